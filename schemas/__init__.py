@@ -1,0 +1,1 @@
+"""Everything on disk: errors, fields, specification, manifest, commits, ledger, store."""

@@ -1,0 +1,33 @@
+"""The one error that people see for bad input: it names the place, the field and the mend."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class InputError(ValueError):
+    """Input that cannot be used. The command line prints it as one line and exits with 2.
+
+    `place` is a file, a folder, a run or a command-line option; `field` is where in it the
+    trouble lies (a JSON path, a column, a line), or "" when the whole place is at fault.
+    """
+
+    def __init__(self, place: str | Path, field: str, problem: str, mend: str) -> None:
+        self.place = str(place)
+        self.field = field
+        self.problem = problem
+        self.mend = mend
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        where = f"{self.place}: {self.field}" if self.field else self.place
+        return " ".join(f"{where}: {self.problem}. {self.mend}".split())
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
+        # Exceptions cross process borders; the default would call __init__ with one argument.
+        return (InputError, (self.place, self.field, self.problem, self.mend))
+
+
+def choices(valid: object) -> str:
+    """`choose one of: a, b, c` for an error's mend."""
+    return "Choose one of: " + ", ".join(sorted(str(v) for v in valid))  # type: ignore[attr-defined]

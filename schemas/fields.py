@@ -1,0 +1,232 @@
+"""Record schemas: the single source of truth for what a scene and a sample store.
+
+Store creation, batch checks, merge compatibility, audit ranges, the data-format page and the
+training keys all derive from the tables below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from schemas.errors import InputError
+
+Table = Literal["scene", "sample"]
+
+# Causes for which a scene is drawn again; their order is part of the data format.
+REDRAW_CAUSES = (
+    "no_surface",  # the house has no support surface of the asked height and size
+    "no_placement",  # target or clutter found no free place on the surface
+    "not_at_rest",  # still moving after the last step
+    "fell_off",  # an object left its support
+    "penetration",  # a body ended inside another
+    "not_finite",  # the physics returned NaN or infinite poses
+    "no_viewpoint",  # no free place from which enough of the target is seen
+)
+
+LABEL_SOURCE_CODES = {"heuristic": 0, "plan": 1, "sim": 2}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of a store.
+
+    `dims` names the axes after the table's own ("scene" or "sample"); their lengths are given by
+    `RecordSchema.sizes`. `low` and `high` bound every finite value (closed interval).
+    """
+
+    name: str
+    dtype: str  # a numpy dtype name, or "string"
+    dims: tuple[str, ...]
+    unit: str  # "m", "kg", "px", "1" for numbers without a unit, "" for names
+    frame: str  # "world", "target", "camera", "" where none applies
+    doc: str
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def is_text(self) -> bool:
+        return self.dtype == "string"
+
+
+@dataclass(frozen=True)
+class RecordSchema:
+    """The arrays of one label source and the lengths of their axes."""
+
+    name: str
+    version: int
+    scene_fields: tuple[Field, ...]
+    sample_fields: tuple[Field, ...]
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+    def table(self, table: Table) -> tuple[Field, ...]:
+        return self.scene_fields if table == "scene" else self.sample_fields
+
+    def shape(self, f: Field, rows: int) -> tuple[int, ...]:
+        """Shape of the field's array with so many rows."""
+        return (rows, *(self.sizes[d] for d in f.dims))
+
+    def sized(self, **sizes: int) -> RecordSchema:
+        """The schema with axis lengths of one specification (points, objects)."""
+        merged = {**self.sizes, **sizes}
+        return RecordSchema(self.name, self.version, self.scene_fields, self.sample_fields, merged)
+
+    def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Refuse a batch that lacks a field, has a foreign one, or breaks dtype, shape or range."""
+        fields = {f.name: f for f in self.table(table)}
+        place = f"batch of {self.name} {table}s"
+        mend = "This is a defect of the label source: its output must follow its schema."
+        if set(arrays) != set(fields):
+            odd = sorted(set(arrays) ^ set(fields))
+            raise InputError(place, ", ".join(odd), "fields missing or unknown", mend)
+        for name, f in fields.items():
+            a = arrays[name]
+            if a.shape != self.shape(f, rows):
+                raise InputError(place, name, f"shape {a.shape}, not {self.shape(f, rows)}", mend)
+            if f.is_text:
+                continue
+            if a.dtype != np.dtype(f.dtype):
+                raise InputError(place, name, f"dtype {a.dtype}, not {f.dtype}", mend)
+            if a.dtype.kind == "f" and not np.isfinite(a).all():
+                raise InputError(place, name, "NaN or infinite values", mend)
+            if a.size and f.low is not None and a.min() < f.low:
+                raise InputError(place, name, f"value {a.min()} below {f.low}", mend)
+            if a.size and f.high is not None and a.max() > f.high:
+                raise InputError(place, name, f"value {a.max()} above {f.high}", mend)
+
+
+_EXTENT = 1000.0  # no house is larger; a larger coordinate is a unit error or garbage
+
+SCENE_FIELDS = (
+    Field("scene_index", "int64", (), "1", "", "index of the scene in the run's sequence", 0),
+    Field("retry", "int32", (), "1", "", "retry index that succeeded; 0 is the first draw", 0),
+    Field("redraws", "uint16", ("redraw_cause",), "1", "", "redraws before it, by cause"),
+    Field("house_id", "string", (), "", "", "house, as its source names it"),
+    Field("house_digest", "string", (), "", "", "sha256 of the house's bytes in its source"),
+    Field("room_id", "string", (), "", "", "room that holds the support surface"),
+    Field("room_type", "string", (), "", "", "type of that room"),
+    Field("support_id", "string", (), "", "", "support surface within the house"),
+    Field("support_type", "string", (), "", "", "type of furniture that carries it"),
+    Field(
+        "T_world_support",
+        "float64",
+        ("row", "column"),
+        "m",
+        "world",
+        "support surface, origin at its centre, z up",
+    ),
+    Field(
+        "support_size_m", "float32", ("xy",), "m", "support", "extent of the support rectangle", 0, _EXTENT
+    ),
+    Field("object_name", "string", ("object",), "", "", "objects on the support; the target is first"),
+    Field("object_digest", "string", ("object",), "", "", "sha256 of what each object is made from"),
+    Field("object_mass_kg", "float32", ("object",), "kg", "", "mass used by the physics", 0, 100),
+    Field("T_world_object", "float64", ("object", "row", "column"), "m", "world", "settled object poses"),
+    Field("settle_steps", "int32", (), "1", "", "physics steps until rest", 0),
+    Field("residual_speed_mps", "float32", (), "m/s", "world", "largest object speed at the end", 0, 100),
+    Field("penetration_m", "float32", (), "m", "", "deepest contact at the end", 0, 10),
+    Field(
+        "target_center_m",
+        "float64",
+        ("xyz",),
+        "m",
+        "world",
+        "centre of the settled target's bounding box",
+        -_EXTENT,
+        _EXTENT,
+    ),
+    Field("target_radius_m", "float32", (), "m", "", "radius of the target's bounding sphere", 0, 10),
+    Field(
+        "T_world_camera",
+        "float64",
+        ("row", "column"),
+        "m",
+        "world",
+        "observation camera: x right, y down, z forward",
+    ),
+    Field("intrinsics_px", "float32", ("fx_fy_cx_cy",), "px", "camera", "pinhole intrinsics", 0, 1e5),
+    Field("image_size_px", "int32", ("width_height",), "px", "camera", "frame size", 1, 1e5),
+    Field(
+        "target_visible_fraction",
+        "float32",
+        (),
+        "1",
+        "camera",
+        "target pixels seen / target pixels alone",
+        0,
+        1,
+    ),
+    Field(
+        "points_m",
+        "float16",
+        ("point", "xyz"),
+        "m",
+        "target",
+        "cloud, world axes, origin at target_center_m",
+        -10,
+        10,
+    ),
+    Field("rgb", "uint8", ("point", "rgb"), "1", "", "colour of each point", 0, 255),
+    Field("target_mask", "bool", ("point",), "1", "", "whether the point lies on the target"),
+    Field("n_points", "int32", (), "1", "", "rows of the cloud that hold points; the rest are zero", 0),
+)
+
+SAMPLE_FIELDS = (
+    Field("sample_id", "uint8", ("byte",), "1", "", "128-bit id: hash of specification, scene and candidate"),
+    Field("scene", "int64", (), "1", "", "scene_index of the sample's scene", 0),
+    Field("candidate", "int32", (), "1", "", "index of the candidate in its scene", 0),
+    Field(
+        "robot",
+        "int16",
+        (),
+        "1",
+        "",
+        "index of the robot in its scene; candidates of one robot share its numbers",
+        0,
+    ),
+    Field("base_xy_m", "float32", ("xy",), "m", "world", "base position", -_EXTENT, _EXTENT),
+    Field("camera_height_m", "float32", (), "m", "world", "height of the robot's camera", 0, 10),
+    Field("base_height_m", "float32", (), "m", "world", "height of the arm's mount", 0, 10),
+    Field("arm_reach_m", "float32", (), "m", "", "reach of the arm, d_arm", 0, 10),
+    Field("distance_m", "float32", (), "m", "world", "horizontal distance from base to target centre", 0, 10),
+    Field(
+        "mount_distance_m",
+        "float32",
+        (),
+        "m",
+        "world",
+        "distance from the arm's mount (x, y, base_height) to the target centre",
+        0,
+        10,
+    ),
+    Field("target_px", "int32", (), "px", "", "window pixels on the target when it is alone", 0),
+    Field("visible_px", "int32", (), "px", "", "those of them on which the full scene shows the target", 0),
+    Field("visibility", "float32", (), "1", "", "rho = visible_px / target_px (0 when target_px is 0)", 0, 1),
+    Field("heuristic_score", "float32", (), "1", "", "H, the distance-visibility score", 0, 10),
+    Field(
+        "base_clearance_m",
+        "float32",
+        (),
+        "m",
+        "world",
+        "free distance around the robot's body; negative inside an obstacle or outside every room",
+        -10,
+        10,
+    ),
+    Field("base_is_clear", "bool", (), "1", "", "base_clearance_m >= 0"),
+    Field("label", "uint8", (), "1", "", "1 where the label source calls the base pose good", 0, 1),
+    Field("label_source", "uint8", (), "1", "", "0 heuristic, 1 plan, 2 sim", 0, 2),
+    Field("label_version", "int16", (), "1", "", "version of the label source's code", 0),
+)
+
+_SIZES = {
+    "row": 4, "column": 4, "xy": 2, "xyz": 3, "rgb": 3, "byte": 16, "fx_fy_cx_cy": 4,
+    "width_height": 2, "redraw_cause": len(REDRAW_CAUSES), "object": 7, "point": 4096,
+}  # fmt: skip
+
+SCHEMAS: dict[str, RecordSchema] = {
+    "heuristic": RecordSchema("heuristic", 1, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
+}

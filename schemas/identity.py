@@ -1,0 +1,54 @@
+"""Names and random streams that depend on what is made, never on who makes it or when."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+class Stream(IntEnum):
+    """Independent random streams of a run. Numbers are part of the data: never reuse one."""
+
+    SCENE = 0
+    SETTLE = 1
+    OBSERVE = 2
+    CANDIDATES = 3
+    NOISE = 4
+
+
+def generator(seed: int, stream: Stream, scene_index: int, retry: int) -> np.random.Generator:
+    """The generator of one stage of one try of one scene; the same on every machine."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), scene_index, retry))
+    return np.random.Generator(np.random.PCG64(sequence))
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys, no spaces and no NaN: equal values give equal text."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def digest_of(value: Any) -> str:
+    """sha256 of the canonical JSON, as 64 hexadecimal digits."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
+def sample_ids(
+    spec_hash: str, scene_index: int, candidate_indices: npt.NDArray[np.integer[Any]]
+) -> npt.NDArray[np.uint8]:  # (N, 16)
+    """128-bit ids of the samples of one scene: blake2b(spec hash, scene index, candidate index).
+
+    They do not depend on shard size or worker, so two runs of one specification agree on them.
+    """
+    head = hashlib.blake2b(bytes.fromhex(spec_hash), digest_size=16)
+    head.update(int(scene_index).to_bytes(8, "little"))
+    out = np.empty((len(candidate_indices), 16), np.uint8)
+    for row, candidate in enumerate(candidate_indices):
+        h = head.copy()
+        h.update(int(candidate).to_bytes(8, "little"))
+        out[row] = np.frombuffer(h.digest(), np.uint8)
+    return out

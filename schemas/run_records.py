@@ -1,0 +1,138 @@
+"""The JSON records of a run: manifest, plan, commit, ledger entry, quarantine.
+
+They are read back from disk and so are validated like any input.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.specification import Specification
+
+FORMAT_VERSION = 1
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Outcome = Literal[
+    "committed", "superseded", "failed", "crashed", "hung", "out_of_memory", "lost", "cancelled"
+]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Layout(_Record):
+    """How scenes are cut into shards. Fixed for a run, and without influence on any sample."""
+
+    scenes_per_shard: int = Field(ge=1, le=100_000)
+    candidates_per_scene: int = Field(ge=1, le=1_000_000)
+
+    @property
+    def samples_per_shard(self) -> int:
+        return self.scenes_per_shard * self.candidates_per_scene
+
+    def shards_for(self, n: int) -> int:
+        """Shards that hold the first n samples."""
+        return -(-n // self.samples_per_shard)
+
+
+class Manifest(_Record):
+    """manifest.json: what the run is. Written once, create-only."""
+
+    format_version: int = FORMAT_VERSION
+    spec: Specification
+    spec_hash: Digest
+    schema_name: str
+    schema_version: int
+    layout: Layout
+    code_version: str
+    libraries: dict[str, str]
+    platform: str
+    created: str
+    # Where the sources were found and under which licences; information, not identity.
+    sources: dict[str, str] = Field(default_factory=dict)
+
+
+class Plan(_Record):
+    """plans/<k>.json: how many samples are wanted. The newest counts; a run only grows."""
+
+    n: int = Field(ge=1, le=10**12)
+    created: str
+
+
+class FileEntry(_Record):
+    """One file of a committed attempt, relative to the attempt's folder."""
+
+    path: str
+    size: int = Field(ge=0)
+    sha256: Digest
+
+
+class Cost(_Record):
+    """What one attempt cost. `gpu_s` stays empty where no GPU was used."""
+
+    wall_s: float = Field(ge=0)
+    cpu_s: float = Field(ge=0)
+    stage_wall_s: dict[str, float] = Field(default_factory=dict)
+    stage_cpu_s: dict[str, float] = Field(default_factory=dict)
+    stage_gpu_s: dict[str, float] = Field(default_factory=dict)
+    peak_rss_bytes: int = 0
+    written_bytes: int = 0
+
+
+class Host(_Record):
+    """Fingerprint of the machine that ran an attempt."""
+
+    name: str
+    cpu: str
+    cores: int
+    memory_bytes: int
+    gpu: str = ""
+    pid: int = 0
+
+
+class Commit(_Record):
+    """commits/<shard>.json: written last and create-only; readers trust nothing else."""
+
+    format_version: int = FORMAT_VERSION
+    shard: int = Field(ge=0)
+    attempt: str
+    spec_hash: Digest
+    scenes: int
+    samples: int
+    positives: int
+    redraws: dict[str, int]
+    files: tuple[FileEntry, ...]
+    cost: Cost
+    host: Host
+    created: str
+
+
+class LedgerEntry(_Record):
+    """ledger/<attempt>.json: how one attempt ended, and what it cost."""
+
+    format_version: int = FORMAT_VERSION
+    attempt: str
+    shard: int = Field(ge=0)
+    outcome: Outcome
+    cause: str = ""
+    stack: str = ""
+    started: str = ""
+    ended: str = ""
+    cost: Cost | None = None  # None where the attempt left no account of itself
+    host: Host | None = None
+
+
+class QuarantineRecord(_Record):
+    """quarantine/<shard>.json: a shard given up, with all that is needed to run it alone."""
+
+    format_version: int = FORMAT_VERSION
+    shard: int = Field(ge=0)
+    seed: int
+    first_scene: int
+    scenes: int
+    attempts: tuple[str, ...]
+    causes: tuple[str, ...]
+    stacks: tuple[str, ...]
+    created: str

@@ -1,0 +1,1 @@
+"""Meshes, rigid transforms and planar geometry: arrays in, arrays out."""

@@ -1,0 +1,48 @@
+"""A coloured triangle mesh, the only surface that leaves a loader."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+U8 = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image on a mesh; `uv` has its origin at the image's lower left corner, as in OBJ."""
+
+    image: U8  # (H, W, 3)
+    uv: F32  # (V, 2), one per vertex of the mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with a flat colour each and, where there is one, a texture that overrides it."""
+
+    vertices_m: F32  # (V, 3)
+    faces: I32  # (F, 3)
+    face_rgb: U8  # (F, 3)
+    texture: Texture | None = None
+
+    def transformed(self, T_parent_mesh: F64) -> Mesh:
+        """The mesh in the parent's frame; `T_parent_mesh` is (4, 4)."""
+        vertices_m = self.vertices_m @ T_parent_mesh[:3, :3].T + T_parent_mesh[:3, 3]
+        return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture)
+
+
+def concatenate(meshes: list[Mesh]) -> Mesh:
+    """One untextured mesh with the faces of all, in order; textures become flat face colours."""
+    if not meshes:
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    offsets = np.cumsum([0] + [len(m.vertices_m) for m in meshes[:-1]])
+    return Mesh(
+        np.concatenate([m.vertices_m for m in meshes]),
+        np.concatenate([m.faces + np.int32(o) for m, o in zip(meshes, offsets, strict=True)]),
+        np.concatenate([m.face_rgb for m in meshes]),
+    )

@@ -1,0 +1,88 @@
+"""A house as every source delivers it: world frame, right-handed, z up, metres, floor at z = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+
+from workers.geometry.mesh import F32, F64, Mesh
+
+BodyKind = Literal["wall", "furniture", "small"]
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A floor. `polygon_m` is simple, counter-clockwise seen from above, without repeated end."""
+
+    room_id: str
+    room_type: str  # Kitchen, LivingRoom, Bedroom, Bathroom, ...
+    polygon_m: F64  # (K, 2)
+    ceiling_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One rigid static thing: a wall, a piece of furniture or a small thing standing on one.
+
+    `visual` is what cameras see and `convex_parts_m` what other things bump into, both in the
+    world frame. Every part is the vertex set of a convex polyhedron with volume.
+    """
+
+    body_id: str
+    kind: BodyKind
+    object_type: str  # "Wall", "DiningTable", "Apple", ...
+    asset_id: str  # "" for walls
+    room_id: str  # "" for walls
+    visual: Mesh
+    convex_parts_m: tuple[F32, ...]  # each (V, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A horizontal rectangle on a body on which things can be put.
+
+    The frame `T_world_surface` has its origin at the rectangle's centre and z up.
+    """
+
+    surface_id: str
+    body_id: str
+    object_type: str
+    room_id: str
+    T_world_surface: F64  # (4, 4)
+    size_m: tuple[float, float]  # along the surface frame's x and y
+
+    @property
+    def height_m(self) -> float:
+        return float(self.T_world_surface[2, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class House:
+    """Static surroundings of a scene. `skipped` counts what the loader left out, by cause."""
+
+    house_id: str
+    digest: str  # sha256 of the house's own bytes in its source
+    rooms: tuple[Room, ...]
+    bodies: tuple[Body, ...]
+    surfaces: tuple[Surface, ...]
+    skipped: Mapping[str, int] = field(default_factory=dict)
+
+    def room(self, room_id: str) -> Room:
+        return next(r for r in self.rooms if r.room_id == room_id)
+
+
+class HouseSource(Protocol):
+    """An ordered collection of houses. Opening one is cheap; loading one takes milliseconds."""
+
+    kind: str
+    digest: str  # of the content, not of the path
+
+    def house_ids(self) -> list[str]:
+        """All ids, in an order that the content alone decides."""
+        ...
+
+    def load(self, house_id: str) -> House:
+        """The house. Raises InputError that names the file, the house and the field."""
+        ...
