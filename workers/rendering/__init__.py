@@ -1,0 +1,1 @@
+"""RGB-D frames of a scene. RENDERERS is the registry; each engine lives in one file."""

@@ -1,0 +1,60 @@
+"""What every renderer takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from workers.geometry.mesh import F32, F64, U8
+from workers.houses.house import House
+from workers.objects.model import ObjectModel
+
+I16 = npt.NDArray[np.int16]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera; its frame has x right, y down, z forward (OpenCV).
+
+    Pixel (u, v) has its centre at u + 0.5, v + 0.5; `cx_px`, `cy_px` are in the same units.
+    """
+
+    T_world_camera: F64  # (4, 4)
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What stands in front of the camera: a house and the objects placed in it."""
+
+    house: House
+    objects: Sequence[ObjectModel]
+    T_world_object: F64  # (K, 4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB-D image. `depth_m` is along the camera's z axis; 0 where nothing was measured.
+
+    `body` says what each pixel shows: -1 nothing, 0 the house, 1 + k object k.
+    """
+
+    camera: Camera
+    rgb: U8  # (H, W, 3)
+    depth_m: F32  # (H, W)
+    body: I16  # (H, W)
+
+
+class Renderer(Protocol):
+    """Renders one frame of a stage."""
+
+    def __call__(self, stage: Stage, camera: Camera) -> Frame: ...
