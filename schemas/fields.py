@@ -176,10 +176,10 @@ SCENE_FIELDS = (
 
 SAMPLE_FIELDS = (
     Field("sample_id", "uint8", ("byte",), "1", "", "128-bit id: hash of specification, scene and candidate"),
-    Field("scene", "int64", (), "1", "", "scene_index of the sample's scene", 0),
-    Field("candidate", "int32", (), "1", "", "index of the candidate in its scene", 0),
+    Field("sample_scene_index", "int64", (), "1", "", "scene_index of the sample's scene", 0),
+    Field("candidate_index", "int32", (), "1", "", "index of the candidate in its scene", 0),
     Field(
-        "robot",
+        "robot_index",
         "int16",
         (),
         "1",
