@@ -27,8 +27,6 @@ REDRAW_CAUSES = (
     "no_viewpoint",  # no free place from which enough of the target is seen
 )
 
-LABEL_SOURCE_CODES = {"heuristic": 0, "plan": 1, "sim": 2}
-
 
 @dataclass(frozen=True)
 class Field:
@@ -134,11 +132,11 @@ SCENE_FIELDS = (
         ("xyz",),
         "m",
         "world",
-        "centre of the settled target's bounding box",
+        "origin of the target's frame: the centre of its bounding box",
         -_EXTENT,
         _EXTENT,
     ),
-    Field("target_radius_m", "float32", (), "m", "", "radius of the target's bounding sphere", 0, 10),
+    Field("target_radius_m", "float32", (), "m", "", "radius of the sphere around target_center_m that holds the target", 0, 10),
     Field(
         "T_world_camera",
         "float64",
@@ -218,7 +216,7 @@ SAMPLE_FIELDS = (
     ),
     Field("base_is_clear", "bool", (), "1", "", "base_clearance_m >= 0"),
     Field("label", "uint8", (), "1", "", "1 where the label source calls the base pose good", 0, 1),
-    Field("label_source", "uint8", (), "1", "", "0 heuristic, 1 plan, 2 sim", 0, 2),
+    Field("label_source", "string", (), "", "", "name of the label source"), "1", "", "0 heuristic, 1 plan, 2 sim", 0, 2),
     Field("label_version", "int16", (), "1", "", "version of the label source's code", 0),
 )
 
