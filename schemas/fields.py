@@ -216,7 +216,7 @@ SAMPLE_FIELDS = (
     ),
     Field("base_is_clear", "bool", (), "1", "", "base_clearance_m >= 0"),
     Field("label", "uint8", (), "1", "", "1 where the label source calls the base pose good", 0, 1),
-    Field("label_source", "string", (), "", "", "name of the label source"), "1", "", "0 heuristic, 1 plan, 2 sim", 0, 2),
+    Field("label_source", "string", (), "", "", "name of the label source"),
     Field("label_version", "int16", (), "1", "", "version of the label source's code", 0),
 )
 
