@@ -26,25 +26,29 @@ def convex_hull(points_m: F64) -> F64:
         return points_m[order[[0, -1]]]
 
 
-def segment_distance(points_m: F64, start_m: F64, end_m: F64) -> F64:
-    """Distance of points (N, 2) from segments `start_m`, `end_m` (S, 2), as (N, S)."""
-    along = end_m - start_m
-    rel = points_m[:, None, :] - start_m[None]
-    length2 = np.maximum((along**2).sum(1), 1e-18)
-    t = np.clip((rel * along).sum(2) / length2, 0.0, 1.0)
-    return np.linalg.norm(rel - t[..., None] * along, axis=2)
+def stack_polygons(polygons_m: Sequence[F64]) -> F64:
+    """Polygons of different length as one array (P, K, 2), padded by repeating the last corner."""
+    longest = max((len(p) for p in polygons_m), default=1)
+    padded = [np.concatenate([p, np.repeat(p[-1:], longest - len(p), axis=0)]) for p in polygons_m]
+    return np.array(padded, np.float64).reshape(len(polygons_m), longest, 2)
 
 
-def signed_distance_to_convex(points_m: F64, polygon_m: F64) -> F64:
-    """Distance (N,) of points (N, 2) from a counter-clockwise convex polygon; negative inside."""
-    end_m = np.roll(polygon_m, -1, axis=0)
-    outside = segment_distance(points_m, polygon_m, end_m).min(1)
-    if len(polygon_m) < 3:
-        return outside
-    along = end_m - polygon_m
-    rel = points_m[:, None, :] - polygon_m[None]
-    inside = (along[:, 0] * rel[..., 1] - along[:, 1] * rel[..., 0] >= 0).all(1)
-    return np.where(inside, -outside, outside)
+def signed_distances_to_convex(points_m: F64, polygons_m: F64) -> F64:
+    """Distance (N, P) of points (N, 2) from counter-clockwise convex polygons (P, K, 2).
+
+    Negative inside. A polygon may repeat corners; one without area has no inside.
+    """
+    along = np.roll(polygons_m, -1, axis=1) - polygons_m  # (P, K, 2)
+    length2 = np.maximum((along**2).sum(2), 1e-18)
+    rel = points_m[:, None, None, :] - polygons_m[None]  # (N, P, K, 2)
+    t = np.clip((rel[..., 0] * along[..., 0] + rel[..., 1] * along[..., 1]) / length2, 0.0, 1.0)
+    dx = rel[..., 0] - t * along[..., 0]
+    dy = rel[..., 1] - t * along[..., 1]
+    border = np.sqrt((dx * dx + dy * dy).min(2))
+    left = (along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0] >= 0).all(2)
+    first, second = polygons_m, np.roll(polygons_m, -1, axis=1)
+    area = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]).sum(1)
+    return np.where(left & (area > 1e-12), -border, border)
 
 
 def inside_polygon(points_m: F64, polygon_m: F64) -> npt.NDArray[np.bool_]:

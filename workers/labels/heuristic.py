@@ -25,7 +25,9 @@ def visibility_score(rho: F64) -> F64:
     return np.where(rho < 0.04, 0.05 + 6.25 * rho, np.where(rho <= 0.8, 0.3, 0.3 + 1.5 * (rho - 0.8)))
 
 
-def effective_distance(distance_m: F32, mount_distance_m: F32, arm_reach_m: F32, params: HeuristicParams) -> F64:
+def effective_distance(
+    distance_m: F32, mount_distance_m: F32, arm_reach_m: F32, params: HeuristicParams
+) -> F64:
     """The distance that the score is a function of: the paper's planar one, or a reach-relative one."""
     match params.distance:
         case "planar":

@@ -30,6 +30,7 @@ class RayMesh:
     mesh: Mesh
     hierarchy: EmbreeScene
     normals: F32  # (F, 3), unit, mesh frame
+    box_corners_m: F32  # (8, 3), of the bounding box, mesh frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,9 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    rays = RayMesh(mesh, hierarchy, normals.astype(np.float32))
+    low, high = mesh.vertices_m.min(0), mesh.vertices_m.max(0)
+    corners_m = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
+    rays = RayMesh(mesh, hierarchy, normals.astype(np.float32), corners_m)
     # Embree builds on the first query; doing it here keeps that cost out of the stages that time rays.
     nearest(rays, np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return rays

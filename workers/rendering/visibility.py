@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import look_at
-from workers.rendering.rays import MISS, RayStage, nearest, occluded
+from workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
 
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.
@@ -16,13 +16,6 @@ _SKIN_M = 5e-4
 _MAX_RAYS = 1 << 18
 
 I32 = npt.NDArray[np.int32]
-
-
-def window_directions(window: int) -> F32:
-    """Homogeneous image directions (window^2, 3) of a square of half width 1 at depth 1."""
-    axis = (np.arange(window, dtype=np.float64) + 0.5) / window * 2 - 1
-    v, u = np.meshgrid(axis, axis, indexing="ij")
-    return np.stack([u.ravel(), v.ravel(), np.ones(window * window)], axis=1).astype(np.float32)
 
 
 def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
@@ -46,38 +39,59 @@ def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tu
 
 
 def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
-    n, rays = len(eyes_m), window * window
+    n = len(eyes_m)
     T_world_target = stage.T_world_object[target]
-    centre_m = T_world_target[:3, 3]
+    axes = np.stack([look_at(eye, T_world_target[:3, 3])[:3, :3] for eye in eyes_m])  # (n, 3, 3)
     sine = stage.radii_m[target] / distance_m
-    tangent = sine / np.sqrt(1 - sine**2)  # half width of the window at depth 1
-    axes = np.stack([look_at(eye, centre_m)[:3, :3] for eye in eyes_m])  # (n, 3, 3)
-    axes[:, :, :2] *= tangent[:, None, None]
-    directions = np.einsum("ri,nji->nrj", window_directions(window), axes.astype(np.float32))
-    directions = np.ascontiguousarray(directions.reshape(-1, 3))
+    half_width = sine / np.sqrt(1 - sine**2)  # of the window, at depth 1
+    eye, x, y = _window_rays(stage.objects[target], T_world_target, eyes_m, axes, half_width, window)
+    axes32 = axes.astype(np.float32)
+    directions = x[:, None] * axes32[eye, :, 0] + y[:, None] * axes32[eye, :, 1] + axes32[eye, :, 2]
 
     # Alone, in the target's own frame.
+    local_eyes = ((eyes_m - T_world_target[:3, 3]) @ T_world_target[:3, :3]).astype(np.float32)
     R = T_world_target[:3, :3].astype(np.float32)
-    local_eyes = ((eyes_m - centre_m) @ T_world_target[:3, :3]).astype(np.float32)
-    parameter = nearest(stage.objects[target], np.repeat(local_eyes, rays, axis=0), directions @ R)
-    ray = np.flatnonzero(parameter < MISS)
-    eye = ray // rays
+    parameter = nearest(stage.objects[target], local_eyes[eye], directions @ R)
+    hit = parameter < MISS
+    eye, directions, limits = eye[hit], directions[hit], parameter[hit] - np.float32(_SKIN_M)
     alone = np.bincount(eye, minlength=n).astype(np.int32)
 
     # What is left of these rays after the house and each other object that may stand before it.
-    origins = eyes_m.astype(np.float32)
-    directions, limits = directions[ray], parameter[ray] - np.float32(_SKIN_M)
-    free = ~occluded(stage.house, origins[eye], directions, limits)
+    free = ~occluded(stage.house, eyes_m.astype(np.float32)[eye], directions, limits)
     for k in range(len(stage.objects)):
         if k == target:
             continue
-        between = _may_hide(stage, k, target, eyes_m, distance_m)[eye] & free
-        if between.any():
+        between = np.flatnonzero(_may_hide(stage, k, target, eyes_m, distance_m)[eye] & free)
+        if len(between):
             T = stage.T_world_object[k]
             local = ((eyes_m - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
             towards = directions[between] @ T[:3, :3].astype(np.float32)
             free[between] = ~occluded(stage.objects[k], local[eye[between]], towards, limits[between])
     return alone, np.bincount(eye[free], minlength=n).astype(np.int32)
+
+
+def _window_rays(
+    target: RayMesh, T_world_target: F64, eyes_m: F64, axes: F64, half_width: F64, window: int
+) -> tuple[npt.NDArray[np.int64], F32, F32]:
+    """The window's pixels that may show the target: eye (R,), and x, y at depth 1 (R,), camera frame.
+
+    A pixel outside the image of the target's bounding box cannot show it; leaving it out changes
+    no count and saves most rays of a long thin target.
+    """
+    corners_m = target.box_corners_m @ T_world_target[:3, :3].T + T_world_target[:3, 3]  # (8, 3)
+    rel = np.einsum("nci,nij->ncj", corners_m[None] - eyes_m[:, None], axes)  # (n, 8, 3)
+    # A corner level with the eye or behind it has no image: then the whole window is cast.
+    ahead = (rel[..., 2] > 1e-3).all(1)
+    image = rel[..., :2] / np.maximum(rel[..., 2:], 1e-3) / half_width[:, None, None]
+    low = np.where(ahead[:, None], image.min(1), -1.0)
+    high = np.where(ahead[:, None], image.max(1), 1.0)
+    centres = (np.arange(window, dtype=np.float64) + 0.5) / window * 2 - 1
+    slack = 1e-3
+    columns = (centres >= low[:, :1] - slack) & (centres <= high[:, :1] + slack)  # (n, window)
+    rows = (centres >= low[:, 1:] - slack) & (centres <= high[:, 1:] + slack)
+    eye, v, u = np.nonzero(rows[:, :, None] & columns[:, None, :])
+    scale = half_width[eye]
+    return eye, (centres[u] * scale).astype(np.float32), (centres[v] * scale).astype(np.float32)
 
 
 def _may_hide(stage: RayStage, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:

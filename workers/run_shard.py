@@ -1,0 +1,152 @@
+"""One shard, from its place in the sequence to checked arrays. Read this first.
+
+draw a house, a support, a target and clutter   (redrawn until it works)
+settle them by physics
+observe one RGB-D frame
+sample base candidates
+label them
+check the batch against its schema
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.cost import StageClock
+from schemas.errors import InputError, choices
+from schemas.fields import REDRAW_CAUSES, SCHEMAS, RecordSchema
+from schemas.identity import Stream, generator, sample_ids
+from schemas.specification import Specification
+from workers.bases.candidates import Candidates, draw_candidates
+from workers.bases.clearance import base_clearance_m
+from workers.labels import LABEL_SOURCES
+from workers.labels.source import LabelSource
+from workers.rendering.frame import Camera
+from workers.scenes.draw import draw_scene
+from workers.scenes.scene import Scene
+from workers.world import World
+
+Columns = dict[str, np.ndarray[Any, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class ShardResult:
+    """Arrays by field name, one row a scene and one row a sample, and what they cost."""
+
+    scene: Columns
+    sample: Columns
+    clock: StageClock
+    redraws: dict[str, int]
+
+
+def run_shard(spec: Specification, world: World, scene_indices: Sequence[int]) -> ShardResult:
+    """Make the scenes of these indices and label their candidates.
+
+    The same specification and index give the same bytes, whatever else is in the shard.
+    """
+    source, schema, spec_hash = label_source_of(spec), schema_of(spec), spec.hash()
+    clock, redraws = StageClock(), Counter[str]()
+    scene_rows: list[dict[str, Any]] = []
+    sample_blocks: list[Columns] = []
+    for index in scene_indices:
+        scene = draw_scene(world, index, clock)
+        rng = generator(spec.seed, Stream.CANDIDATES, index, scene.retry)
+        candidates = draw_candidates(scene.target_center_m, spec.candidates, rng)
+        labelled = source.label(scene, candidates, spec, clock)
+        common = candidate_columns(scene, candidates, spec, spec_hash, source)
+        scene_rows.append(scene_row(scene))
+        sample_blocks.append(common | labelled)
+        redraws.update(scene.redraws)
+
+    scenes = {f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields}
+    samples = {name: np.concatenate([b[name] for b in sample_blocks]) for name in sample_blocks[0]}
+    schema.check("scene", len(scene_rows), scenes)
+    schema.check("sample", sum(len(b["label"]) for b in sample_blocks), samples)
+    return ShardResult(scenes, samples, clock, dict(redraws))
+
+
+def label_source_of(spec: Specification) -> LabelSource:
+    """The label source of a specification. Raises InputError where there is none of that name."""
+    if spec.label_source not in LABEL_SOURCES:
+        raise InputError(
+            "specification", "label_source", f"no source {spec.label_source!r}", choices(LABEL_SOURCES)
+        )
+    return LABEL_SOURCES[spec.label_source]
+
+
+def schema_of(spec: Specification) -> RecordSchema:
+    """The record schema of a specification's store, with its axis lengths."""
+    schema = SCHEMAS[label_source_of(spec).schema]
+    return schema.sized(object=spec.scene.n_clutter + 1, point=spec.observation.n_points)
+
+
+def scene_row(scene: Scene) -> dict[str, Any]:
+    """The scene's record, by field name."""
+    house, surface, camera, cloud = scene.house.house, scene.surface, scene.camera, scene.cloud
+    return {
+        "scene_index": scene.index,
+        "retry": scene.retry,
+        "redraws": [scene.redraws.get(cause, 0) for cause in REDRAW_CAUSES],
+        "house_id": house.house_id,
+        "house_digest": house.digest,
+        "room_id": surface.room_id,
+        "room_type": house.room(surface.room_id).room_type,
+        "support_id": surface.surface_id,
+        "support_type": surface.object_type,
+        "T_world_support": surface.T_world_surface,
+        "support_size_m": surface.size_m,
+        "object_name": [m.name for m in scene.models],
+        "object_digest": [m.digest for m in scene.models],
+        "object_mass_kg": [m.mass_kg for m in scene.models],
+        "T_world_object": scene.T_world_object,
+        "settle_steps": scene.settled.steps,
+        "residual_speed_mps": scene.settled.residual_speed_mps,
+        "penetration_m": scene.settled.penetration_m,
+        "target_center_m": scene.target_center_m,
+        "target_radius_m": scene.rays.radii_m[0],
+        "T_world_camera": camera.T_world_camera,
+        "intrinsics_px": intrinsics_px(camera),
+        "image_size_px": (camera.width_px, camera.height_px),
+        "target_visible_fraction": scene.target_visible_fraction,
+        "points_m": cloud.points_m,
+        "rgb": cloud.rgb,
+        "target_mask": cloud.target_mask,
+        "n_points": cloud.n,
+    }
+
+
+def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
+    """(fx, fy, cx, cy) in pixels."""
+    return (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+
+
+def candidate_columns(
+    scene: Scene, candidates: Candidates, spec: Specification, spec_hash: str, source: LabelSource
+) -> Columns:
+    """The columns that the candidates alone decide, one row a candidate."""
+    n = len(candidates)
+    clearance_m = base_clearance_m(candidates, scene.house.obstacles, spec.candidates)
+    index = np.arange(n, dtype=np.int32)
+    return {
+        "sample_id": sample_ids(spec_hash, scene.index, index),
+        "sample_scene_index": np.full(n, scene.index, np.int64),
+        "candidate_index": index,
+        "robot_index": candidates.robot_index,
+        "base_xy_m": candidates.base_xy_m,
+        "camera_height_m": candidates.camera_height_m,
+        "base_height_m": candidates.base_height_m,
+        "arm_reach_m": candidates.arm_reach_m,
+        "base_clearance_m": clearance_m,
+        "base_is_clear": clearance_m >= 0,
+        "label_source": np.full(n, source.name, dtype=object),
+        "label_version": np.full(n, source.version, np.int16),
+    }
+
+
+def _stack(dtype: str, rows: list[Any]) -> np.ndarray[Any, Any]:
+    return np.array(rows, dtype=object if dtype == "string" else dtype)

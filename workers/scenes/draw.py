@@ -1,0 +1,145 @@
+"""One scene from its random streams: draw, settle, observe; redraw what does not work."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from schemas.cost import StageClock
+from schemas.errors import InputError
+from schemas.identity import Stream, generator
+from schemas.specification import SettleParams
+from workers.geometry.mesh import F64
+from workers.houses.house import Surface
+from workers.objects.model import ObjectModel
+from workers.rendering import load_renderer
+from workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
+from workers.rendering.embree_renderer import cast_pixels
+from workers.rendering.frame import Camera, Frame, Stage
+from workers.rendering.noise import add_noise
+from workers.rendering.rays import RayStage
+from workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
+from workers.scenes.scene import Redraw, Scene
+from workers.scenes.viewpoint import draw_viewpoint
+from workers.settling import load_settler
+from workers.settling.settler import SettleResult
+from workers.world import PreparedHouse, World
+
+# Static parts this far from the support can be touched by what rolls off; farther ones cannot.
+_SURROUNDINGS_M = 0.3
+
+
+def draw_scene(world: World, index: int, clock: StageClock) -> Scene:
+    """Scene `index` of the specification's endless sequence: the first retry that works.
+
+    Raises InputError when `scene.max_retries` redraws were not enough.
+    """
+    redraws: Counter[str] = Counter()
+    for retry in range(world.spec.scene.max_retries):
+        try:
+            return _try_scene(world, index, retry, dict(redraws), clock)
+        except Redraw as redraw:
+            redraws[redraw.cause] += 1
+    causes = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
+    raise InputError(
+        f"scene {index}",
+        "scene.max_retries",
+        f"no usable scene in {world.spec.scene.max_retries} tries ({causes})",
+        "Look at the most frequent cause: other houses or objects, or wider limits, may help",
+    )
+
+
+def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], clock: StageClock) -> Scene:
+    spec = world.spec
+    with clock.stage("draw"):
+        rng = generator(spec.seed, Stream.SCENE, index, retry)
+        house = world.house(world.house_ids[rng.integers(len(world.house_ids))])
+        surfaces = eligible_surfaces(house.house, spec.scene)
+        if not surfaces:
+            raise Redraw("no_surface")
+        surface = surfaces[rng.integers(len(surfaces))]
+        names = _draw_names(world, rng)
+        models = tuple(world.object(name).model for name in names)
+        taken = standing_footprints(house.house, surface)
+        start = drop_poses(models, surface, taken, spec.scene, rng)
+        static = nearby_parts(house.house, surface, _SURROUNDINGS_M)
+
+    with clock.stage("settle"):
+        settled = load_settler(spec.settle.engine)(static, models, start, spec.settle)
+        check_settled(settled, models, surface, spec.settle)
+
+    with clock.stage("observe"):
+        rays = world.stage(house, names, settled.T_world_object)
+        room = house.house.room(surface.room_id)
+        target_m = settled.T_world_object[0, :3, 3]
+        rng = generator(spec.seed, Stream.OBSERVE, index, retry)
+        camera, share = draw_viewpoint(
+            rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
+        )
+        stage = Stage(house.house, models, settled.T_world_object)
+        noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
+        cloud = _observe(world, stage, rays, camera, rng, noise_rng)
+    return Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
+
+
+def _draw_names(world: World, rng: np.random.Generator) -> list[str]:
+    """The target first, then clutter, all different."""
+    target = world.target_names[rng.integers(len(world.target_names))]
+    others = [name for name in world.object_names if name != target]
+    clutter = rng.choice(len(others), size=world.spec.scene.n_clutter, replace=False)
+    return [target, *(others[k] for k in clutter)]
+
+
+def check_settled(
+    settled: SettleResult, models: tuple[ObjectModel, ...], surface: Surface, params: SettleParams
+) -> None:
+    """Raise Redraw where the result is no scene: blown up, still moving, sunk in, or fallen off."""
+    T = settled.T_world_object
+    if not np.isfinite(T).all():
+        raise Redraw("not_finite")
+    if not settled.at_rest:
+        raise Redraw("not_at_rest")
+    local = (T[:, :3, 3] - surface.T_world_surface[:3, 3]) @ surface.T_world_surface[:3, :3]
+    bottoms_m = np.array([_lowest_m(m, T[k]) for k, m in enumerate(models)]) - surface.height_m
+    beyond = (np.abs(local[:, :2]) > np.array(surface.size_m) / 2).any()
+    if beyond or (bottoms_m < -params.max_drop_m).any():
+        raise Redraw("fell_off")
+    if settled.penetration_m > params.max_penetration_m:
+        raise Redraw("penetration")
+
+
+def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
+    """Height of the object's lowest point, world."""
+    z = T_world_object[2, :3]
+    return float(min((part @ z).min() for part in model.convex_parts_m) + T_world_object[2, 3])
+
+
+def render_frame(
+    world: World, stage: Stage, rays: RayStage, camera: Camera, noise_rng: np.random.Generator
+) -> Frame:
+    """The whole frame by the specified renderer, with the specified noise."""
+    params = world.spec.observation
+    frame = load_renderer(params.renderer)(stage, camera)
+    return add_noise(frame, params.noise, noise_rng) if params.noise.enabled else frame
+
+
+def _observe(
+    world: World,
+    stage: Stage,
+    rays: RayStage,
+    camera: Camera,
+    rng: np.random.Generator,
+    noise_rng: np.random.Generator,
+) -> Cloud:
+    params = world.spec.observation
+    # Embree casts single pixels: only those that the cloud draws. Noise looks at neighbours, and
+    # the other renderers make whole frames.
+    single = params.renderer == "embree" and not params.noise.enabled
+    cast: PixelCaster = (
+        (lambda pixels: cast_pixels(rays, camera, pixels))
+        if single
+        else caster_of(render_frame(world, stage, rays, camera, noise_rng))
+    )
+    radius_m = float(rays.radii_m[0])
+    return observe_cloud(cast, camera, 1, stage.T_world_object[0, :3, 3], radius_m, params, rng)

@@ -1,0 +1,52 @@
+"""A finished scene, and why a try at one was given up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from schemas.fields import REDRAW_CAUSES
+from workers.geometry.mesh import F64
+from workers.houses.house import Surface
+from workers.objects.model import ObjectModel
+from workers.rendering.cloud import Cloud
+from workers.rendering.frame import Camera
+from workers.rendering.rays import RayStage
+from workers.settling.settler import SettleResult
+from workers.world import PreparedHouse
+
+
+class Redraw(Exception):
+    """This try gives no scene; `cause` is one of REDRAW_CAUSES."""
+
+    def __init__(self, cause: str) -> None:
+        if cause not in REDRAW_CAUSES:
+            raise KeyError(f"unknown redraw cause {cause!r}; causes are {', '.join(REDRAW_CAUSES)}")
+        super().__init__(cause)
+        self.cause = cause
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A settled and observed scene. Object 0 is the target."""
+
+    index: int
+    retry: int
+    redraws: dict[str, int]
+    house: PreparedHouse
+    surface: Surface
+    models: tuple[ObjectModel, ...]
+    settled: SettleResult
+    rays: RayStage
+    camera: Camera
+    target_visible_fraction: float
+    cloud: Cloud
+
+    @property
+    def T_world_object(self) -> F64:
+        """Settled poses (K, 4, 4)."""
+        return self.settled.T_world_object
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        return self.settled.T_world_object[0, :3, 3]

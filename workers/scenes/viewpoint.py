@@ -1,0 +1,69 @@
+"""From where a scene is observed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.specification import CandidateParams, ObservationParams
+from workers.geometry.mesh import F64
+from workers.geometry.planar import inside_polygon
+from workers.geometry.transforms import look_at
+from workers.houses.house import Room
+from workers.bases.candidates import Candidates
+from workers.bases.clearance import Obstacles, base_clearance_m
+from workers.rendering.visibility import visible_pixels
+from workers.rendering.frame import Camera
+from workers.rendering.rays import RayStage
+from workers.scenes.scene import Redraw
+
+_WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
+_BLOCK = 8
+
+
+def draw_viewpoint(
+    rays: RayStage,
+    room: Room,
+    obstacles: Obstacles,
+    target_center_m: F64,
+    params: ObservationParams,
+    robot: CandidateParams,
+    rng: np.random.Generator,
+) -> tuple[Camera, float]:
+    """A camera at a free place on the room's floor, and the share of the target that it sees.
+
+    The carrier is a column of the robot's base radius up to the camera. Raises
+    Redraw("no_viewpoint") when none of `max_viewpoints` places serves.
+    """
+    n = params.max_viewpoints
+    angle = rng.uniform(-np.pi, np.pi, n)
+    distance_m = rng.uniform(params.distance_m.low, params.distance_m.high, n)
+    height_m = rng.uniform(params.camera_height_m.low, params.camera_height_m.high, n)
+    xy = target_center_m[:2] + distance_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    column = height_m.astype(np.float32)
+    carriers = Candidates(xy.astype(np.float32), np.arange(n, dtype=np.int16), column, column, column)
+    free = base_clearance_m(carriers, obstacles, robot) >= 0
+    usable = np.flatnonzero(free & inside_polygon(xy, room.polygon_m))
+    eyes_m = np.column_stack([xy, height_m])
+    for start in range(0, len(usable), _BLOCK):
+        rows = usable[start : start + _BLOCK]
+        alone, seen = visible_pixels(rays, 0, eyes_m[rows], _WINDOW_PX)
+        share = seen / np.maximum(alone, 1)
+        good = np.flatnonzero((share >= params.min_target_fraction) & (alone > 0))
+        if len(good):
+            row = rows[good[0]]
+            return camera_at(eyes_m[row], target_center_m, params), float(share[good[0]])
+    raise Redraw("no_viewpoint")
+
+
+def camera_at(eye_m: F64, target_m: F64, params: ObservationParams) -> Camera:
+    """The observation camera at `eye_m` (3,), turned to `target_m` (3,), principal point centred."""
+    return Camera(
+        T_world_camera=look_at(eye_m, target_m),
+        width_px=params.width_px,
+        height_px=params.height_px,
+        fx_px=params.fx_px,
+        fy_px=params.fy_px,
+        cx_px=params.width_px / 2,
+        cy_px=params.height_px / 2,
+    )

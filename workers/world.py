@@ -1,0 +1,122 @@
+"""What a worker keeps between scenes: sources, geometry and hierarchies, each built once."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.specification import Specification
+from workers.geometry.mesh import F64
+from workers.houses import ids_of_split, open_houses
+from workers.houses.house import House, HouseSource
+from workers.bases.clearance import Obstacles, obstacles_of
+from workers.objects import open_objects
+from workers.objects.model import ObjectModel, ObjectSource
+from workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays
+
+# Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
+_HOUSES_KEPT = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedHouse:
+    """A house with what is derived from it once."""
+
+    house: House
+    rays: RayMesh
+    obstacles: Obstacles
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedObject:
+    """An object with its ray hierarchy."""
+
+    model: ObjectModel
+    rays: RayMesh
+
+
+@dataclass(eq=False)
+class World:
+    """Houses and objects of one specification, loaded when first needed."""
+
+    spec: Specification
+    houses: HouseSource
+    objects: ObjectSource
+    house_ids: list[str]
+    object_names: list[str]
+    target_names: list[str]
+    _houses: OrderedDict[str, PreparedHouse] = field(default_factory=OrderedDict)
+    _objects: dict[str, PreparedObject] = field(default_factory=dict)
+
+    def house(self, house_id: str) -> PreparedHouse:
+        if house_id in self._houses:
+            self._houses.move_to_end(house_id)
+            return self._houses[house_id]
+        house = self.houses.load(house_id)
+        prepared = PreparedHouse(house, house_rays(house), obstacles_of(house))
+        self._houses[house_id] = prepared
+        if len(self._houses) > _HOUSES_KEPT:
+            self._houses.popitem(last=False)
+        return prepared
+
+    def object(self, name: str) -> PreparedObject:
+        if name not in self._objects:
+            model = self.objects.load(name)
+            self._objects[name] = PreparedObject(model, object_rays(model))
+        return self._objects[name]
+
+    def stage(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayStage:
+        """A house with the named objects at these poses (K, 4, 4), ready for rays."""
+        prepared = [self.object(name) for name in names]
+        radii_m = np.array([p.model.radius_m for p in prepared])
+        return RayStage(house.rays, [p.rays for p in prepared], radii_m, T_world_object)
+
+
+def open_world(spec: Specification, houses: str, objects: str) -> World:
+    """Open the sources that `houses` and `objects` name, and check that they are the specified ones.
+
+    Raises InputError where a source has other content than the specification says, or where it
+    holds too few houses, objects or targets.
+    """
+    house_source, object_source = open_houses(houses), open_objects(objects)
+    for option, ref, source, wanted in (
+        ("--houses", houses, house_source, spec.houses),
+        ("--objects", objects, object_source, spec.objects),
+    ):
+        if (source.kind, source.digest) != (wanted.kind, wanted.digest):
+            found = f"{source.kind} with digest {source.digest[:12]}"
+            raise InputError(
+                option,
+                ref,
+                f"holds {found}, but the run was made with {wanted.kind} {wanted.digest[:12]}",
+                "Give the folder the run was started with, or start a new run",
+            )
+    return assemble_world(spec, house_source, object_source, houses, objects)
+
+
+def assemble_world(
+    spec: Specification, houses: HouseSource, objects: ObjectSource, houses_ref: str, objects_ref: str
+) -> World:
+    """A world over opened sources. Raises InputError where they hold too little for the specification."""
+    house_ids = ids_of_split(houses, spec.split)
+    if not house_ids:
+        raise InputError(
+            "--houses", houses_ref, f"has no house in split {spec.split}", "Add houses, or use --split all"
+        )
+    names = objects.names()
+    targets = [n for n in names if objects.load(n).can_be_target]
+    if not targets:
+        raise InputError(
+            "--objects", objects_ref, "has no object that a gripper could take", "Add smaller objects"
+        )
+    if len(names) <= spec.scene.n_clutter:
+        raise InputError(
+            "--objects",
+            objects_ref,
+            f"has {len(names)} objects, too few for one target and {spec.scene.n_clutter} clutter objects",
+            "Add objects, or ask for less clutter (scene.n_clutter)",
+        )
+    return World(spec, houses, objects, house_ids, names, targets)
