@@ -1,0 +1,61 @@
+"""A stored scene made whole again from its record: the same stage, without drawing or physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F64
+from workers.objects.model import ObjectModel
+from workers.rendering.frame import Camera, Stage
+from workers.rendering.rays import RayStage
+from workers.world import PreparedHouse, World
+
+Record = Mapping[str, Any]  # one row of the scene table, by field name
+
+
+@dataclass(frozen=True, eq=False)
+class RecalledScene:
+    """What a scene's record stands for."""
+
+    house: PreparedHouse
+    models: tuple[ObjectModel, ...]
+    T_world_object: F64  # (K, 4, 4)
+    rays: RayStage
+    camera: Camera
+
+    @property
+    def stage(self) -> Stage:
+        return Stage(self.house.house, self.models, self.T_world_object)
+
+
+def recall_scene(world: World, record: Record) -> RecalledScene:
+    """Rebuild the stage of a record from the sources it names.
+
+    Raises InputError where a house or an object is not there any more or has other content.
+    """
+    house = world.house(str(record["house_id"]))
+    _same(house.house.house_id, house.house.digest, str(record["house_digest"]))
+    names = [str(name) for name in record["object_name"]]
+    models = tuple(world.object(name).model for name in names)
+    for model, digest in zip(models, record["object_digest"], strict=True):
+        _same(model.name, model.digest, str(digest))
+    T_world_object = np.asarray(record["T_world_object"], np.float64)
+    fx, fy, cx, cy = (float(v) for v in record["intrinsics_px"])
+    width, height = (int(v) for v in record["image_size_px"])
+    camera = Camera(np.asarray(record["T_world_camera"], np.float64), width, height, fx, fy, cx, cy)
+    return RecalledScene(house, models, T_world_object, world.stage(house, names, T_world_object), camera)
+
+
+def _same(name: str, found: str, stored: str) -> None:
+    if found != stored:
+        raise InputError(
+            name,
+            "digest",
+            f"its content is {found[:12]}, but the scene was made with {stored[:12]}",
+            "Give the houses and objects that the run was made with",
+        )
