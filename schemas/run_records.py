@@ -13,6 +13,11 @@ from schemas.specification import Specification
 
 FORMAT_VERSION = 1
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+# One file name without folders, and a path of such names: neither can leave the run.
+AttemptName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+FilePath = Annotated[
+    str, Field(max_length=300, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*$")
+]
 Outcome = Literal[
     "committed", "superseded", "failed", "crashed", "hung", "out_of_memory", "lost", "cancelled"
 ]
@@ -64,8 +69,8 @@ class Plan(_Record):
 class FileEntry(_Record):
     """One file of a committed attempt, relative to the attempt's folder."""
 
-    path: str
-    size: int = Field(ge=0)
+    path: FilePath
+    size: int = Field(ge=0, le=2**40)
     sha256: Digest
 
 
@@ -97,11 +102,11 @@ class Commit(_Record):
 
     format_version: int = FORMAT_VERSION
     shard: int = Field(ge=0)
-    attempt: str
+    attempt: AttemptName
     spec_hash: Digest
-    scenes: int
-    samples: int
-    positives: int
+    scenes: int = Field(ge=0)
+    samples: int = Field(ge=0)
+    positives: int = Field(ge=0)
     redraws: dict[str, int]
     files: tuple[FileEntry, ...]
     cost: Cost
@@ -109,11 +114,20 @@ class Commit(_Record):
     created: str
 
 
+class AttemptStart(_Record):
+    """ledger/<attempt>.start.json: an attempt that began; without an end it was lost."""
+
+    format_version: int = FORMAT_VERSION
+    attempt: AttemptName
+    shard: int = Field(ge=0)
+    started: str
+
+
 class LedgerEntry(_Record):
     """ledger/<attempt>.json: how one attempt ended, and what it cost."""
 
     format_version: int = FORMAT_VERSION
-    attempt: str
+    attempt: AttemptName
     shard: int = Field(ge=0)
     outcome: Outcome
     cause: str = ""

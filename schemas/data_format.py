@@ -1,0 +1,100 @@
+"""The data-format page, written from the schemas: `python -m schemas.data_format`."""
+
+from __future__ import annotations
+
+import sys
+
+from schemas.fields import REDRAW_CAUSES, SCHEMAS, Field, RecordSchema
+from schemas.run_records import FORMAT_VERSION
+from schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
+
+_HEAD = f"""# Data format
+
+This page is generated: `python -m schemas.data_format > docs/data-format.md`.
+
+## A run
+
+Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix):
+
+```
+RUN/
+  manifest.json                  specification, its hash, schema version, layout, versions; written once
+  plans/<k>.json                 samples wanted; the highest k counts, a run only grows
+  shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
+  commits/<shard>.json           written last, create-only: the attempt, every file's size and sha256, cost
+  ledger/<attempt>.start.json    an attempt began
+  ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
+  quarantine/<shard>.json        a shard given up: seeds, causes, stacks
+  data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
+```
+
+Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are all
+equally long; the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by
+scene, and the samples of a scene lie together, in the order of their candidates.
+
+## Arrays
+
+Every array lies at the root of its group. The first dimension is `scene` or `sample`. Chunks hold
+the rows of one shard, or an equal part of them where a shard's rows exceed {MAX_CHUNK_BYTES // 2**20} MiB.
+Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written,
+so a missing file is damage; fill values (NaN, -1, the largest unsigned number) are no valid data.
+Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`.
+
+`data.zarr` has consolidated metadata, and the specification in its root's attributes:
+
+```python
+import xarray, zarr
+zarr.open("RUN/data.zarr", mode="r")["label"][:]
+xarray.open_zarr("RUN/data.zarr")
+```
+"""
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    parts = [_HEAD, *(_section(schema) for schema in SCHEMAS.values())]
+    parts.append(
+        "## Redraw causes\n\nAxis `redraw_cause`, in order: " + ", ".join(f"`{c}`" for c in REDRAW_CAUSES)
+    )
+    return "\n".join(part.rstrip() + "\n" for part in parts)
+
+
+def _section(schema: RecordSchema) -> str:
+    sizes = ", ".join(f"{name} {size}" for name, size in schema.sizes.items())
+    return "\n".join(
+        [
+            f"## Schema `{schema.name}`, version {schema.version}",
+            "",
+            f"Axis lengths (points and objects follow the specification): {sizes}.",
+            "",
+            *_table("scene", schema.scene_fields),
+            "",
+            *_table("sample", schema.sample_fields),
+        ]
+    )
+
+
+def _table(title: str, fields: tuple[Field, ...]) -> list[str]:
+    head = [
+        f"### One row a {title}",
+        "",
+        "| array | type | dimensions | unit | frame | range | fill | meaning |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    return head + [
+        f"| `{f.name}` | {f.dtype} | {', '.join((title, *f.dims))} | {f.unit} | {f.frame} "
+        f"| {_range(f)} | {fill_value(f)!r} | {f.doc} |"
+        for f in fields
+    ]
+
+
+def _range(field: Field) -> str:
+    if field.low is None and field.high is None:
+        return ""
+    low = "" if field.low is None else f"{field.low:g}"
+    high = "" if field.high is None else f"{field.high:g}"
+    return f"{low} .. {high}"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

@@ -1,0 +1,323 @@
+"""A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs: architecture).
+
+Readers, resume, merge, verify and audit trust commit records alone: a commit is written last and
+create-only, so that of two racing attempts one wins and the other is waste.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from pathlib import Path
+
+from schemas.errors import InputError
+from schemas.fields import RecordSchema
+from schemas.record_files import different_fields, encode_record, now, read_record
+from schemas.run_records import (
+    FORMAT_VERSION,
+    AttemptStart,
+    Commit,
+    FileEntry,
+    Layout,
+    LedgerEntry,
+    Manifest,
+    Plan,
+    QuarantineRecord,
+)
+from schemas.shard_files import sized_schema
+from schemas.storage import Storage, open_storage
+
+_NUMBERED = re.compile(r"([0-9]{1,18})\.json")
+MAX_STACK_CHARS = 20_000
+
+
+class Run:
+    """One run. Cheap to open and to send to another process; holds no lock.
+
+    Make it with `Run.create_or_open` or `Run.open`.
+    """
+
+    def __init__(self, storage: Storage, manifest: Manifest) -> None:
+        self.storage = storage
+        self.manifest = manifest
+        self._commits: dict[int, Commit] = {}  # immutable once written, so read at most once
+
+    def __repr__(self) -> str:
+        return f"Run({self.storage.url!r})"
+
+    @classmethod
+    def create_or_open(cls, storage: Storage, manifest: Manifest, n: int) -> Run:
+        """A new run of n samples, or the one that is there, grown to n if it is shorter.
+
+        An existing run keeps its layout. InputError when it has another specification or format,
+        naming every field that differs, or when the place holds files of something else.
+        """
+        if not storage.exists("manifest.json"):
+            _refuse_foreign(storage)
+            storage.put_new("manifest.json", encode_record(manifest))
+        run = cls.open(storage)
+        run._refuse_other(manifest)
+        run.grow(n)
+        return run
+
+    @classmethod
+    def open(cls, place: Storage | Path | str) -> Run:
+        """An existing run. InputError when there is none, or it is damaged or of another format."""
+        storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
+        manifest = read_record(storage, "manifest.json", Manifest)
+        if manifest is None:
+            raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
+        where = f"{storage.url}/manifest.json"
+        if manifest.format_version != FORMAT_VERSION:
+            raise InputError(
+                where,
+                "format_version",
+                f"{manifest.format_version}, and this program reads {FORMAT_VERSION}",
+                "Use the version of the program that made the run",
+            )
+        if manifest.spec.hash() != manifest.spec_hash:
+            raise InputError(
+                where,
+                "spec_hash",
+                "not the hash of the specification beside it",
+                "The manifest was edited: restore it from a copy",
+            )
+        return cls(storage, manifest)
+
+    @property
+    def layout(self) -> Layout:
+        """How scenes are cut into shards."""
+        return self.manifest.layout
+
+    @property
+    def schema(self) -> RecordSchema:
+        """The record schema with this run's axis lengths."""
+        schema = sized_schema(self.manifest.schema_name, self.manifest.spec)
+        if schema.version != self.manifest.schema_version:
+            raise InputError(
+                f"{self.storage.url}/manifest.json",
+                "schema_version",
+                f"{self.manifest.schema_version}, and this program writes {schema.version}",
+                "Use the version of the program that made the run, or start a new run",
+            )
+        return schema
+
+    # Plans: how far to go.
+
+    @property
+    def n(self) -> int:
+        """Samples wanted by the newest plan."""
+        return self._newest_plan()[1]
+
+    def grow(self, n: int) -> None:
+        """Want at least n samples. A run never shrinks."""
+        if not 1 <= n <= 10**12:
+            raise InputError("--n", "", f"{n} samples", "Ask for 1 to 10^12 samples")
+        while True:
+            number, wanted = self._newest_plan()
+            if wanted >= n:
+                return
+            # Losing this race means that another plan appeared: look again.
+            self.storage.put_new(f"plans/{number + 1}.json", encode_record(Plan(n=n, created=now())))
+
+    def _newest_plan(self) -> tuple[int, int]:
+        numbers = self._numbers("plans", width=1)
+        if not numbers:
+            return 0, 0
+        key = f"plans/{max(numbers)}.json"
+        plan = read_record(self.storage, key, Plan)
+        return (max(numbers), plan.n) if plan else self._newest_plan()
+
+    # Shards and commits.
+
+    def planned(self) -> range:
+        """Indices of the shards that hold the wanted samples."""
+        return range(self.layout.shards_for(self.n))
+
+    def committed(self) -> set[int]:
+        """Indices of committed shards, by listing."""
+        return self._numbers("commits")
+
+    def missing(self) -> list[int]:
+        """Planned shards that are neither committed nor in quarantine, in order."""
+        return sorted(set(self.planned()) - self.committed() - self.quarantined())
+
+    def planned_rows(self, shard: int) -> tuple[int, int]:
+        """(scenes, samples) of a shard that the newest plan wants; the last shard may be cut."""
+        samples = min(max(self.n - shard * self.layout.samples_per_shard, 0), self.layout.samples_per_shard)
+        return -(-samples // self.layout.candidates_per_scene), samples
+
+    def commit_of(self, shard: int) -> Commit:
+        """The commit record of a committed shard, checked against the manifest."""
+        if shard not in self._commits:
+            key = commit_key(shard)
+            commit = read_record(self.storage, key, Commit)
+            place = f"{self.storage.url}/{key}"
+            if commit is None:
+                raise InputError(place, "", "no such commit", "Submit the run again to make the shard")
+            expected = {
+                "shard": shard,
+                "spec_hash": self.manifest.spec_hash,
+                "scenes": self.layout.scenes_per_shard,
+                "samples": self.layout.samples_per_shard,
+            }
+            for field, value in expected.items():
+                if (given := getattr(commit, field)) != value:
+                    raise InputError(
+                        place, field, f"{given}, where this run has {value}", "Remove this foreign commit"
+                    )
+            self._commits[shard] = commit
+        return self._commits[shard]
+
+    def commits(self) -> Iterator[Commit]:
+        """Commit records of all committed shards, in order of their shards."""
+        for shard in sorted(self.committed()):
+            yield self.commit_of(shard)
+
+    def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
+        """Write an attempt's files durably; its entries for the commit. Nothing counts before it."""
+        folder = shard_folder(shard, attempt)
+        entries = tuple(
+            FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())
+            for path, data in files.items()
+        )
+        for path, data in files.items():
+            self.storage.put(f"{folder}/{path}", data)
+        self.storage.sync(f"{folder}/{path}" for path in files)
+        return entries
+
+    def commit(self, commit: Commit) -> bool:
+        """Publish a shard. False when another attempt has won; its files then are garbage."""
+        self.check_files(commit)
+        return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
+
+    def check_files(self, commit: Commit) -> None:
+        """Refuse a commit whose files are absent or of another size (bytes are not read)."""
+        folder = shard_folder(commit.shard, commit.attempt)
+        sizes = {f.key: f.size for f in self.storage.list(folder)}
+        for entry in commit.files:
+            size = sizes.get(f"{folder}/{entry.path}")
+            if size != entry.size:
+                raise InputError(
+                    f"{self.storage.url}/{folder}/{entry.path}",
+                    "",
+                    "missing" if size is None else f"{size} bytes, where the commit has {entry.size}",
+                    f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
+                )
+
+    def check_digests(self, commit: Commit) -> None:
+        """Refuse a commit one of whose files has other bytes than were committed."""
+        self.check_files(commit)
+        folder = shard_folder(commit.shard, commit.attempt)
+        for entry in commit.files:
+            key = f"{folder}/{entry.path}"
+            data = self.storage.get(key, entry.size)
+            if data is None or sha256(data).hexdigest() != entry.sha256:
+                raise InputError(
+                    f"{self.storage.url}/{key}",
+                    "sha256",
+                    "the file is damaged",
+                    f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
+                )
+
+    # Ledger and quarantine.
+
+    def start_attempt(self, attempt: str, shard: int) -> None:
+        """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
+        record = AttemptStart(attempt=attempt, shard=shard, started=now())
+        if not self.storage.put_new(f"ledger/{attempt}.start.json", encode_record(record)):
+            place = f"{self.storage.url}/ledger/{attempt}.start.json"
+            raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")
+
+    def end_attempt(self, entry: LedgerEntry) -> bool:
+        """Note how an attempt ended; False when its end was noted before. Long stacks are cut."""
+        kept = entry.model_copy(
+            update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
+        )
+        return self.storage.put_new(f"ledger/{entry.attempt}.json", encode_record(kept))
+
+    def ledger(self) -> Iterator[LedgerEntry]:
+        """Ends of all attempts, in order of their names."""
+        for name in sorted(self._ledger_names()):
+            if not name.endswith(".start"):
+                entry = read_record(self.storage, f"ledger/{name}.json", LedgerEntry)
+                if entry is not None:
+                    yield entry
+
+    def unfinished_attempts(self) -> list[AttemptStart]:
+        """Attempts that began and left no end: running elsewhere, or lost."""
+        names = self._ledger_names()
+        open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
+        found = (read_record(self.storage, f"ledger/{name}.json", AttemptStart) for name in open_)
+        return [start for start in found if start is not None]
+
+    def quarantine(self, record: QuarantineRecord) -> bool:
+        """Give a shard up; False when it was before."""
+        cut = tuple(stack[-MAX_STACK_CHARS:] for stack in record.stacks)
+        kept = record.model_copy(update={"stacks": cut})
+        return self.storage.put_new(f"quarantine/{record.shard:06d}.json", encode_record(kept))
+
+    def quarantined(self) -> set[int]:
+        """Shards that were given up, by listing. One that was committed later counts as committed."""
+        return self._numbers("quarantine") - self.committed()
+
+    def quarantine_records(self) -> list[QuarantineRecord]:
+        """Records of the shards in quarantine, in order."""
+        keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
+        found = (read_record(self.storage, key, QuarantineRecord) for key in keys)
+        return [record for record in found if record is not None]
+
+    def _numbers(self, folder: str, width: int = 6) -> set[int]:
+        numbers: set[int] = set()
+        for file in self.storage.list(folder):
+            name = file.key.removeprefix(f"{folder}/")
+            # Only names that this program gives: not drafts, and not "7.json" for "000007.json".
+            if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
+                numbers.add(int(found.group(1)))
+        return numbers
+
+    def _ledger_names(self) -> set[str]:
+        names = {f.key.rsplit("/", 1)[-1] for f in self.storage.list("ledger")}
+        return {name.removesuffix(".json") for name in names if name.endswith(".json")}
+
+    def _refuse_other(self, manifest: Manifest) -> None:
+        ours = manifest.model_dump(mode="json")
+        theirs = self.manifest.model_dump(mode="json")
+        keys = ("spec", "schema_name", "schema_version")
+        rows = different_fields({k: ours[k] for k in keys}, {k: theirs[k] for k in keys})
+        if self.layout.candidates_per_scene != manifest.layout.candidates_per_scene:
+            raise InputError(
+                f"{self.storage.url}/manifest.json",
+                "layout.candidates_per_scene",
+                f"{self.layout.candidates_per_scene}, not the {manifest.layout.candidates_per_scene} asked",
+                "Choose another --out",
+            )
+        if rows:
+            shown = [f"{path.removeprefix('spec.')}: it has {b!r}, asked {a!r}" for path, a, b in rows[:20]]
+            more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
+            raise InputError(
+                f"{self.storage.url}/manifest.json",
+                "",
+                "another specification lives here (" + "; ".join(shown) + more + ")",
+                "Choose another --out, or ask for what it has",
+            )
+
+
+def shard_folder(shard: int, attempt: str) -> str:
+    """Key of the folder of one attempt at a shard."""
+    return f"shards/{shard:06d}/{attempt}"
+
+
+def commit_key(shard: int) -> str:
+    """Key of a shard's commit record."""
+    return f"commits/{shard:06d}.json"
+
+
+def _refuse_foreign(storage: Storage) -> None:
+    ours = re.compile(r"^(manifest\.json|plans/|shards/|commits/|ledger/|\.probe-)")
+    for file in storage.list(""):
+        if not ours.match(file.key):
+            raise InputError(
+                storage.url, file.key, "the folder holds files of something else", "Choose a new --out"
+            )

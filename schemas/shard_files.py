@@ -1,0 +1,206 @@
+"""A shard as files: one immutable, flat Zarr v3 group, made in memory.
+
+All arrays of both tables lie at the group's root; their first dimension is "scene" or "sample".
+Chunks are bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no
+folders ("c.0.0"), so that a shard is one folder an array. The metadata is made by zarr-python once
+per layout; chunks are encoded directly, because creating 50 arrays through zarr-python costs more
+than a tenth of a second per shard. Tests hold the bytes equal to what zarr-python writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import numpy.typing as npt
+import zarr
+from numcodecs.vlen import VLenUTF8
+from numcodecs.zstd import Zstd
+from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
+from zarr.storage import MemoryStore
+
+from schemas.errors import InputError
+from schemas.fields import REDRAW_CAUSES, SCHEMAS, Field, RecordSchema, Table
+from schemas.run_records import Layout
+from schemas.specification import Specification
+
+Array = npt.NDArray[Any]
+
+ZSTD_LEVEL = 3
+MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
+MAX_TEXT_BYTES = 4096  # one name; a longer one is not a name
+TABLES: tuple[Table, Table] = ("scene", "sample")
+
+
+def schema_for(spec: Specification) -> RecordSchema:
+    """The record schema of a specification's label source, with the specification's axis lengths."""
+    return sized_schema(spec.label_source, spec)
+
+
+def sized_schema(name: str, spec: Specification) -> RecordSchema:
+    """The named schema with the specification's axis lengths. InputError for an unknown name."""
+    if name not in SCHEMAS:
+        raise InputError(
+            "specification",
+            "label_source",
+            f"no record schema called {name!r}",
+            "Choose one of: " + ", ".join(sorted(SCHEMAS)),
+        )
+    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)
+
+
+def rows_per_shard(layout: Layout, table: Table) -> int:
+    """Rows of a table in every shard."""
+    return layout.scenes_per_shard if table == "scene" else layout.samples_per_shard
+
+
+def chunk_rows(schema: RecordSchema, field: Field, rows: int) -> int:
+    """Rows of one chunk: the largest divisor of a shard's rows that keeps a chunk small.
+
+    A divisor, because the sealed store is a regular grid over equal shards.
+    """
+    if field.is_text:
+        return rows
+    row_bytes = int(np.prod(schema.shape(field, 1))) * np.dtype(field.dtype).itemsize
+    most = max(1, MAX_CHUNK_BYTES // row_bytes)
+    return next(c for c in range(min(rows, most), 0, -1) if rows % c == 0)
+
+
+def chunk_key(field: Field, index: int) -> str:
+    """Name of a field's chunk: its index along the rows, and 0 along the field's own axes."""
+    return ".".join(["c", str(index), *("0" for _ in field.dims)])
+
+
+def fill_value(field: Field) -> Any:
+    """What a missing chunk would read as: never a plausible value."""
+    if field.is_text:
+        return ""
+    dtype = np.dtype(field.dtype)
+    if dtype.kind == "f":
+        return float("nan")
+    if dtype.kind == "b":
+        return False
+    return -1 if dtype.kind == "i" else int(np.iinfo(dtype).max)
+
+
+def encode_shard(
+    schema: RecordSchema,
+    layout: Layout,
+    spec_hash: str,
+    scene_arrays: Mapping[str, Array],
+    sample_arrays: Mapping[str, Array],
+) -> dict[str, bytes]:
+    """The files of one full shard, by path within the attempt's folder.
+
+    `scene_arrays` have `layout.scenes_per_shard` rows, `sample_arrays` `samples_per_shard`, sorted
+    by scene. InputError when an array breaks the schema.
+    """
+    files = dict(group_metadata(schema, layout, spec_hash))
+    for table, arrays in zip(TABLES, (scene_arrays, sample_arrays), strict=True):
+        rows = rows_per_shard(layout, table)
+        schema.check(table, rows, arrays)
+        for field in schema.table(table):
+            step = chunk_rows(schema, field, rows)
+            for i in range(rows // step):
+                part = arrays[field.name][i * step : (i + 1) * step]
+                files[f"{field.name}/{chunk_key(field, i)}"] = encode_chunk(field, part)
+    return files
+
+
+def encode_chunk(field: Field, values: Array) -> bytes:
+    """One chunk's bytes as zarr's codecs write them."""
+    if field.is_text:
+        raw = VLenUTF8().encode(_checked_text(field, values))
+    else:
+        raw = np.ascontiguousarray(values, np.dtype(field.dtype).newbyteorder("<"))
+    packed = bytes(Zstd(level=ZSTD_LEVEL).encode(raw))
+    return packed + google_crc32c.value(packed).to_bytes(4, "little")
+
+
+def group_metadata(schema: RecordSchema, layout: Layout, spec_hash: str) -> Mapping[str, bytes]:
+    """Every zarr.json of a shard, by path: the root's with the schema's name, and each array's."""
+    key = (schema.name, schema.version, schema.scene_fields, schema.sample_fields)
+    cut = (layout.scenes_per_shard, layout.candidates_per_scene)
+    return _metadata(*key, tuple(sorted(schema.sizes.items())), cut, spec_hash)
+
+
+@lru_cache(maxsize=16)
+def _metadata(
+    name: str,
+    version: int,
+    scene_fields: tuple[Field, ...],
+    sample_fields: tuple[Field, ...],
+    sizes: tuple[tuple[str, int], ...],
+    cut: tuple[int, int],
+    spec_hash: str,
+) -> Mapping[str, bytes]:
+    layout = Layout(scenes_per_shard=cut[0], candidates_per_scene=cut[1])
+    schema = RecordSchema(name, version, scene_fields, sample_fields, dict(sizes))
+    rows: dict[str, int] = {t: rows_per_shard(layout, t) for t in TABLES}
+    return zarr_metadata(schema, layout, rows, root_attributes(schema, layout, spec_hash))
+
+
+def root_attributes(schema: RecordSchema, layout: Layout, spec_hash: str) -> dict[str, Any]:
+    """Attributes of a shard's group and, with more, of the sealed store."""
+    return {
+        "schema": schema.name,
+        "schema_version": schema.version,
+        "spec_hash": spec_hash,
+        "scenes_per_shard": layout.scenes_per_shard,
+        "candidates_per_scene": layout.candidates_per_scene,
+        "redraw_causes": list(REDRAW_CAUSES),
+    }
+
+
+def zarr_metadata(
+    schema: RecordSchema, layout: Layout, rows: Mapping[str, int], attributes: Mapping[str, Any]
+) -> dict[str, bytes]:
+    """zarr.json files of a group with so many rows a table; chunks are those of the layout's shards."""
+    store: dict[str, Any] = {}
+    group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes=dict(attributes))
+    for table in TABLES:
+        for field in schema.table(table):
+            step = chunk_rows(schema, field, rows_per_shard(layout, table))
+            codec = VLenUTF8Codec() if field.is_text else BytesCodec(endian="little")
+            group.create_array(
+                field.name,
+                shape=schema.shape(field, rows[table]),
+                chunks=schema.shape(field, step),
+                dtype=field.dtype,
+                fill_value=fill_value(field),
+                serializer=codec,
+                compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
+                filters=None,
+                chunk_key_encoding={"name": "default", "separator": "."},
+                dimension_names=(table, *field.dims),
+                attributes=field_attributes(field),
+                config={"write_empty_chunks": True},
+            )
+    return {path: buffer.to_bytes() for path, buffer in store.items()}
+
+
+def field_attributes(field: Field) -> dict[str, Any]:
+    """An array's attributes: CF names where they exist."""
+    attributes: dict[str, Any] = {"long_name": field.doc, "units": field.unit, "frame": field.frame}
+    bounds = {"valid_min": field.low, "valid_max": field.high}
+    return {k: v for k, v in {**attributes, **bounds}.items() if v not in (None, "")}
+
+
+def _checked_text(field: Field, values: Array) -> Array:
+    texts = np.asarray(values, dtype=object)
+    for text in texts.flat:
+        try:
+            ok = isinstance(text, str) and len(text.encode()) <= MAX_TEXT_BYTES
+        except UnicodeEncodeError:
+            ok = False
+        if not ok:
+            raise InputError(
+                "batch",
+                field.name,
+                f"{text!r:.60} is not text of at most {MAX_TEXT_BYTES} bytes",
+                "Give the house or object a short name in valid Unicode",
+            )
+    return texts

@@ -1,0 +1,62 @@
+"""A sealed store that travels without its run: read as slices of shards by its own attributes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import InputError, choices
+from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, read_metadata
+from schemas.storage import open_storage
+
+_MEND = "Seal the run again, and copy its data.zarr whole"
+
+
+def is_sealed_store(place: Path | str) -> bool:
+    """Whether the place is named like a sealed store (`....zarr`) and not like a run."""
+    return str(place).rstrip("/").endswith(".zarr")
+
+
+def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], dict[str, StoredArray]]:
+    """Its shards and the named arrays. InputError when it is not a sealed store or lacks a field."""
+    storage = open_storage(place, probe=False, create=False)
+    data = storage.get("zarr.json", 64 * MAX_META_BYTES)
+    where = f"{storage.url}/zarr.json"
+    if data is None:
+        raise InputError(where, "", "no such file", "Name a run's folder or a sealed data.zarr")
+    try:
+        meta: dict[str, Any] = json.loads(data)
+        attributes = meta["attributes"]
+        per_shard = int(attributes["scenes_per_shard"])
+        per_scene = int(attributes["candidates_per_scene"])
+        stored = list(meta["consolidated_metadata"]["metadata"])
+    except (ValueError, KeyError, TypeError, RecursionError) as e:
+        raise InputError(where, "", f"not the root of a sealed store ({e})", _MEND) from e
+    for name in names:
+        if name not in stored:
+            raise InputError(storage.url, name, "the store has no such field", choices(stored))
+    arrays = read_metadata(storage, "", names)
+    scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
+    samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
+    if len(scenes) != 1 or len(samples) != 1 or per_shard < 1 or per_scene < 1:
+        raise InputError(where, "shape", "arrays of one table differ in length", _MEND)
+    n_scenes, n_samples = scenes.pop(), samples.pop()
+    full = per_shard * per_scene
+    for array in arrays.values():
+        if (per_shard if array.dims[0] == "scene" else full) % array.chunk_rows:
+            raise InputError(where, array.name, "chunks that do not divide a shard", _MEND)
+    shards = [
+        ShardPlace(
+            storage,
+            "",
+            i,
+            min(per_shard, n_scenes - i * per_shard),
+            min(full, n_samples - i * full),
+            per_shard,
+            full,
+        )
+        for i in range(min(-(-n_scenes // per_shard), -(-n_samples // full)))
+    ]
+    return shards, arrays
