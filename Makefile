@@ -1,0 +1,55 @@
+# `make demo` and `make test` are all the set-up there is; both are incremental.
+PYTHON ?= python3
+# Test workers; 1 runs them in one process.
+JOBS ?= 2
+
+BIN := .venv/bin
+CODE := cluster datagen schemas train workers tests benchmarks scripts
+DEMO := build/demo
+
+.PHONY: help demo test lint format docs venv clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
+	@echo "make test    format check, lint, types, layers, tests"
+	@echo "make lint    the same without tests"
+	@echo "make format  rewrite the code in the project's format"
+	@echo "make docs    rewrite docs/data-format.md from the schemas"
+	@echo "make venv    only the environment (.venv); PYTHON=python3.12 chooses another interpreter"
+	@echo "make clean   remove everything that make made"
+
+# Does nothing when pyproject.toml, constraints.txt and the interpreter are those of the last call.
+venv:
+	@$(PYTHON) scripts/environment.py
+
+demo: venv
+	@rm -rf $(DEMO)
+	@mkdir -p $(DEMO)
+	$(BIN)/datagen submit heuristic --n 600 --out $(DEMO)/run
+	$(BIN)/datagen show $(DEMO)/run --scene 0 --out $(DEMO)/scene-0.png
+	$(BIN)/datagen status $(DEMO)/run
+	$(BIN)/datagen audit $(DEMO)/run
+	@echo "the picture: $(DEMO)/scene-0.png"
+
+test: lint
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
+
+lint: venv
+	$(BIN)/ruff format --check --quiet $(CODE)
+	$(BIN)/ruff check --quiet $(CODE)
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/pyright
+
+format: venv
+	$(BIN)/ruff check --fix --quiet $(CODE) || true
+	$(BIN)/ruff format $(CODE)
+
+docs: venv
+	@mkdir -p build
+	$(BIN)/python -m schemas.data_format > build/data-format.md
+	mv build/data-format.md docs/data-format.md
+
+clean:
+	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info
+	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +

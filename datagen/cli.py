@@ -1,0 +1,143 @@
+"""The program `datagen`: its verbs, and what becomes of errors on the way out.
+
+Exit codes: 0 good, 1 finished with too many failures, 2 bad input, 130 interrupted. Verbs are loaded
+only when called, so that `datagen --help` does not wait for simulators.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from typing import TYPE_CHECKING
+
+from cyclopts import App
+from cyclopts.exceptions import CycloptsError, UnknownCommandError
+
+from datagen import __version__
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pydantic import ValidationError
+
+EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
+
+# Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
+VERBS: dict[str, tuple[str, str]] = {
+    "submit": ("datagen.submit:submit", "Make labels: start a run, or resume it."),
+    "status": ("datagen.status:status", "How far a run is, and what failed."),
+    "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
+    "show": ("datagen.show:show", "A picture of one scene of a run."),
+    "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
+    "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
+}
+
+# The machine's fault, not the program's: the disk is full or the place cannot be written.
+_PLACE_ERRNOS = {
+    errno.ENOSPC: "free some space, or choose another place",
+    errno.EDQUOT: "the quota is used up: free some space, or choose another place",
+    errno.EROFS: "choose a place that can be written",
+    errno.EACCES: "choose a place that you may use, or change its permissions",
+    errno.EPERM: "choose a place that you may use, or change its permissions",
+    errno.EMFILE: "raise the limit of open files: ulimit -n 65536",
+    errno.EFBIG: "choose a file system that holds larger files",
+    errno.ENAMETOOLONG: "choose a shorter path",
+}
+
+
+def build_app() -> App:
+    """The command line with every verb of `VERBS` registered and none imported."""
+    app = App(
+        name="datagen",
+        help="Labelled robot base poses from furnished houses.",
+        version=f"datagen {__version__}",
+        # `main` prints errors itself: one line each, without a frame.
+        print_error=False,
+        exit_on_error=False,
+        result_action="return_value",
+    )
+    for verb, (target, line) in VERBS.items():
+        app.command(target, name=verb, help=line)
+    return app
+
+
+def one_line(text: str) -> str:
+    """The text without line breaks, control characters or runs of spaces."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def _usage_line(error: CycloptsError) -> str:
+    """One line for a wrong command line; unknown verbs are answered without loading the known ones."""
+    error.verbose = False
+    if isinstance(error, UnknownCommandError) and not error.command_chain:
+        token = (error.unused_tokens or ["?"])[0]
+        word = "option" if token.startswith("-") else "command"
+        return f'unknown {word} "{token}". Choose one of: {", ".join(VERBS)}'
+    chain = " ".join(error.command_chain or ())
+    return f"{error} See: datagen {chain} --help" if chain else f"{error} See: datagen --help"
+
+
+def _validation_lines(error: ValidationError) -> list[str]:
+    """One line for each field that a model refused."""
+    lines: list[str] = []
+    for detail in error.errors(include_url=False, include_context=False):
+        field = ".".join(str(part) for part in detail["loc"]) or "value"
+        given = one_line(repr(detail["input"]))
+        given = given if len(given) <= 80 else given[:77] + "..."
+        lines.append(f"{error.title}: {field}: {detail['msg']}. Given: {given}")
+    return lines
+
+
+def _lines_for(error: Exception) -> list[str] | None:
+    """What the user is told, or None when the error is a defect of this program."""
+    if isinstance(error, InputError):
+        return [str(error)]
+    if isinstance(error, CycloptsError):
+        return [_usage_line(error)]
+    if isinstance(error, OSError) and error.errno in _PLACE_ERRNOS:
+        place = error.filename or error.filename2 or "output"
+        reason = os.strerror(error.errno)
+        return [f"{place}: {reason}. Mend: {_PLACE_ERRNOS[error.errno]}"]
+    # pydantic takes 0.1 s to import; whoever raised its error has imported it.
+    if "pydantic" in sys.modules:
+        from pydantic import ValidationError
+
+        if isinstance(error, ValidationError):
+            return _validation_lines(error)
+    return None
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line and return its exit code; messages go to standard error.
+
+    Defects of this program are not caught: their traceback is what a report of them needs.
+    """
+    try:
+        result = build_app()(list(arguments))
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader went away (`datagen status | head`). Python's own flush at exit would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_GOOD
+    except Exception as error:
+        lines = _lines_for(error)
+        if lines is None:
+            raise
+        for line in lines:
+            print(f"error: {one_line(line)}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    return result if isinstance(result, int) else EXIT_GOOD
+
+
+def main() -> None:
+    """The console script."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

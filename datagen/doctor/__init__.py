@@ -1,0 +1,101 @@
+"""`datagen doctor`: what this machine can do, each problem with its mend."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from datagen.doctor.check import Check
+from datagen.doctor.engines import engine_checks
+from datagen.doctor.host import host_checks
+from schemas.errors import InputError
+
+_COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+
+
+def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
+    try:
+        n = count(ref)
+    except InputError as error:
+        return Check(name, "fail", f"{error.place}: {error.problem}", error.mend)
+    if n == 0:
+        return Check(name, "fail", f"{ref}: none", "Name a folder that holds some.")
+    return Check(name, "ok", f"{n} from {ref}")
+
+
+def _houses(ref: str) -> int:
+    from workers.houses import open_houses
+
+    return len(open_houses(ref).house_ids())
+
+
+def _objects(ref: str) -> int:
+    from workers.objects import open_objects
+
+    return len(open_objects(ref).names())
+
+
+def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
+    """Counts of houses and objects: those named, else those in DATAGEN_ASSETS, else the built-in ones."""
+    root = os.environ.get("DATAGEN_ASSETS")
+    if root and houses is None and (Path(root) / "procthor").is_dir():
+        houses = f"procthor:{Path(root) / 'procthor'}"
+    if root and objects is None and (Path(root) / "ycb").is_dir():
+        objects = f"ycb:{Path(root) / 'ycb'}"
+    return [_count("houses", houses or "builtin", _houses), _count("objects", objects or "builtin", _objects)]
+
+
+def as_json(checks: list[Check]) -> str:
+    """`{"ok": bool, "checks": [{"name", "status", "detail", "mend"}, ...]}`, in the order of the table."""
+    good = all(check.status != "fail" for check in checks)
+    return json.dumps({"ok": good, "checks": [asdict(check) for check in checks]}, indent=2)
+
+
+def as_table(checks: list[Check]) -> Table:
+    """One row a check; the mend under the finding."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for check in checks:
+        # Details hold paths and messages of others: Text, because brackets in them are not markup.
+        finding = Text(check.detail)
+        if check.mend:
+            finding.append(f"\n-> {check.mend}", style="cyan")
+        table.add_row(Text(check.status, style=_COLOURS[check.status]), check.name, finding)
+    return table
+
+
+def doctor(*, json: bool = False, houses: str | None = None, objects: str | None = None) -> int:
+    """Say what this machine can do, and how to mend what it cannot.
+
+    Exits with 0 when labels can be made here, else with 1.
+
+    Parameters
+    ----------
+    json:
+        Print JSON instead of a table.
+    houses:
+        Houses to look for: builtin, procthor:DIR or ai2thor:DIR.
+    objects:
+        Objects to look for: builtin or ycb:DIR.
+    """
+    checks = [*host_checks(), *engine_checks(), *asset_checks(houses, objects)]
+    failures = sum(check.status == "fail" for check in checks)
+    if json:
+        sys.stdout.write(as_json(checks) + "\n")
+    else:
+        console = Console(highlight=False)
+        console.print(as_table(checks))
+        warnings = sum(check.status == "warn" for check in checks)
+        verdict = "labels can be made here" if not failures else "labels cannot be made here yet"
+        console.print(f"\n{verdict}: {failures} failed, {warnings} warned")
+    return 1 if failures else 0

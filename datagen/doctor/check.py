@@ -1,0 +1,60 @@
+"""One finding of the doctor, and the probe that asks an engine a question in a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import Literal
+
+Status = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report. `fail` means that labels cannot be made; `warn` that something is lost.
+
+    `mend` is what to do about it, "" where nothing is to be done.
+    """
+
+    name: str
+    status: Status
+    detail: str
+    mend: str = ""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """How a probe ended: its last line of output, or why there is none."""
+
+    succeeded: bool
+    text: str
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1][:200] if lines else ""
+
+
+def probe(code: str, timeout_s: float = 60.0) -> Probe:
+    """Run Python code in a fresh interpreter, so that a crash or a hang there is only a finding here."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(False, f"no answer within {timeout_s:.0f} s")
+    except OSError as error:
+        return Probe(False, f"could not start an interpreter: {error.strerror}")
+    if done.returncode == 0:
+        return Probe(True, _last_line(done.stdout))
+    if done.returncode < 0:
+        return Probe(False, f"crashed with {signal.Signals(-done.returncode).name}")
+    return Probe(False, _last_line(done.stderr) or f"exit code {done.returncode}")

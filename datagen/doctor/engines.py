@@ -1,0 +1,96 @@
+"""Whether each engine works, asked in processes of their own: one step, one ray, one frame."""
+
+from __future__ import annotations
+
+from datagen.doctor.check import Check, probe
+
+_SAPIEN_PHYSICS = """
+import importlib, importlib.metadata
+sapien = importlib.import_module("sapien")
+scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+builder = scene.create_actor_builder()
+builder.add_box_collision(half_size=[0.05, 0.05, 0.05])
+builder.initial_pose = sapien.Pose([0, 0, 1])
+actor = builder.build(name="cube")
+scene.step()
+assert actor.pose.p[2] < 1.0, "the cube does not fall"
+print("sapien " + importlib.metadata.version("sapien") + ", a cube falls")
+"""
+
+# A render system is created before anything is drawn, and it is what fails without a device.
+_SAPIEN_RENDER = """
+import importlib
+sapien = importlib.import_module("sapien")
+system = sapien.render.RenderSystem()
+print(system.device.name)
+"""
+
+_PYBULLET = """
+import importlib, importlib.metadata
+p = importlib.import_module("pybullet")
+p.connect(p.DIRECT)
+p.setGravity(0, 0, -9.81)
+shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.05, 0.05, 0.05])
+body = p.createMultiBody(1.0, shape, basePosition=[0, 0, 1])
+p.stepSimulation()
+assert p.getBasePositionAndOrientation(body)[0][2] < 1.0, "the cube does not fall"
+print("pybullet " + importlib.metadata.version("pybullet") + ", a cube falls")
+"""
+
+_EMBREE = """
+import importlib.metadata
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+scene = EmbreeScene()
+TriangleMesh(scene, np.array([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], np.float32))
+origin = np.array([[0, 0, 1]], np.float32)
+hit = scene.run(origin, np.array([[0, 0, -1]], np.float32))
+miss = scene.run(origin, np.array([[0, 0, 1]], np.float32))
+assert hit[0] == 0 and miss[0] == -1, "a ray goes astray"
+print("embreex " + importlib.metadata.version("embreex") + ", a ray hits")
+"""
+
+_RAY = """
+import importlib
+ray = importlib.import_module("ray")
+print("ray " + ray.__version__)
+"""
+
+_MESA_MEND = (
+    "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
+    "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
+)
+
+
+def engine_checks() -> list[Check]:
+    """Settlers, renderers, the ray caster and Ray. One working settler is enough."""
+    sapien, pybullet = probe(_SAPIEN_PHYSICS), probe(_PYBULLET)
+    # An engine that is lost is a loss; with both lost there is nothing left to settle scenes with.
+    lost = "warn" if sapien.succeeded or pybullet.succeeded else "fail"
+    embree, ray = probe(_EMBREE), probe(_RAY)
+    checks = [
+        Check("sapien physics", "ok", sapien.text)
+        if sapien.succeeded
+        else Check(
+            "sapien physics", lost, sapien.text, "See the libraries above, or use --settler pybullet."
+        ),
+        Check("pybullet", "ok", pybullet.text)
+        if pybullet.succeeded
+        else Check(
+            "pybullet", lost, pybullet.text, "Install again: make clean venv; or use --settler sapien."
+        ),
+        Check("embree", "ok", embree.text)
+        if embree.succeeded
+        else Check("embree", "fail", embree.text, "Install again: make clean venv."),
+        Check("ray", "ok", ray.text)
+        if ray.succeeded
+        else Check("ray", "warn", ray.text, "Install again: make clean venv; or use --workers 1."),
+    ]
+    if sapien.succeeded:
+        device = probe(_SAPIEN_RENDER)
+        if device.succeeded:
+            checks.append(Check("sapien render device", "ok", device.text))
+        else:
+            checks.append(Check("sapien render device", "warn", device.text, _MESA_MEND))
+    return checks
