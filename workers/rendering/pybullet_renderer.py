@@ -1,0 +1,213 @@
+"""RGB-D frames and visible pixels by pybullet's TinyRenderer: a software rasteriser, no render device."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import numpy.typing as npt
+import pybullet
+from PIL import Image
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
+from workers.geometry.transforms import inverse, look_at, quaternion_wxyz
+from workers.rendering.frame import I16, Camera, Frame, Stage
+
+# Depth range; what is nearer or farther is not drawn.
+_NEAR_M, _FAR_M = 0.02, 60.0
+# Bullet silently drops what exceeds 131,072 vertices of one mesh.
+_MAX_FACES = 40_000
+_PALETTE_WIDTH = 256
+_LIGHT_DIRECTION = [0.35, 0.25, 0.90]
+_AMBIENT, _DIFFUSE = 0.55, 0.45
+
+
+def render_pybullet(stage: Stage, camera: Camera) -> Frame:
+    """The whole frame of a stage, built from scratch. Raises InputError where Bullet cannot."""
+    with PybulletStage(stage) as loaded:
+        return loaded.render(camera)
+
+
+class PybulletStage:
+    """A stage loaded once, for many images; a context manager that frees it at the end."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._closing = ExitStack()
+        self._alone: dict[int, _Drawing] = {}
+        with ExitStack() as undo:  # a stage that fails to load leaves nothing behind
+            self._full = undo.enter_context(_Drawing())
+            self._full.add(concatenate([body.visual for body in stage.house.bodies]), np.eye(4), 0)
+            for k, model in enumerate(stage.objects):
+                self._full.add(model.visual, stage.T_world_object[k], 1 + k)
+            self._closing = undo.pop_all()
+
+    def __enter__(self) -> PybulletStage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.close()
+
+    def render(self, camera: Camera) -> Frame:
+        """The frame that a camera sees."""
+        return self._full.render(camera)
+
+    def visible_pixels(self, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
+        """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
+
+        The same cameras as `workers.rendering.visibility.visible_pixels`: each eye (N, 3) looks at
+        the target's centre through `window` x `window` pixels that touch its bounding sphere.
+        """
+        if target not in self._alone:
+            drawing = self._closing.enter_context(_Drawing())
+            drawing.add(self._stage.objects[target].visual, self._stage.T_world_object[target], 1 + target)
+            self._alone[target] = drawing
+        alone_px, visible_px = np.zeros(len(eyes_m), np.int32), np.zeros(len(eyes_m), np.int32)
+        centre_m = self._stage.T_world_object[target, :3, 3]
+        radius_m = self._stage.objects[target].radius_m
+        for row, eye_m in enumerate(eyes_m):
+            distance_m = float(np.linalg.norm(eye_m - centre_m))
+            if distance_m <= radius_m * 1.05:
+                continue
+            sine = radius_m / distance_m
+            f_px = window / 2 * np.sqrt(1 - sine**2) / sine
+            T = look_at(eye_m, centre_m)
+            camera = Camera(T, window, window, f_px, f_px, window / 2, window / 2)
+            on_target = self._alone[target].bodies(camera) == 1 + target
+            alone_px[row] = on_target.sum()
+            visible_px[row] = (on_target & (self._full.bodies(camera) == 1 + target)).sum()
+        return alone_px, visible_px
+
+
+class _Drawing:
+    """One Bullet world that holds visual meshes only, each with the number that pixels report."""
+
+    def __init__(self) -> None:
+        self._world: int = pybullet.connect(pybullet.DIRECT)
+        if self._world < 0:
+            mend = "Draw fewer stages at once in one process, or take another renderer"
+            raise InputError("--renderer", "pybullet", "Bullet cannot open another world", mend)
+        self._label_of_body: list[int] = []
+
+    def __enter__(self) -> _Drawing:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pybullet.disconnect(physicsClientId=self._world)
+
+    def add(self, mesh: Mesh, T_world_mesh: F64, label: int) -> None:
+        """Draw a mesh at a pose (4, 4); its pixels report `label`."""
+        uv, image = _texture_of(mesh)
+        with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
+            file = Path(folder) / "texture.png"
+            Image.fromarray(image).save(file)
+            texture = pybullet.loadTexture(str(file), physicsClientId=self._world)
+        corners = mesh.vertices_m[mesh.faces]  # (F, 3, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        w, x, y, z = quaternion_wxyz(T_world_mesh[:3, :3]).tolist()
+        for start in range(0, len(mesh.faces), _MAX_FACES):
+            chunk = slice(start, start + _MAX_FACES)
+            n = 3 * len(corners[chunk])
+            shape = pybullet.createVisualShape(
+                pybullet.GEOM_MESH,
+                vertices=corners[chunk].reshape(-1, 3).tolist(),
+                indices=list(range(n)),
+                uvs=uv[chunk].reshape(-1, 2).tolist(),
+                normals=np.repeat(normals[chunk], 3, axis=0).tolist(),
+                rgbaColor=[1, 1, 1, 1],
+                physicsClientId=self._world,
+            )
+            body: int = pybullet.createMultiBody(
+                baseVisualShapeIndex=shape,
+                basePosition=T_world_mesh[:3, 3].tolist(),
+                baseOrientation=[x, y, z, w],
+                physicsClientId=self._world,
+            )
+            pybullet.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=self._world)
+            self._label_of_body.append(label)
+
+    def render(self, camera: Camera) -> Frame:
+        rgba, buffer, segments = self._image(camera)
+        body = self._labels(segments)
+        # The buffer holds OpenGL's window depth, which is not linear in metres.
+        depth_m = _FAR_M * _NEAR_M / (_FAR_M - (_FAR_M - _NEAR_M) * buffer.astype(np.float64))
+        depth_m[body < 0] = 0.0
+        return Frame(camera, np.ascontiguousarray(rgba[..., :3]), depth_m.astype(np.float32), body)
+
+    def bodies(self, camera: Camera) -> I16:
+        """The labels (H, W) that a camera sees; -1 for none."""
+        return self._labels(self._image(camera)[2])
+
+    def _labels(self, segments: npt.NDArray[np.int32]) -> I16:
+        labels = np.array([*self._label_of_body, -1], np.int16)  # -1, the background, takes the last
+        return labels[segments]
+
+    def _image(self, camera: Camera) -> tuple[U8, F32, npt.NDArray[np.int32]]:
+        h, w = camera.height_px, camera.width_px
+        _, _, rgba, buffer, segments = pybullet.getCameraImage(
+            w,
+            h,
+            _view_matrix(camera),
+            _projection_matrix(camera),
+            lightDirection=_LIGHT_DIRECTION,
+            lightAmbientCoeff=_AMBIENT,
+            lightDiffuseCoeff=_DIFFUSE,
+            lightSpecularCoeff=0.0,
+            shadow=0,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=self._world,
+        )
+        return (
+            np.asarray(rgba, np.uint8).reshape(h, w, 4),
+            np.asarray(buffer, np.float32).reshape(h, w),
+            np.asarray(segments, np.int32).reshape(h, w),
+        )
+
+
+def _view_matrix(camera: Camera) -> list[float]:
+    """T_camera_world as OpenGL wants it: y up and z backward in the camera frame, by columns."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    columns: list[float] = (flip @ inverse(camera.T_world_camera)).T.ravel().tolist()
+    return columns
+
+
+def _projection_matrix(camera: Camera) -> list[float]:
+    """OpenGL's projection for a pinhole whose principal point need not be the middle, by columns."""
+    w, h = camera.width_px, camera.height_px
+    # TinyRenderer samples a pixel at its lower left corner, not at its centre (measured).
+    cx_px, cy_px = camera.cx_px - 0.5, camera.cy_px + 0.5
+    P = np.zeros((4, 4))
+    P[0, 0], P[0, 2] = 2 * camera.fx_px / w, 1 - 2 * cx_px / w
+    P[1, 1], P[1, 2] = 2 * camera.fy_px / h, 2 * cy_px / h - 1
+    P[2, 2] = -(_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M)
+    P[2, 3] = -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M)
+    P[3, 2] = -1.0
+    columns: list[float] = P.T.ravel().tolist()
+    return columns
+
+
+def _texture_of(mesh: Mesh) -> tuple[F32, U8]:
+    """Texture coordinates (F, 3, 2) of the faces' corners and the image (H, W, 3) they point into.
+
+    TinyRenderer has one colour for a mesh. Flat face colours become texels of a palette, all three
+    corners of a face in the middle of the same one.
+    """
+    if mesh.texture is not None:
+        return mesh.texture.uv[mesh.faces], mesh.texture.image
+    colours, index = np.unique(mesh.face_rgb, axis=0, return_inverse=True)
+    height = -(-len(colours) // _PALETTE_WIDTH)
+    image = np.zeros((height * _PALETTE_WIDTH, 3), np.uint8)
+    image[: len(colours)] = colours
+    row, column = np.divmod(index.ravel(), _PALETTE_WIDTH)
+    # v runs upward from the image's last row.
+    uv = np.stack([(column + 0.5) / _PALETTE_WIDTH, 1 - (row + 0.5) / height], axis=1).astype(np.float32)
+    return np.repeat(uv[:, None], 3, axis=1), image.reshape(height, _PALETTE_WIDTH, 3)

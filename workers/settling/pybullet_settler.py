@@ -1,0 +1,174 @@
+"""Settling by Bullet. Needs no system libraries, and cross-checks PhysX."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pybullet
+
+from schemas.errors import InputError
+from schemas.specification import SettleParams
+from workers.geometry.mesh import F32, F64
+from workers.geometry.transforms import inverse, pose, quaternion_wxyz
+from workers.objects.model import ObjectModel
+from workers.settling.inertia import mass_properties
+from workers.settling.settler import SettleResult
+
+_LOOK_EVERY = 5  # steps between looks at the speeds, as with PhysX: the same counts come out
+_GRAVITY_MPS2 = 9.81
+# PhysX's defaults; Bullet's own would slow falls and rolls down.
+_LINEAR_DAMPING, _ANGULAR_DAMPING = 0.0, 0.05
+# Bullet inflates every hull by 1 mm, so that things would rest 2 mm above each other.
+_MARGIN_M = 0.0
+
+
+def settle_pybullet(
+    static_parts_m: Sequence[F32],
+    objects: Sequence[ObjectModel],
+    T_world_object: F64,
+    params: SettleParams,
+) -> SettleResult:
+    """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
+
+    Every call has a physics world of its own. Raises InputError where Bullet cannot make one, or
+    a part of an object has no volume.
+    """
+    world = pybullet.connect(pybullet.DIRECT)
+    if world < 0:
+        mend = "Run fewer scenes at once in one process, or take another settler"
+        raise InputError("--settler", "pybullet", "Bullet cannot open another physics world", mend)
+    try:
+        with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
+            bodies, T_object_inertial = _fill(
+                world, Path(folder), static_parts_m, objects, T_world_object, params
+            )
+        steps, at_rest, speed, angular = _fall(world, bodies, params)
+        final = [
+            _pose_of(world, body) @ inverse(T) for body, T in zip(bodies, T_object_inertial, strict=True)
+        ]
+        return SettleResult(
+            T_world_object=np.stack(final) if final else np.zeros((0, 4, 4)),
+            steps=steps,
+            at_rest=at_rest,
+            residual_speed_mps=speed,
+            residual_angular_radps=angular,
+            penetration_m=_deepest_contact(world),
+        )
+    finally:
+        pybullet.disconnect(physicsClientId=world)
+
+
+def _fill(
+    world: int,
+    folder: Path,
+    static_parts_m: Sequence[F32],
+    objects: Sequence[ObjectModel],
+    T_world_object: F64,
+    params: SettleParams,
+) -> tuple[list[int], list[F64]]:
+    """Add everything; the objects' body numbers and their T_object_inertial (4, 4) each.
+
+    Bullet reports the pose of the inertial frame: centre of mass and principal axes.
+    """
+    pybullet.setGravity(0, 0, -_GRAVITY_MPS2, physicsClientId=world)
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=params.timestep_s, deterministicOverlappingPairs=1, physicsClientId=world
+    )
+    if static_parts_m:
+        _add_body(world, folder / "static.obj", static_parts_m, params, baseMass=0.0)
+    bodies: list[int] = []
+    frames: list[F64] = []
+    for k, (model, T) in enumerate(zip(objects, T_world_object, strict=True)):
+        properties = mass_properties(model.name, model.convex_parts_m, model.mass_kg)
+        T_object_inertial = pose(properties.centre_m, quaternion_wxyz(properties.R_body_principal))
+        body = _add_body(
+            world,
+            folder / f"object-{k}.obj",
+            model.convex_parts_m,
+            params,
+            baseMass=model.mass_kg,
+            basePosition=T[:3, 3].tolist(),
+            baseOrientation=_xyzw(T),
+            baseInertialFramePosition=T_object_inertial[:3, 3].tolist(),
+            baseInertialFrameOrientation=_xyzw(T_object_inertial),
+        )
+        # What Bullet puts in by itself is the inertia of the bounding box.
+        pybullet.changeDynamics(
+            body, -1, localInertiaDiagonal=properties.inertia_kgm2.tolist(), physicsClientId=world
+        )
+        bodies.append(body)
+        frames.append(T_object_inertial)
+    return bodies, frames
+
+
+def _add_body(
+    world: int, file: Path, parts_m: Sequence[F32], params: SettleParams, **placing: float | list[float]
+) -> int:
+    """A body of convex parts, by way of an OBJ file: Bullet takes more than 16 parts only from one."""
+    file.write_text(_hulls_as_obj(parts_m), encoding="ascii")
+    shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(file), physicsClientId=world)
+    body: int = pybullet.createMultiBody(baseCollisionShapeIndex=shape, physicsClientId=world, **placing)
+    pybullet.changeDynamics(
+        body,
+        -1,
+        # Bullet multiplies the frictions of a pair; the root makes the product the one asked for.
+        lateralFriction=float(np.sqrt(params.friction)),
+        restitution=0.0,
+        linearDamping=_LINEAR_DAMPING,
+        angularDamping=_ANGULAR_DAMPING,
+        collisionMargin=_MARGIN_M,
+        physicsClientId=world,
+    )
+    return body
+
+
+def _hulls_as_obj(parts_m: Sequence[F32]) -> str:
+    """One group a part. Bullet makes a hull of each group's corners, so faces only list the vertices."""
+    lines: list[str] = []
+    offset = 1
+    for k, part in enumerate(parts_m):
+        lines.append(f"o part_{k}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
+        last = offset + len(part) - 1
+        lines += [f"f {i} {min(i + 1, last)} {min(i + 2, last)}" for i in range(offset, last + 1, 3)]
+        offset = last + 1
+    return "\n".join(lines) + "\n"
+
+
+def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, bool, float, float]:
+    """Step until rest; steps made, whether at rest, and the largest speeds at the end (m/s, rad/s)."""
+    steps, resting = 0, 0
+    speed = angular = np.inf
+    while steps < params.max_steps and resting < params.rest_steps:
+        for _ in range(min(_LOOK_EVERY, params.max_steps - steps)):
+            pybullet.stepSimulation(physicsClientId=world)
+            steps += 1
+        velocities = np.array(
+            [pybullet.getBaseVelocity(body, physicsClientId=world) for body in bodies]
+        ).reshape(-1, 2, 3)
+        largest = np.linalg.norm(velocities, axis=2).max(0, initial=0.0)
+        speed, angular = float(largest[0]), float(largest[1])
+        if not (np.isfinite(speed) and np.isfinite(angular)):
+            break
+        calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
+        resting = resting + _LOOK_EVERY if calm else 0
+    return steps, resting >= params.rest_steps, speed, angular
+
+
+def _pose_of(world: int, body: int) -> F64:
+    position_m, (x, y, z, w) = pybullet.getBasePositionAndOrientation(body, physicsClientId=world)
+    return pose(np.array(position_m), np.array([w, x, y, z]))
+
+
+def _deepest_contact(world: int) -> float:
+    """Depth in metres of the deepest contact point of the last step; 0 when nothing touches."""
+    contacts = pybullet.getContactPoints(physicsClientId=world) or ()
+    return max(0.0, -min((contact[8] for contact in contacts), default=0.0))
+
+
+def _xyzw(T: F64) -> list[float]:
+    w, x, y, z = quaternion_wxyz(T[:3, :3]).tolist()
+    return [x, y, z, w]
