@@ -1,0 +1,82 @@
+"""One attempt at one shard, from its key to its commit. Runs in a worker; knows nothing of Ray."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+
+from cluster.guard import Meter, this_host, utc_now
+from cluster.task import JobCannotGoOn, Product, ShardTask
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.run_records import Commit
+from schemas.shard_files import encode_shard
+from schemas.storage import storage_error
+from workers.run_shard import run_shard
+from workers.world import World, open_world
+
+# Failures of a disk that no retry cures.
+_FINAL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
+_FINAL_PROBLEMS = {os.strerror(code) for code in _FINAL}
+
+
+def run_attempt(task: ShardTask, meter: Meter) -> Product:
+    """Make the shard's arrays, write them, and commit them unless another attempt was first.
+
+    Raises JobCannotGoOn where the run or its sources cannot be opened or its disk is full; what
+    else goes wrong is raised as it is, and concerns this attempt alone.
+    """
+    spec_hash = task.spec.hash()
+    with _ends_job(every_input_error=True):
+        run, world = _open(task.run, spec_hash, task.houses, task.objects)
+    with _ends_job():
+        run.start_attempt(task.attempt, task.shard)
+    made = run_shard(task.spec, world, task.scene_indices)
+    with _ends_job(), made.clock.stage("write"):
+        files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
+        entries = run.write_shard(task.shard, task.attempt, files)
+    labels = made.sample["label"]
+    cost = meter.cost(made.clock, written_bytes=sum(entry.size for entry in entries))
+    positives = int(labels.sum())
+    commit = Commit(
+        shard=task.shard,
+        attempt=task.attempt,
+        spec_hash=spec_hash,
+        scenes=len(task.scene_indices),
+        samples=len(labels),
+        positives=positives,
+        redraws=made.redraws,
+        files=entries,
+        cost=cost,
+        host=this_host(),
+        created=utc_now(),
+    )
+    with _ends_job():
+        won = run.commit(commit)
+    return Product(won, len(labels), positives, cost)
+
+
+@contextmanager
+def _ends_job(every_input_error: bool = False) -> Iterator[None]:
+    """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
+    try:
+        yield
+    except InputError as error:
+        if every_input_error or error.problem in _FINAL_PROBLEMS:
+            raise JobCannotGoOn(str(error)) from error
+        raise
+    except OSError as error:
+        if error.errno in _FINAL:
+            raise JobCannotGoOn(str(storage_error(error.filename or "the run", error))) from error
+        raise
+
+
+@lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large
+def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+    run = Run.open(place)
+    if run.manifest.spec_hash != spec_hash:
+        raise InputError(place, "spec_hash", "the run now has another specification", "Submit to a new --out")
+    return run, open_world(run.manifest.spec, houses, objects)

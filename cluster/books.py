@@ -1,0 +1,65 @@
+"""The driver's records in a run: how attempts ended, which shards were given up, what was lost."""
+
+from __future__ import annotations
+
+from cluster.guard import utc_now
+from cluster.policy import Trouble
+from schemas.run import Run, commit_key
+from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
+
+
+class RunBooks:
+    """Writes the ledger and the quarantine of one run."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def close(self, entry: LedgerEntry) -> None:
+        """Note how an attempt ended. An end that was noted before stands."""
+        self._run.end_attempt(entry)
+
+    def quarantine(self, shard: int, trouble: Trouble) -> None:
+        """Give a shard up, with all that is needed to run it alone."""
+        scenes = self._run.layout.scenes_per_shard
+        self._run.quarantine(
+            QuarantineRecord(
+                shard=shard,
+                seed=self._run.manifest.spec.seed,
+                first_scene=shard * scenes,
+                scenes=scenes,
+                attempts=trouble.attempts,
+                causes=trouble.causes,
+                stacks=trouble.stacks,
+                created=utc_now(),
+            )
+        )
+
+    def commit_of(self, shard: int) -> Commit | None:
+        """The shard's commit record, or None while there is none."""
+        return self._run.commit_of(shard) if self._run.storage.exists(commit_key(shard)) else None
+
+
+def close_lost_attempts(run: Run) -> int:
+    """Close in the ledger what a former driver left open; return how many attempts that were.
+
+    An attempt that began and never ended belonged to a driver that was killed. If it reached its
+    commit all the same, it is closed as committed, at the commit's cost; otherwise it is lost, at
+    a cost that nobody knows.
+    """
+    books, lost = RunBooks(run), run.unfinished_attempts()
+    for start in lost:
+        commit = books.commit_of(start.shard)
+        won = commit is not None and commit.attempt == start.attempt
+        books.close(
+            LedgerEntry(
+                attempt=start.attempt,
+                shard=start.shard,
+                outcome="committed" if won else "lost",
+                cause="" if won else "its driver ended before it did",
+                started=start.started,
+                ended=commit.created if won else utc_now(),
+                cost=commit.cost if won else None,
+                host=commit.host if won else None,
+            )
+        )
+    return len(lost)

@@ -1,0 +1,302 @@
+"""The driver: keeps a window of attempts in flight and decides what each ending means.
+
+    while shards are open:
+        fill the window: retries that are due first, then new shards
+        wait a moment for reports, and settle each: ledger, then done, retry or quarantine
+        look after attempts that are silent beyond their deadline
+        heed a request to stop
+
+The driver alone owns attempts: executors never repeat one by themselves.
+"""
+
+from __future__ import annotations
+
+import heapq
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
+
+from cluster.executor import Executor
+from cluster.policy import (
+    Durations,
+    Policy,
+    Trouble,
+    deadline_s,
+    decide,
+    ends_early,
+    too_many_quarantined,
+    window,
+)
+from cluster.stop import StopRequest
+from cluster.tally import End, JobSummary, Tally
+from cluster.task import AttemptReport
+from schemas.run_records import Commit, LedgerEntry, Outcome
+
+T = TypeVar("T")
+# Upper bound of one wait, so that a request to stop is heeded soon.
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the driver decides about an attempt before it starts."""
+
+    shard: int
+    attempt: str
+    deadline_s: float
+    memory_factor: float
+
+
+class Books(Protocol):
+    """Where the driver writes down how attempts and shards ended."""
+
+    def close(self, entry: LedgerEntry) -> None: ...
+
+    def quarantine(self, shard: int, trouble: Trouble) -> None: ...
+
+    def commit_of(self, shard: int) -> Commit | None:
+        """The shard's commit record, if there is one."""
+        ...
+
+
+class Events(Protocol):
+    """What a progress display hears."""
+
+    def ended(self, report: AttemptReport, action: str) -> None:
+        """An attempt was settled; `action` is the policy's decision."""
+        ...
+
+    def tick(self, tally: Tally) -> None:
+        """Called often; the tally is the driver's own and changes."""
+        ...
+
+    def stopping(self, reason: str) -> None:
+        """No new shard is begun from here on."""
+        ...
+
+
+@dataclass
+class _Flight:
+    order: Order
+    submitted_s: float
+    check_s: float  # when to look after it next
+    begun: bool = False
+    verdict: tuple[Outcome, str] | None = None  # set when the driver ended it
+
+
+def drive(
+    shards: Sequence[int],
+    make_task: Callable[[Order], T],
+    executor: Executor[T],
+    books: Books,
+    policy: Policy,
+    events: Events,
+    stop: StopRequest,
+    clock: Callable[[], float] = time.monotonic,
+) -> JobSummary:
+    """Run every shard to its commit, or give it up; return how the job ended.
+
+    `clock` gives seconds and only grows. Raises InputError when the books cannot be written; then,
+    and on any other exception, what is in flight is ended by force first.
+    """
+    driver = _Driver(shards, make_task, executor, books, policy, events, stop, clock)
+    try:
+        return driver.run()
+    finally:
+        driver.kill_all("the driver ended")
+
+
+class _Driver(Generic[T]):
+    def __init__(
+        self,
+        shards: Sequence[int],
+        make_task: Callable[[Order], T],
+        executor: Executor[T],
+        books: Books,
+        policy: Policy,
+        events: Events,
+        stop: StopRequest,
+        clock: Callable[[], float],
+    ) -> None:
+        self._make_task, self._executor, self._books = make_task, executor, books
+        self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
+        self._fresh = iter(shards)
+        self._tally = Tally(len(shards))
+        self._flights: dict[str, _Flight] = {}
+        self._troubled: dict[int, Trouble] = {}
+        self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
+        self._durations = Durations()
+        self._numbered = 0
+        # Two drivers of one run must never give two attempts one name.
+        self._name = secrets.token_hex(4)
+        self._next_check_s = float("inf")
+        self._end: End | None = None  # set once nothing new is begun
+        self._cause = ""
+        self._drain_until_s = float("inf")
+
+    def run(self) -> JobSummary:
+        start_s = self._clock()
+        while True:
+            self._heed_stop()
+            if self._end is None:
+                self._fill()
+            if not self._flights and (self._end is not None or not self._due):
+                break
+            for report in self._executor.wait(self._patience_s()):
+                self._settle(report)
+            self._look_after_silent()
+            self._tally.in_flight = len(self._flights)
+            self._events.tick(self._tally)
+        failed = too_many_quarantined(self._policy, self._tally.quarantined, self._tally.shards)
+        end = self._end or ("failed" if failed else "complete")
+        return JobSummary(end, self._cause, self._tally, self._clock() - start_s)
+
+    # Begin ---------------------------------------------------------------------------------
+
+    def _fill(self) -> None:
+        room = window(self._policy, self._executor.slots) - len(self._flights)
+        while room > 0 and (shard := self._next_shard()) is not None:
+            self._submit(shard)
+            room -= 1
+
+    def _next_shard(self) -> int | None:
+        if self._due and self._due[0][0] <= self._clock():
+            return heapq.heappop(self._due)[1]
+        if len(self._due) >= self._policy.max_waiting:
+            return None
+        return next(self._fresh, None)
+
+    def _submit(self, shard: int) -> None:
+        trouble = self._troubled.get(shard, Trouble())
+        self._numbered += 1
+        order = Order(
+            shard=shard,
+            attempt=f"{shard:06d}-{self._name}-{self._numbered:06d}",
+            deadline_s=deadline_s(self._policy, self._durations, trouble),
+            memory_factor=trouble.memory_factor,
+        )
+        now_s = self._clock()
+        check_s = now_s + order.deadline_s + self._policy.grace_s
+        self._flights[order.attempt] = _Flight(order, now_s, check_s)
+        self._next_check_s = min(self._next_check_s, check_s)
+        self._tally.retries += bool(trouble.attempts)
+        self._executor.submit(self._make_task(order))
+
+    def _patience_s(self) -> float:
+        wake_s = min(self._next_check_s, self._due[0][0] if self._due else float("inf"))
+        return min(_POLL_S, max(0.0, wake_s - self._clock()))
+
+    # End -----------------------------------------------------------------------------------
+
+    def _settle(self, report: AttemptReport) -> None:
+        flight = self._flights.pop(report.attempt, None)
+        if flight is None:
+            return  # settled before: a report came twice, or after the driver gave up waiting
+        if report.outcome == "cancelled" and flight.verdict is not None:
+            outcome, cause = flight.verdict
+            report = replace(report, outcome=outcome, cause=cause)
+        if report.outcome in ("crashed", "hung", "lost", "out_of_memory", "cancelled"):
+            report = self._what_the_run_says(report)
+        shard = report.shard
+        decision = decide(self._policy, self._troubled.get(shard, Trouble()), report)
+        self._books.close(_ledger_entry(report))
+        self._tally.count(report)
+        if report.outcome == "committed" and report.cost is not None:
+            self._durations.add(report.cost.wall_s)
+        if decision.action == "done":
+            self._troubled.pop(shard, None)
+        elif decision.action == "retry":
+            self._troubled[shard] = decision.trouble
+            heapq.heappush(self._due, (self._clock() + decision.wait_s, shard))
+        elif decision.action == "quarantine":
+            self._troubled.pop(shard, None)
+            self._books.quarantine(shard, decision.trouble)
+            self._tally.count_quarantined(shard)
+            if ends_early(self._policy, self._tally.quarantined, self._tally.shards):
+                self._begin_end("failed", f"{self._tally.quarantined} shards are quarantined")
+        elif decision.action == "abort":
+            self._begin_end("aborted", report.cause)
+            self.kill_all("the job cannot go on")
+        self._events.ended(report, decision.action)
+
+    def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
+        """A worker may die after its commit and before its answer: the commit record decides."""
+        commit = self._books.commit_of(report.shard)
+        if commit is None:
+            return report
+        if commit.attempt != report.attempt:
+            return replace(report, outcome="superseded")
+        return replace(
+            report,
+            outcome="committed",
+            cause="",
+            labels=commit.samples,
+            positives=commit.positives,
+            cost=commit.cost,
+            host=commit.host,
+        )
+
+    # Silence -------------------------------------------------------------------------------
+
+    def _look_after_silent(self) -> None:
+        now_s = self._clock()
+        if now_s < self._next_check_s:
+            return
+        for flight in [f for f in self._flights.values() if f.check_s <= now_s]:
+            order = flight.order
+            if flight.verdict is not None:
+                outcome, cause = flight.verdict
+                self._settle(AttemptReport(order.attempt, order.shard, outcome, cause))
+            elif flight.begun:
+                cause = f"still running after its deadline of {order.deadline_s:g} s; ended by the driver"
+                self._kill(flight, "hung", cause)
+            elif self._executor.has_begun(order.attempt):
+                # Since when is not known, so its time counts from now.
+                flight.begun, flight.check_s = True, now_s + order.deadline_s + self._policy.grace_s
+            elif now_s - flight.submitted_s > self._policy.queue_deadlines * order.deadline_s:
+                self._kill(flight, "lost", "no worker reported to have begun it")
+            else:
+                flight.check_s = now_s + order.deadline_s + self._policy.grace_s
+        self._next_check_s = min((f.check_s for f in self._flights.values()), default=float("inf"))
+
+    def _kill(self, flight: _Flight, outcome: Outcome, cause: str) -> None:
+        flight.verdict = (outcome, cause)
+        flight.check_s = self._clock() + self._policy.kill_s
+        self._next_check_s = min(self._next_check_s, flight.check_s)
+        self._executor.kill(flight.order.attempt)
+
+    # Stop ----------------------------------------------------------------------------------
+
+    def _heed_stop(self) -> None:
+        if self._stop.drain and self._end is None:
+            self._begin_end("interrupted", "asked to stop")
+        if self._stop.force or self._clock() >= self._drain_until_s:
+            self.kill_all("the job was stopped")
+
+    def _begin_end(self, end: End, cause: str) -> None:
+        if self._end is None:
+            self._end, self._cause = end, cause
+            self._drain_until_s = self._clock() + self._policy.drain_s
+            self._events.stopping(cause)
+
+    def kill_all(self, cause: str) -> None:
+        """End what is in flight by force; the endings are reported as those of cancelled attempts."""
+        for flight in list(self._flights.values()):
+            if flight.verdict is None:
+                self._kill(flight, "cancelled", cause)
+
+
+def _ledger_entry(report: AttemptReport) -> LedgerEntry:
+    return LedgerEntry(
+        attempt=report.attempt,
+        shard=report.shard,
+        outcome=report.outcome,
+        cause=report.cause,
+        stack=report.stack,
+        started=report.started,
+        ended=report.ended,
+        cost=report.cost,
+        host=report.host,
+    )

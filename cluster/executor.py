@@ -1,0 +1,34 @@
+"""What the driver needs from a place where attempts run."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+from cluster.task import AttemptReport
+
+T_contra = TypeVar("T_contra", contravariant=True)
+
+
+class Executor(Protocol[T_contra]):
+    """Runs attempts. Every submitted attempt is answered by one report, whatever happens to it."""
+
+    @property
+    def slots(self) -> int:
+        """Attempts that can run at the same time now."""
+        ...
+
+    def submit(self, task: T_contra) -> None:
+        """Take an attempt; return at once."""
+        ...
+
+    def wait(self, timeout_s: float) -> list[AttemptReport]:
+        """Reports of attempts that ended, as soon as there is one, or none after the timeout."""
+        ...
+
+    def has_begun(self, attempt: str) -> bool:
+        """Whether a worker is known to have begun the attempt."""
+        ...
+
+    def kill(self, attempt: str) -> None:
+        """End an attempt by force. Its report follows through `wait`, with outcome `cancelled`."""
+        ...

@@ -1,0 +1,245 @@
+"""The worker's side of an attempt: deadline with stack, process notes, account of the cost.
+
+A worker that is killed cannot answer. So it first writes who it is into a small note, and points
+`faulthandler` at a file beside it: whatever ends the process, the driver finds what is known.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import platform
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import TypeVar
+
+from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
+from schemas.cost import StageClock
+from schemas.run_records import Cost, Host, Outcome
+
+T = TypeVar("T", bound=Task)
+# What a ledger entry keeps of a stack, from its end, where the failing frame is.
+STACK_LIMIT = 16_000
+
+
+def utc_now() -> str:
+    """The time, UTC, ISO 8601 with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class Meter:
+    """Counts what an attempt costs from the moment it is made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        _reset_peak_memory()
+
+    def cost(self, clock: StageClock | None = None, written_bytes: int = 0) -> Cost:
+        """The cost so far. What no stage of `clock` claimed is wall and CPU time without a name."""
+        clock = clock or StageClock()
+        return Cost(
+            wall_s=time.perf_counter() - self._wall,
+            cpu_s=time.process_time() - self._cpu,
+            stage_wall_s=clock.wall_s,
+            stage_cpu_s=clock.cpu_s,
+            stage_gpu_s=clock.gpu_s,
+            peak_rss_bytes=_peak_memory_bytes(),
+            written_bytes=written_bytes,
+        )
+
+
+def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = True) -> AttemptReport:
+    """Run one attempt and tell how it ended. Exceptions become failed reports with their stack.
+
+    With `deadline`, the process ends itself when the task takes longer than `task.deadline_s`,
+    also when native code hangs with the interpreter's lock held.
+    """
+    started, meter = utc_now(), Meter()
+    with _notes(task, started, deadline):
+        try:
+            product = function(task, meter)
+        except Exception as error:
+            cause = " ".join(str(error).split())
+            ends_job = isinstance(error, JobCannotGoOn)
+            return AttemptReport(
+                attempt=task.attempt,
+                shard=task.shard,
+                outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
+                cause=cause if ends_job else f"{type(error).__name__}: {cause}"[:1000],
+                stack=traceback.format_exc()[-STACK_LIMIT:],
+                started=started,
+                ended=utc_now(),
+                cost=meter.cost(),
+                host=this_host(),
+                ends_job=ends_job,
+            )
+        return AttemptReport(
+            attempt=task.attempt,
+            shard=task.shard,
+            outcome="committed" if product.won else "superseded",
+            started=started,
+            ended=utc_now(),
+            labels=product.labels,
+            positives=product.positives,
+            cost=product.cost,
+            host=this_host(),
+        )
+
+
+@contextmanager
+def _notes(task: Task, started: str, deadline: bool) -> Iterator[None]:
+    """Keep the note and the stack file of an attempt while it runs, and remove them after it."""
+    if not task.notes:
+        yield
+        return
+    note, stack = _note_path(task.notes, task.attempt), _stack_path(task.notes, task.attempt)
+    draft = note.with_suffix(".part")
+    draft.write_text(json.dumps({"host": platform.node(), "pid": os.getpid(), "started": started}))
+    draft.rename(note)
+    if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
+        try:
+            yield
+        finally:
+            note.unlink(missing_ok=True)
+        return
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+    with open(stack, "w") as file:
+        faulthandler.enable(file)  # a native crash leaves its stack here too
+        faulthandler.dump_traceback_later(task.deadline_s, exit=True, file=file)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            faulthandler.disable()
+    if sys.__stderr__ is not None:
+        faulthandler.enable(sys.__stderr__)
+    note.unlink(missing_ok=True)
+    stack.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a worker left behind about an attempt."""
+
+    host: str
+    pid: int
+    started: str
+
+
+def read_note(notes: str, attempt: str) -> Note | None:
+    """The note of an attempt that has begun and not ended by itself; None when there is none."""
+    if not notes:
+        return None
+    try:
+        text = _note_path(notes, attempt).read_text()
+    except FileNotFoundError:
+        return None
+    return Note(**json.loads(text))
+
+
+def collect_stack(notes: str, attempt: str) -> str:
+    """The stack that a dead worker left, "" when there is none; note and stack file are removed."""
+    if not notes:
+        return ""
+    path = _stack_path(notes, attempt)
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(0, path.stat().st_size - STACK_LIMIT))
+            text = file.read(STACK_LIMIT).decode(errors="replace")
+    except FileNotFoundError:
+        text = ""
+    path.unlink(missing_ok=True)
+    _note_path(notes, attempt).unlink(missing_ok=True)
+    return text
+
+
+def obituary(task: Task, outcome: Outcome, cause: str) -> AttemptReport:
+    """The report of an attempt whose worker is gone, from what it left behind.
+
+    A stack that begins with faulthandler's timeout line tells a hang from a crash. The wall time is
+    counted from the note; CPU time went with the process and is 0.
+    """
+    note, ended = read_note(task.notes, task.attempt), utc_now()
+    stack = collect_stack(task.notes, task.attempt)
+    if outcome == "crashed" and stack.startswith("Timeout ("):
+        outcome, cause = "hung", f"still running after its deadline of {task.deadline_s:g} s"
+    elif outcome == "crashed" and stack.startswith("Fatal Python error"):
+        cause = stack.splitlines()[0]
+    wall_s = 0.0
+    if note is not None:
+        wall_s = (datetime.fromisoformat(ended) - datetime.fromisoformat(note.started)).total_seconds()
+    return AttemptReport(
+        task.attempt,
+        task.shard,
+        outcome,
+        cause=cause,
+        stack=stack,
+        started=note.started if note else "",
+        ended=ended,
+        cost=Cost(wall_s=max(0.0, wall_s), cpu_s=0.0) if note else None,
+    )
+
+
+def _note_path(notes: str, attempt: str) -> Path:
+    return Path(notes, f"{attempt}.json")
+
+
+def _stack_path(notes: str, attempt: str) -> Path:
+    return Path(notes, f"{attempt}.stack")
+
+
+@cache
+def this_host() -> Host:
+    """Fingerprint of this machine and process."""
+    cpu = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = (
+            line.split(":", 1)[1]
+            for line in cpuinfo.read_text().splitlines()
+            if line.startswith("model name")
+        )
+        cpu = next(names, cpu).strip()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return Host(
+        name=platform.node(), cpu=cpu, cores=os.cpu_count() or 1, memory_bytes=memory, pid=os.getpid()
+    )
+
+
+def _reset_peak_memory() -> None:
+    # Linux: makes VmHWM start again from what is resident now, so that the peak is the attempt's.
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return  # elsewhere, or forbidden: the peak is then that of the whole process
+
+
+def _peak_memory_bytes() -> int:
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def resident_bytes() -> int:
+    """Memory that this process holds now; 0 where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")

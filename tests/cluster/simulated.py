@@ -1,0 +1,147 @@
+"""A cluster that exists only in numbers: time passes when the driver waits."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from cluster.driver import Order
+from cluster.policy import Trouble
+from cluster.tally import Tally
+from cluster.task import AttemptReport
+from schemas.run_records import Commit, Cost, LedgerEntry
+
+# How an attempt ends, and the seconds it takes; None never ends by itself.
+Fate = tuple[str, float | None]
+
+
+class FakeClock:
+    """Seconds that only grow when told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def report_of(order: Order, outcome: str, wall_s: float) -> AttemptReport:
+    """A worker's answer; an outcome with `!` ends the job."""
+    committed = outcome == "committed"
+    return AttemptReport(
+        order.attempt,
+        order.shard,
+        outcome.rstrip("!"),  # type: ignore[arg-type]
+        cause="" if committed else f"scripted {outcome}",
+        labels=10 * committed,
+        positives=3 * committed,
+        cost=Cost(wall_s=wall_s, cpu_s=wall_s / 2),
+        ends_job=outcome.endswith("!"),
+    )
+
+
+@dataclass
+class SimulatedExecutor:
+    """`slots` workers that take orders in turn. `fate(order, n)` scripts the shard's n-th attempt.
+
+    With `twice`, every report comes two times, as after a lost acknowledgement.
+    """
+
+    clock: FakeClock
+    fate: Callable[[Order, int], Fate]
+    slots: int = 4
+    twice: bool = False
+    deaf: bool = False  # kills are never confirmed
+    notes: bool = True  # whether it can tell what has begun
+    most_in_flight: int = 0
+    orders: list[Order] = field(default_factory=list)
+    keep_orders: bool = False
+    _tries: Counter[int] = field(default_factory=Counter)
+    _queue: list[Order] = field(default_factory=list)
+    _running: dict[str, Order] = field(default_factory=dict)
+    _ends: list[tuple[float, str, str, float]] = field(default_factory=list)
+    _ready: list[AttemptReport] = field(default_factory=list)
+
+    def submit(self, order: Order) -> None:
+        self._queue.append(order)
+        if self.keep_orders:
+            self.orders.append(order)
+        self._start()
+        self.most_in_flight = max(self.most_in_flight, len(self._queue) + len(self._running))
+
+    def _start(self) -> None:
+        while self._queue and len(self._running) < self.slots:
+            order = self._queue.pop(0)
+            self._tries[order.shard] += 1
+            outcome, wall_s = self.fate(order, self._tries[order.shard])
+            self._running[order.attempt] = order
+            if wall_s is not None:
+                heapq.heappush(self._ends, (self.clock.now_s + wall_s, order.attempt, outcome, wall_s))
+
+    def wait(self, timeout_s: float) -> list[AttemptReport]:
+        limit_s = self.clock.now_s + timeout_s
+        ready, self._ready = self._ready, []
+        while not ready and self._ends and self._ends[0][0] <= limit_s:
+            end_s, attempt, outcome, wall_s = heapq.heappop(self._ends)
+            self.clock.now_s = max(self.clock.now_s, end_s)
+            order = self._running.pop(attempt, None)
+            if order is not None:  # else it was killed
+                ready += [report_of(order, outcome, wall_s)] * (2 if self.twice else 1)
+            self._start()
+        if not ready:
+            self.clock.now_s = max(limit_s, self.clock.now_s + 1e-3)
+        return ready
+
+    def has_begun(self, attempt: str) -> bool:
+        return self.notes and attempt in self._running
+
+    def kill(self, attempt: str) -> None:
+        order = self._running.pop(attempt, None)
+        for waiting in [o for o in self._queue if o.attempt == attempt]:
+            self._queue.remove(waiting)
+            order = waiting
+        if order is not None and not self.deaf:
+            self._ready.append(replace(report_of(order, "cancelled", 0.0), cause="ended by force"))
+        self._start()
+
+
+@dataclass
+class PaperBooks:
+    """Books that only count, and remember the commits that a test gives them."""
+
+    keep_entries: bool = True
+    entries: list[LedgerEntry] = field(default_factory=list)
+    given_up: dict[int, Trouble] = field(default_factory=dict)
+    commits: dict[int, Commit] = field(default_factory=dict)
+    closed: Counter[str] = field(default_factory=Counter)
+
+    def close(self, entry: LedgerEntry) -> None:
+        self.closed[entry.outcome] += 1
+        if self.keep_entries:
+            self.entries.append(entry)
+
+    def quarantine(self, shard: int, trouble: Trouble) -> None:
+        self.given_up[shard] = trouble
+
+    def commit_of(self, shard: int) -> Commit | None:
+        return self.commits.get(shard)
+
+
+@dataclass
+class Heard:
+    """Events as they came."""
+
+    actions: list[tuple[int, str, str]] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    on_tick: Callable[[Tally], None] = lambda tally: None
+
+    def ended(self, report: AttemptReport, action: str) -> None:
+        self.actions.append((report.shard, report.outcome, action))
+
+    def tick(self, tally: Tally) -> None:
+        self.on_tick(tally)
+
+    def stopping(self, reason: str) -> None:
+        self.reasons.append(reason)

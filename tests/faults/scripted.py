@@ -1,0 +1,68 @@
+"""Small real tasks that misbehave as told, for the executors."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from cluster.guard import Meter
+from cluster.task import JobCannotGoOn, Product
+
+
+@dataclass(frozen=True)
+class ScriptedTask:
+    """Does the n-th of its words at its n-th attempt, and commits when it has no more."""
+
+    shard: int
+    attempt: str
+    deadline_s: float
+    notes: str
+    words: tuple[str, ...] = ()
+    memory_factor: float = 1.0
+
+
+def perform(task: ScriptedTask, meter: Meter) -> Product:
+    """The task function. Attempts are counted by files beside the notes."""
+    tries = Path(task.notes).parent / "tries"
+    tries.mkdir(exist_ok=True)
+    n = len(list(tries.glob(f"{task.shard}-*")))
+    (tries / f"{task.shard}-{n}-{os.getpid()}").touch()
+    word = task.words[n] if n < len(task.words) else "commit"
+    misbehave(word)
+    return Product(word != "superseded", labels=10, positives=4, cost=meter.cost())
+
+
+def misbehave(word: str) -> None:
+    """Crash, hang, raise or return, by name."""
+    if word == "segfault":
+        ctypes.string_at(0)
+    elif word == "exit":
+        os._exit(3)
+    elif word == "system_exit":
+        raise SystemExit(2)
+    elif word == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif word == "hang":
+        time.sleep(600)
+    elif word == "hang_with_lock":
+        ctypes.PyDLL(None).sleep(600)  # unlike CDLL, keeps the interpreter's lock
+    elif word == "stop":
+        os.kill(os.getpid(), signal.SIGSTOP)
+    elif word == "raise":
+        raise ValueError("a scene\nof two lines")
+    elif word == "memory":
+        raise MemoryError
+    elif word == "disk":
+        raise JobCannotGoOn(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
+    elif word == "slow":
+        time.sleep(0.3)
+    elif word == "grow":
+        GROWN.append(bytearray(os.urandom(1) * (300 << 20)))
+
+
+GROWN: list[bytearray] = []

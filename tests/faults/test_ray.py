@@ -1,0 +1,149 @@
+"""Real Ray workers that crash, hang and die: each ending is seen for what it is, others go on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cluster.driver import Order, drive
+from cluster.policy import Policy
+from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.stop import StopRequest
+from cluster.tally import JobSummary, Tally
+from tests.cluster.simulated import Heard, PaperBooks
+from tests.faults.scripted import ScriptedTask, perform
+
+SETTINGS = RaySettings(workers=2, attempts_per_worker=50, resident_limit_bytes=250 << 20)
+POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
+
+
+@pytest.fixture(scope="module")
+def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """One local cluster of two slots, started from a folder that is not the repository."""
+    before = os.getcwd()
+    os.chdir(tmp_path_factory.mktemp("elsewhere"))
+    try:
+        with ray_cluster(SETTINGS) as ray:
+            yield ray
+    finally:
+        os.chdir(before)
+
+
+@dataclass
+class Played:
+    summary: JobSummary
+    books: PaperBooks
+    folder: Path
+
+    def ends(self, shard: int) -> list[str]:
+        return [e.outcome for e in self.books.entries if e.shard == shard]
+
+    def entry(self, outcome: str) -> Any:
+        return next(e for e in self.books.entries if e.outcome == outcome)
+
+
+def play(
+    ray: Any,
+    folder: Path,
+    words: dict[int, tuple[str, ...]],
+    shards: int = 6,
+    policy: Policy = POLICY,
+    deadline_s: float = 30.0,
+    on_tick: Callable[[Tally, StopRequest], None] = lambda tally, stop: None,
+) -> Played:
+    notes = folder / "notes"
+    notes.mkdir()
+
+    def make_task(order: Order) -> ScriptedTask:
+        return ScriptedTask(
+            order.shard,
+            order.attempt,
+            deadline_s,
+            str(notes),
+            words.get(order.shard, ()),
+            order.memory_factor,
+        )
+
+    stop, books = StopRequest(), PaperBooks()
+    heard = Heard(on_tick=lambda tally: on_tick(tally, stop))
+    executor = RayExecutor(perform, SETTINGS, ray)
+    summary = drive(range(shards), make_task, executor, books, policy, heard, stop)
+    assert list(notes.iterdir()) == []  # neither notes nor stacks are left behind
+    return Played(summary, books, folder)
+
+
+def test_crashes_exits_kills_and_exceptions_are_told_apart_and_others_complete(
+    ray: Any, tmp_path: Path
+) -> None:
+    words = {0: ("segfault",), 1: ("exit",), 2: ("kill",), 3: ("raise",), 4: ("system_exit",), 5: ("memory",)}
+    played = play(ray, tmp_path, words, shards=12)
+    assert played.summary.end == "complete" and played.summary.tally.committed == 12
+    for shard in (0, 1, 2, 4):
+        assert played.ends(shard) == ["crashed", "committed"]
+    assert played.ends(3) == ["failed", "committed"]
+    assert played.ends(5) == ["out_of_memory", "committed"]
+    segfault = next(e for e in played.books.entries if e.shard == 0)
+    assert segfault.cause == "Fatal Python error: Segmentation fault" and "misbehave" in segfault.stack
+    failed = played.entry("failed")
+    assert failed.cause == "ValueError: a scene of two lines" and "misbehave" in failed.stack
+    assert failed.cost.wall_s > 0 and failed.host.pid > 0
+    committed = played.entry("committed")
+    assert committed.cost.peak_rss_bytes > 10 << 20 and committed.started <= committed.ended
+
+
+def test_hangs_end_at_their_deadline_with_the_stack(ray: Any, tmp_path: Path) -> None:
+    played = play(ray, tmp_path, {0: ("hang",), 1: ("hang_with_lock",)}, shards=4, deadline_s=1.5)
+    assert played.summary.tally.committed == 4
+    for shard in (0, 1):
+        assert played.ends(shard) == ["hung", "committed"]
+        entry = next(e for e in played.books.entries if e.shard == shard)
+        assert "deadline of 1.5 s" in entry.cause and "misbehave" in entry.stack
+        assert entry.cost.wall_s >= 1.5
+
+
+def test_a_process_that_cannot_end_itself_is_ended_by_the_driver(ray: Any, tmp_path: Path) -> None:
+    policy = Policy(max_quarantined_share=1.0, initial_deadline_s=1.0, grace_s=0.5, backoff_s=0.05)
+    played = play(ray, tmp_path, {1: ("stop",)}, shards=3, policy=policy)
+    assert played.summary.tally.committed == 3 and played.ends(1) == ["hung", "committed"]
+    assert "ended by the driver" in played.entry("hung").cause
+
+
+def test_a_shard_that_always_crashes_is_given_up_with_its_stacks(ray: Any, tmp_path: Path) -> None:
+    played = play(ray, tmp_path, {1: ("segfault",) * 3}, shards=3)
+    trouble = played.books.given_up[1]
+    assert played.summary.tally.committed == 2 and len(trouble.stacks) == 3
+    assert all("Segmentation fault" in stack for stack in trouble.stacks)
+
+
+def test_a_full_disk_ends_the_job(ray: Any, tmp_path: Path) -> None:
+    played = play(ray, tmp_path, {2: ("disk",)}, shards=400)
+    assert played.summary.end == "aborted" and played.summary.tally.committed < 50
+    assert played.summary.cause == "RUN: No space left on device. Free disk space"
+
+
+def test_a_forced_stop_ends_hung_workers_and_frees_their_slots(ray: Any, tmp_path: Path) -> None:
+    def stop_when_running(tally: Tally, stop: StopRequest) -> None:
+        if len(list((tmp_path / "notes").glob("*.stack"))) == 2:
+            stop.ask()
+            stop.ask()
+
+    words = dict.fromkeys(range(6), ("hang_with_lock",))
+    played = play(ray, tmp_path, words, shards=6, on_tick=stop_when_running)
+    assert played.summary.end == "interrupted" and played.summary.tally.outcomes == {"cancelled": 4}
+    (tmp_path / "after").mkdir()
+    assert play(ray, tmp_path / "after", {}, shards=6).summary.tally.committed == 6
+
+
+def test_a_worker_that_grew_too_large_makes_way_for_a_fresh_one(ray: Any, tmp_path: Path) -> None:
+    played = play(ray, tmp_path, {0: ("grow",)}, shards=30)
+    assert played.summary.tally.outcomes == {"committed": 30}
+    pids = {p.name.split("-")[2] for p in (tmp_path / "tries").glob("0-*")}
+    others = [p.name for p in (tmp_path / "tries").iterdir() if p.name.split("-")[2] in pids]
+    grown = (tmp_path / "tries" / f"0-0-{pids.pop()}").stat().st_mtime_ns
+    later = [n for n in others if (tmp_path / "tries" / n).stat().st_mtime_ns > grown]
+    assert later == []
