@@ -18,6 +18,7 @@ Table = Literal["scene", "sample"]
 
 # Causes for which a scene is drawn again; their order is part of the data format.
 REDRAW_CAUSES = (
+    "bad_house",  # the house's record in its source is broken
     "no_surface",  # the house has no support surface of the asked height and size
     "no_placement",  # target or clutter found no free place on the surface
     "not_at_rest",  # still moving after the last step
@@ -136,7 +137,16 @@ SCENE_FIELDS = (
         -_EXTENT,
         _EXTENT,
     ),
-    Field("target_radius_m", "float32", (), "m", "", "radius of the sphere around target_center_m that holds the target", 0, 10),
+    Field(
+        "target_radius_m",
+        "float32",
+        (),
+        "m",
+        "",
+        "radius of the sphere around target_center_m that holds the target",
+        0,
+        10,
+    ),
     Field(
         "T_world_camera",
         "float64",
@@ -167,7 +177,7 @@ SCENE_FIELDS = (
         -10,
         10,
     ),
-    Field("rgb", "uint8", ("point", "rgb"), "1", "", "colour of each point", 0, 255),
+    Field("rgb", "uint8", ("point", "channel"), "1", "", "colour of each point", 0, 255),
     Field("target_mask", "bool", ("point",), "1", "", "whether the point lies on the target"),
     Field("n_points", "int32", (), "1", "", "rows of the cloud that hold points; the rest are zero", 0),
 )
@@ -221,7 +231,7 @@ SAMPLE_FIELDS = (
 )
 
 _SIZES = {
-    "row": 4, "column": 4, "xy": 2, "xyz": 3, "rgb": 3, "byte": 16, "fx_fy_cx_cy": 4,
+    "row": 4, "column": 4, "xy": 2, "xyz": 3, "channel": 3, "byte": 16, "fx_fy_cx_cy": 4,
     "width_height": 2, "redraw_cause": len(REDRAW_CAUSES), "object": 7, "point": 4096,
 }  # fmt: skip
 

@@ -1,0 +1,127 @@
+"""Runs filled with random rows that follow the schema: the store cares for bytes, not for meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.fields import Field, RecordSchema
+from schemas.record_files import now
+from schemas.run import Run
+from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, Manifest
+from schemas.shard_files import encode_shard, schema_for
+from schemas.specification import ObservationParams, SceneParams, Source, Specification
+from schemas.storage import open_storage
+
+Tables = tuple[dict[str, np.ndarray[Any, Any]], dict[str, np.ndarray[Any, Any]]]
+
+
+def small_spec(seed: int = 0, n_points: int = 64, **changes: Any) -> Specification:
+    return Specification(
+        seed=seed,
+        houses=Source(kind="builtin", digest="1" * 64),
+        objects=Source(kind="builtin", digest="2" * 64),
+        scene=SceneParams(n_clutter=2),
+        observation=ObservationParams(n_points=n_points),
+        **changes,
+    )
+
+
+def manifest_of(spec: Specification, layout: Layout) -> Manifest:
+    schema = schema_for(spec)
+    return Manifest(
+        spec=spec,
+        spec_hash=spec.hash(),
+        schema_name=schema.name,
+        schema_version=schema.version,
+        layout=layout,
+        code_version="0",
+        libraries={},
+        platform="test",
+        created=now(),
+    )
+
+
+def make_run(
+    folder: Path,
+    n: int = 50,
+    scenes_per_shard: int = 2,
+    candidates_per_scene: int = 5,
+    shards: Iterable[int] | None = None,
+    spec: Specification | None = None,
+) -> Run:
+    """A run of n samples with the given shards committed in the given order (default: all)."""
+    layout = Layout(scenes_per_shard=scenes_per_shard, candidates_per_scene=candidates_per_scene)
+    run = Run.create_or_open(open_storage(folder), manifest_of(spec or small_spec(), layout), n)
+    for shard in run.missing() if shards is None else shards:
+        assert run.commit(write(run, shard, f"a-{shard}"))
+    return run
+
+
+def write(run: Run, shard: int, attempt: str) -> Commit:
+    """Write a shard of random rows; its commit record, not yet published."""
+    scenes, samples = tables_of(run.schema, run.layout, run.manifest.spec.seed, shard)
+    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+    return commit_of(run, shard, attempt, run.write_shard(shard, attempt, files), int(samples["label"].sum()))
+
+
+def commit_of(run: Run, shard: int, attempt: str, files: tuple[FileEntry, ...], positives: int = 0) -> Commit:
+    return Commit(
+        shard=shard,
+        attempt=attempt,
+        spec_hash=run.manifest.spec_hash,
+        scenes=run.layout.scenes_per_shard,
+        samples=run.layout.samples_per_shard,
+        positives=positives,
+        redraws={},
+        files=files,
+        cost=Cost(wall_s=1.0, cpu_s=1.0),
+        host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
+        created=now(),
+    )
+
+
+def tables_of(schema: RecordSchema, layout: Layout, seed: int, shard: int) -> Tables:
+    """The rows of one shard. A scene's rows depend on seed and scene alone, as in a real run."""
+    first = shard * layout.scenes_per_shard
+    each = [
+        _scene(schema, layout.candidates_per_scene, seed, scene)
+        for scene in range(first, first + layout.scenes_per_shard)
+    ]
+    scenes, samples = (
+        {name: np.concatenate([e[t][name] for e in each]) for name in each[0][t]} for t in (0, 1)
+    )
+    return scenes, samples
+
+
+def _scene(schema: RecordSchema, candidates: int, seed: int, scene: int) -> Tables:
+    rng = np.random.default_rng([seed, scene])
+    scenes = {f.name: values_of(schema, f, 1, rng) for f in schema.scene_fields}
+    samples = {f.name: values_of(schema, f, candidates, rng) for f in schema.sample_fields}
+    scenes["scene_index"][:] = scene
+    samples["sample_scene_index"][:] = scene
+    samples["candidate_index"][:] = np.arange(candidates)
+    return scenes, samples
+
+
+def values_of(schema: RecordSchema, f: Field, rows: int, rng: np.random.Generator) -> np.ndarray[Any, Any]:
+    """Random values within the field's range."""
+    shape = schema.shape(f, rows)
+    if f.is_text:
+        words = np.array(["", "table", "Küche", "椅子", "x" * 40], object)
+        return rng.choice(words, shape)
+    dtype = np.dtype(f.dtype)
+    low, high = f.low if f.low is not None else 0, f.high if f.high is not None else 100
+    if dtype.kind == "f":
+        return rng.uniform(low, high, shape).astype(dtype)
+    if dtype.kind == "b":
+        return rng.integers(0, 2, shape).astype(bool)
+    return rng.integers(int(low), int(min(high, np.iinfo(dtype).max, 10**6)) + 1, shape).astype(dtype)
+
+
+def files_of(folder: Path) -> Mapping[str, bytes]:
+    """Every file below a folder, by relative path."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -1,0 +1,193 @@
+"""Storage: one winner, nothing half-written, errors of one line."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import InputError
+from schemas.storage import Storage, open_storage
+from tests.made_runs import files_of
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A real file system of 128 KiB."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("a small file system can be mounted by root alone")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_files_come_back_and_listing_tells_their_sizes(tmp_path: Path):
+    s = open_storage(tmp_path)
+    s.put("a/b", b"12")
+    s.put("a/b", b"123")
+    s.put("ab/c", b"")
+    s.sync(["a/b", "ab/c"])
+    assert s.get("a/b", 10) == b"123"
+    assert s.get("a/none", 10) is None
+    assert [(f.key, f.size) for f in s.list("a")] == [("a/b", 3)]
+    assert list(s.list("none")) == []
+    s.link_or_copy("a/b", "x/y")
+    assert (tmp_path / "x/y").samefile(tmp_path / "a/b")
+    s.delete(["a/b", "a/none"])
+    assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
+
+
+def test_it_travels_to_another_process(tmp_path: Path):
+    s: Storage = pickle.loads(pickle.dumps(open_storage(tmp_path)))
+    assert s.put_new("k", b"v")
+    assert open_storage(tmp_path).get("k", 9) == b"v"
+
+
+def race(s: Storage, barrier: threading.Barrier, key: str, me: int) -> bool:
+    barrier.wait()
+    return s.put_new(key, b"%d" % me * 1000)
+
+
+def test_of_racing_threads_exactly_one_wins_and_its_bytes_stay(tmp_path: Path):
+    s = open_storage(tmp_path)
+    for round_ in range(10):
+        barrier = threading.Barrier(4)
+        with ThreadPoolExecutor(4) as pool:
+            won = list(pool.map(partial(race, s, barrier, f"c/{round_}"), range(4)))
+        assert sum(won) == 1
+        assert s.get(f"c/{round_}", 5000) == b"%d" % won.index(True) * 1000
+    assert sorted(files_of(tmp_path)) == [f"c/{i}" for i in range(10)]
+
+
+def test_of_racing_processes_exactly_one_wins(tmp_path: Path):
+    code = (
+        "import sys; from schemas.storage import open_storage; s = open_storage(sys.argv[1], probe=False)\n"
+        "sys.stdin.readline(); print(sum(s.put_new(f'c/{i}', sys.argv[2].encode()) for i in range(40)))"
+    )
+    racers = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path), str(i)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parents[2],
+        )
+        for i in range(2)
+    ]
+    for r in racers:
+        assert r.stdin
+        r.stdin.write("go\n")
+        r.stdin.flush()
+    assert sum(int(r.communicate()[0]) for r in racers) == 40
+    assert len(files_of(tmp_path)) == 40
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing_visible(tiny_disk: Path):
+    s = open_storage(tiny_disk)
+    for write in (s.put, s.put_new):
+        with pytest.raises(InputError, match=r"No space left on device\. Free disk space") as e:
+            write("commits/000000.json", b"x" * 500_000)
+        assert "\n" not in str(e.value)
+        assert "commits/000000.json" in e.value.place
+    assert files_of(tiny_disk) == {}
+
+
+def test_a_backend_that_ignores_create_only_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # No real backend at hand overwrites; the local one is made to, by the flag that it is given.
+    import obstore
+
+    copy = obstore.copy
+    monkeypatch.setattr(
+        obstore, "copy", lambda store, a, b, overwrite=True: copy(store, a, b, overwrite=True)
+    )
+    with pytest.raises(InputError, match="create-only writes are not honoured"):
+        open_storage(tmp_path)
+    assert files_of(tmp_path) == {}
+
+
+def test_the_probe_leaves_no_file(tmp_path: Path):
+    open_storage(tmp_path / "new")
+    assert files_of(tmp_path) == {}
+
+
+def test_places_that_cannot_hold_a_run(tmp_path: Path):
+    (tmp_path / "file").write_text("x")
+    for place, problem in [
+        ("", "not the name of a folder"),
+        ("a\0b", "not the name of a folder"),
+        (tmp_path / "file", "a file stands there"),
+        (tmp_path / "file" / "below", "A file stands where a folder is needed"),
+        (tmp_path / ("x" * 300), "shorter path"),
+        ("gopher://there/run", "Name a folder or an s3://"),
+    ]:
+        with pytest.raises(InputError, match=problem) as e:
+            open_storage(place)
+        assert "\n" not in str(e.value)
+    with pytest.raises(InputError, match="no such folder"):
+        open_storage(tmp_path / "none", create=False)
+    assert not (tmp_path / "none").exists()
+
+
+def test_keys_cannot_leave_the_root(tmp_path: Path):
+    s = open_storage(tmp_path / "in")
+    (tmp_path / "out").write_text("secret")
+    for key in ("../out", "a/../../out", "a\0b"):
+        with pytest.raises(InputError):
+            s.get(key, 100)
+        with pytest.raises(InputError):
+            s.put(key, b"x")
+    assert (tmp_path / "out").read_text() == "secret"
+
+
+def test_a_file_above_the_limit_is_not_read(tmp_path: Path):
+    s = open_storage(tmp_path)
+    with (tmp_path / "huge").open("wb") as f:
+        f.truncate(2**40)
+    with pytest.raises(InputError, match="1099511627776 bytes, more than the 1000"):
+        s.get("huge", 1000)
+
+
+@pytest.fixture
+def shut_folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder without any permission, seen by a user who is not root."""
+    folder = tmp_path / "shut"
+    folder.mkdir()
+    folder.chmod(0)
+    was_root = os.geteuid() == 0
+    if was_root:
+        for parent in folder.parents:
+            parent.chmod(parent.stat().st_mode | 0o011)
+            if parent.name.startswith("pytest-of-"):
+                break
+        os.seteuid(65534)
+    try:
+        yield folder
+    finally:
+        if was_root:
+            os.seteuid(0)
+        folder.chmod(0o755)
+
+
+def test_without_permission_every_verb_is_refused_in_one_line(shut_folder: Path):
+    s = open_storage(shut_folder, probe=False)
+    for verb in (
+        lambda: open_storage(shut_folder),
+        lambda: s.put("a", b""),
+        lambda: s.put_new("a", b""),
+        lambda: s.get("a", 9),
+        lambda: s.exists("a"),
+        lambda: list(s.list("")),
+    ):
+        with pytest.raises(InputError, match="Permission denied") as e:
+            verb()
+        assert "\n" not in str(e.value)
