@@ -4,7 +4,6 @@ PYTHON ?= python3
 JOBS ?= 2
 
 BIN := .venv/bin
-CODE := cluster datagen schemas train workers tests benchmarks scripts
 DEMO := build/demo
 
 .PHONY: help demo test lint format docs venv clean
@@ -36,14 +35,14 @@ test: lint
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
 
 lint: venv
-	$(BIN)/ruff format --check --quiet $(CODE)
-	$(BIN)/ruff check --quiet $(CODE)
+	$(BIN)/ruff format --check --quiet .
+	$(BIN)/ruff check --quiet .
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: venv
-	$(BIN)/ruff check --fix --quiet $(CODE) || true
-	$(BIN)/ruff format $(CODE)
+	$(BIN)/ruff check --fix --quiet . || true
+	$(BIN)/ruff format .
 
 docs: venv
 	@mkdir -p build
@@ -52,4 +51,4 @@ docs: venv
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info
-	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -56,6 +56,7 @@ def build_app() -> App:
         # `main` prints errors itself: one line each, without a frame.
         print_error=False,
         exit_on_error=False,
+        suppress_keyboard_interrupt=False,
         result_action="return_value",
     )
     for verb, (target, line) in VERBS.items():
@@ -118,7 +119,7 @@ def run(arguments: Sequence[str]) -> int:
         result = build_app()(list(arguments))
         sys.stdout.flush()
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        sys.stderr.write("interrupted\n")
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         # The reader went away (`datagen status | head`). Python's own flush at exit would complain.
@@ -129,7 +130,7 @@ def run(arguments: Sequence[str]) -> int:
         if lines is None:
             raise
         for line in lines:
-            print(f"error: {one_line(line)}", file=sys.stderr)
+            sys.stderr.write(f"error: {one_line(line)}\n")
         return EXIT_BAD_INPUT
     return result if isinstance(result, int) else EXIT_GOOD
 

@@ -1,0 +1,154 @@
+"""The command line's frame: every kind of error leaves one line and the right exit code."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from datagen import __version__, cli
+from schemas.errors import InputError
+
+
+class Box(BaseModel):
+    width_m: float
+    height_m: float
+
+
+def refuse_input() -> None:
+    raise InputError("run.toml", "scene.n_clutter", "is -1", "Use a number from 0 to 30.")
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def fill_disk() -> None:
+    raise OSError(errno.ENOSPC, "No space left on device", "RUN/shards/0/c")
+
+
+def deny() -> None:
+    raise PermissionError(errno.EACCES, "Permission denied", "RUN")
+
+
+def break_model() -> None:
+    Box.model_validate({"width_m": "wide\nand\nwider" * 20, "height_m": None})
+
+
+def break_program() -> None:
+    raise ZeroDivisionError("a defect")
+
+
+def answer(*, n: int = 0) -> int:
+    return n
+
+
+@pytest.fixture
+def with_verbs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The real program with further verbs that end in each of the ways a verb can end."""
+    own = (refuse_input, interrupt, fill_disk, deny, break_model, break_program, answer)
+    table = {f.__name__.replace("_", "-"): (f"{__name__}:{f.__name__}", f.__name__) for f in own}
+    monkeypatch.setitem(sys.modules, __name__, sys.modules[refuse_input.__module__])
+    monkeypatch.setattr(cli, "VERBS", {**cli.VERBS, **table})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["refuse-input"], 2, ["run.toml", "scene.n_clutter", "is -1", "0 to 30"]),
+        (["interrupt"], 130, ["interrupted"]),
+        (["fill-disk"], 2, ["RUN/shards/0/c", "No space left", "free some space"]),
+        (["deny"], 2, ["RUN", "Permission denied", "permissions"]),
+        (["answer", "--n", "many"], 2, ["--n", "many", "int"]),
+        (["answer", "--m", "1"], 2, ["--m", "--help"]),
+        (["answer", "--n"], 2, ["--n", "argument"]),
+        (["answer", "surplus", "tokens"], 2, ["surplus"]),
+        (["statsu"], 2, ["unknown command", "statsu", "status"]),
+        (["--bogus"], 2, ["unknown option", "--bogus"]),
+    ],
+)
+@pytest.mark.usefixtures("with_verbs")
+def test_an_error_is_one_line(
+    arguments: list[str], code: int, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(arguments) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 1
+    assert "Traceback" not in told.err
+    for word in words:
+        assert word in told.err
+
+
+@pytest.mark.usefixtures("with_verbs")
+def test_a_refused_model_is_one_line_a_field(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["break-model"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(": ")[:3] for line in lines] == [
+        ["error", "Box", "width_m"],
+        ["error", "Box", "height_m"],
+    ]
+    assert all(len(line) < 250 for line in lines)
+
+
+@pytest.mark.usefixtures("with_verbs")
+def test_a_defect_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["break-program"])
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+@pytest.mark.usefixtures("with_verbs")
+def test_a_verb_decides_the_exit_code(code: int) -> None:
+    assert cli.run(["answer", "--n", str(code)]) == code
+
+
+@given(st.text(alphabet=st.characters(exclude_characters="\0"), max_size=30))
+def test_no_first_word_gives_a_traceback(word: str) -> None:
+    if word.strip() in cli.VERBS:
+        return
+    assert cli.run([word]) in (0, 2)
+
+
+@given(st.text())
+def test_one_line_holds_no_breaks(text: str) -> None:
+    assert len(cli.one_line(text).splitlines()) <= 1
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == f"datagen {__version__}"
+
+
+def test_help_imports_no_engine() -> None:
+    code = (
+        "import sys; from datagen import cli; cli.run(['--help']); "
+        "heavy = {'numpy', 'ray', 'sapien', 'pybullet', 'zarr', 'matplotlib', 'trimesh', 'pydantic'}; "
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    for verb in cli.VERBS:
+        assert verb in done.stdout
+
+
+@pytest.mark.parametrize("verb", sorted(cli.VERBS))
+def test_every_verb_exists(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    module, _, attribute = cli.VERBS[verb][0].partition(":")
+    assert hasattr(importlib.import_module(module), attribute)
+    assert cli.run([verb, "--help"]) == 0
+    assert "datagen " + verb in capsys.readouterr().out
+
+
+def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
+    errors = tmp_path / "stderr"
+    command = f"'{sys.executable}' -m datagen.cli --help 2>'{errors}' | head -c 1 >/dev/null"
+    subprocess.run(["bash", "-c", command], check=False)
+    assert errors.read_text() == ""

@@ -1,0 +1,159 @@
+"""The doctor: real checks of this machine, and each way in which a check can go wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from datagen import cli, doctor
+from datagen.doctor import engines, host
+from datagen.doctor.check import Check, probe
+from datagen.doctor.host import ENOUGH_DISK_BYTES
+
+
+def test_a_probe_survives_a_crash() -> None:
+    crashed = probe("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    assert not crashed.succeeded
+    assert crashed.text == "crashed with SIGSEGV"
+
+
+def test_a_probe_survives_a_hang() -> None:
+    hung = probe("import time; time.sleep(60)", timeout_s=0.5)
+    assert not hung.succeeded
+    assert "no answer" in hung.text
+
+
+def test_a_probe_tells_the_last_line() -> None:
+    assert probe("print('first'); print('last')").text == "last"
+    failed = probe("raise RuntimeError('no such device')")
+    assert not failed.succeeded
+    assert failed.text == "RuntimeError: no such device"
+
+
+def test_engines_work_where_the_tests_run() -> None:
+    found = {check.name: check for check in engines.engine_checks()}
+    assert found["embree"].status == "ok"
+    assert found["ray"].status == "ok"
+    assert "ok" in {found["sapien physics"].status, found["pybullet"].status}
+    for check in found.values():
+        assert check.status == "ok" or check.mend
+
+
+def test_broken_engines_are_named_with_a_mend(monkeypatch: pytest.MonkeyPatch) -> None:
+    for code in ("_SAPIEN_PHYSICS", "_PYBULLET", "_EMBREE", "_RAY"):
+        monkeypatch.setattr(engines, code, "import a_module_that_is_not_there")
+    found = {check.name: check for check in engines.engine_checks()}
+    assert {name: check.status for name, check in found.items()} == {
+        "sapien physics": "fail",
+        "pybullet": "fail",
+        "embree": "fail",
+        "ray": "warn",
+    }
+    for check in found.values():
+        assert "a_module_that_is_not_there" in check.detail
+        assert check.mend
+
+
+def test_one_settler_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "_SAPIEN_PHYSICS", "raise OSError('libX11.so.6: cannot open')")
+    found = {check.name: check for check in engines.engine_checks()}
+    assert found["sapien physics"].status == "warn"
+    assert "libX11" in found["sapien physics"].detail
+    assert "sapien render device" not in found
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"),
+    [("150000 100000", 1.5), ("max 100000", None), ("", None), ("1 0", None), ("a b", None), ("1 2 3", None)],
+)
+def test_container_cores(tmp_path: Path, text: str, cores: float | None) -> None:
+    (tmp_path / "cpu.max").write_text(text)
+    assert host.cgroup_cores(tmp_path) == cores
+    assert host.cgroup_cores(tmp_path / "absent") is None
+
+
+def test_container_limits_are_named(tmp_path: Path) -> None:
+    (tmp_path / "cpu.max").write_text("50000 100000")
+    (tmp_path / "memory.max").write_text(str(300 * 2**20))
+    (tmp_path / "memory.current").write_text(str(100 * 2**20))
+    cores, memory = host.check_cores(tmp_path), host.check_memory(tmp_path)
+    assert cores.status == "warn"
+    assert "--workers 1" in cores.mend
+    assert memory.status == "fail"
+    assert "container limit" in memory.detail
+
+
+def test_disk(tmp_path: Path) -> None:
+    assert host.check_disk("disk", tmp_path, enough=0).status in {"ok", "fail"}
+    assert host.check_disk("temporary files", tmp_path, enough=2**62).status == "warn"
+    absent = host.check_disk("temporary files", tmp_path / "absent", ENOUGH_DISK_BYTES)
+    assert absent.status == "warn"
+    assert absent.mend
+
+
+def test_cache_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "own"))
+    assert host.check_cache() == Check("cache", "ok", str(tmp_path / "own"))
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file" / "below"))
+    refused = host.check_cache()
+    assert refused.status == "warn"
+    assert "DATAGEN_CACHE" in refused.mend
+    monkeypatch.delenv("DATAGEN_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert host.cache_folder() == tmp_path / "datagen"
+
+
+def test_a_missing_library_comes_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "LIBRARIES", {"libnothere.so.9": ("nothing", "libnothere9")})
+    (check,) = host.check_libraries()
+    assert check.status == "warn"
+    assert "apt-get install -y libnothere9" in check.mend
+
+
+def test_gpu_program_that_fails_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\nexit 9\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert host.check_gpu().status == "warn"
+    program.write_text("#!/bin/sh\necho 'NVIDIA X, 24564 MiB, 570.1'\n")
+    assert host.check_gpu() == Check("gpu", "ok", "NVIDIA X, 24564 MiB, 570.1")
+
+
+def test_json_names_every_check(capsys: pytest.CaptureFixture[str]) -> None:
+    code = cli.run(["doctor", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert list(report) == ["ok", "checks"]
+    assert report["ok"] == (code == 0)
+    names = [check["name"] for check in report["checks"]]
+    assert len(names) == len(set(names))
+    assert {"python", "memory", "disk", "embree", "ray", "houses", "objects"} <= set(names)
+    for check in report["checks"]:
+        assert list(check) == ["name", "status", "detail", "mend"]
+        assert check["status"] != "ok" or check["detail"]
+
+
+def test_a_missing_folder_of_houses_fails(tmp_path: Path) -> None:
+    houses, objects = doctor.asset_checks(f"procthor:{tmp_path / 'absent'}", "teapots:x")
+    assert houses.status == objects.status == "fail"
+    assert str(tmp_path / "absent") in houses.detail
+    assert houses.mend
+    assert "ycb" in objects.mend
+
+
+def test_real_assets_are_counted(assets: Path) -> None:
+    houses, objects = doctor.asset_checks(f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}")
+    assert houses.detail.startswith("2018 ")
+    assert objects.status == "ok"
+
+
+def test_brackets_in_a_message_are_no_markup() -> None:
+    console = Console(width=100)
+    with console.capture() as captured:
+        console.print(doctor.as_table([Check("x", "fail", "[red]no[/blue] [/]", "use [fast]")]))
+    assert "[red]no[/blue] [/]" in captured.get()
+    assert "use [fast]" in captured.get()
