@@ -1,0 +1,281 @@
+"""Random access to the lines of large JSON-lines files, compressed or not, shared by processes.
+
+A compressed file is unpacked once into the cache folder and mapped into memory, so that all
+workers of a machine share its pages. The index (offset, length, sha256 and id of every line) lies
+beside it. Both are named by the digest of the source file and appear by an atomic rename; the
+index comes last, so that its presence means both are whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import hashlib
+import io
+import mmap
+import os
+import re
+import tempfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from schemas.identity import canonical_json
+from workers.houses.reading import parse_json
+
+MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
+_MAX_FILE_BYTES = 64 << 30
+_MAX_IN_MEMORY_BYTES = 2 << 30
+_FORMAT = 1  # raise it when the layout of the cached files changes
+_ID_KEY = re.compile(rb'"_id"\s*:\s*"([^"\\]{1,200})"')
+_MEND = "Restore the file from its source."
+
+
+@dataclass(frozen=True, eq=False)
+class LineIndex:
+    """Lines of one file: `data` holds the bytes, the arrays where each line lies in them."""
+
+    path: Path
+    data: mmap.mmap | bytes
+    spans: npt.NDArray[np.int64]  # (N, 2): offset, length
+    digests: npt.NDArray[np.uint8]  # (N, 32): sha256 of each line
+    ids: list[str]  # "" where a line names no id of its own
+    line_numbers: npt.NDArray[np.int64]  # (N,), from 1
+
+    def line(self, row: int) -> bytes:
+        """The bytes of a line, checked against the index."""
+        offset, length = (int(v) for v in self.spans[row])
+        text = self.data[offset : offset + length]
+        if hashlib.sha256(text).digest() != self.digests[row].tobytes():
+            place = f"{self.path}:{self.line_numbers[row]}"
+            raise InputError(place, "", "its bytes changed since it was opened", "Start again.")
+        return text
+
+
+def open_lines(path: Path, cache: Path | None) -> LineIndex:
+    """The index of a .jsonl, .jsonl.gz or .json file; `cache` None keeps everything in memory."""
+    try:
+        digest = _file_digest(path)
+        if cache is not None:
+            found = _from_cache(path, cache, digest)
+            if found is not None:
+                return found
+            made = _build_in_cache(path, cache, digest)
+            if made is not None:
+                return made
+        return _build_in_memory(path)
+    except OSError as error:
+        if isinstance(error, gzip.BadGzipFile):
+            raise InputError(path, "", f"not a gzip file ({error})", _MEND) from None
+        raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
+    except EOFError:
+        raise InputError(path, "", "the compressed file ends too early", _MEND) from None
+    except zlib.error as error:
+        raise InputError(path, "", f"the compressed data is damaged ({error})", _MEND) from None
+
+
+def cache_folder() -> Path | None:
+    """`$DATAGEN_CACHE`, else datagen/ in the user's cache folder; None where neither can be written."""
+    named = os.environ.get("DATAGEN_CACHE")
+    home = os.environ.get("XDG_CACHE_HOME")
+    try:
+        base = Path(named) if named else (Path(home) if home else Path.home() / ".cache") / "datagen"
+        folder = base / "houses"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: no home folder
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """(line number, line without its end) of every non-empty line, one at a time."""
+    if path.suffix == ".json":
+        yield from _documents(path)
+        return
+    opened = gzip.open(path, "rb") if path.suffix == ".gz" else open(path, "rb")
+    total = 0
+    with opened as stream:
+        for number in range(1, 1 << 62):
+            line = cast(IO[bytes], stream).readline(MAX_LINE_BYTES + 1)
+            if not line:
+                return
+            total += len(line)
+            if len(line) > MAX_LINE_BYTES or total > _MAX_FILE_BYTES:
+                problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB, or a file of more than 64 GiB"
+                raise InputError(f"{path}:{number}", "", problem, _MEND)
+            if line := line.strip():
+                yield number, line
+
+
+def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
+    """A .json file is one house, or a list of houses, each of which counts as a line."""
+    with open(path, "rb") as stream:
+        text = stream.read(MAX_LINE_BYTES * 4 + 1)
+    if len(text) > MAX_LINE_BYTES * 4:
+        raise InputError(path, "", "a JSON file of more than 64 MiB", "Store one house a line (.jsonl).")
+    text = text.strip()
+    if not text.startswith(b"["):
+        yield 1, text
+        return
+    root = parse_json(text, str(path))
+    for number, node in enumerate(root.items(1_000_000), 1):
+        try:
+            yield number, canonical_json(node.value).encode()
+        except ValueError:
+            raise node.error("NaN or infinity in a list of houses", "Store one house a line.") from None
+
+
+def _file_digest(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _own_id(line: bytes) -> str:
+    """The house's own name: its top-level `_id`, "" where there is none or it is not printable."""
+    names = _ID_KEY.findall(line)
+    if len(names) > 1:
+        try:
+            value: Any = parse_json(line, "").value
+        except InputError:
+            return ""  # the line is reported when it is loaded
+        own = cast(dict[str, Any], value).get("_id") if isinstance(value, dict) else None
+        name = own if isinstance(own, str) and len(own) <= 200 else ""
+    else:
+        name = names[0].decode("utf-8", "replace") if names else ""
+    return name if name.isprintable() and "\N{REPLACEMENT CHARACTER}" not in name else ""
+
+
+class _Collector:
+    """Gathers the index while lines pass by."""
+
+    def __init__(self) -> None:
+        self.spans: list[tuple[int, int]] = []
+        self.digests: list[bytes] = []
+        self.ids: list[str] = []
+        self.numbers: list[int] = []
+        self.offset = 0
+
+    def add(self, number: int, line: bytes) -> None:
+        self.spans.append((self.offset, len(line)))
+        self.digests.append(hashlib.sha256(line).digest())
+        self.ids.append(_own_id(line))
+        self.numbers.append(number)
+        self.offset += len(line) + 1
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {
+            "spans": np.array(self.spans, np.int64).reshape(-1, 2),
+            "digests": np.frombuffer(b"".join(self.digests), np.uint8).reshape(-1, 32),
+            "ids": np.frombuffer("\n".join(self.ids).encode(), np.uint8),
+            "numbers": np.array(self.numbers, np.int64),
+            "size": np.array([self.offset], np.int64),
+        }
+
+
+def _index(path: Path, data: mmap.mmap | bytes, arrays: dict[str, npt.NDArray[Any]]) -> LineIndex:
+    count = len(arrays["spans"])
+    ids = arrays["ids"].tobytes().decode().split("\n") if count else []
+    return LineIndex(path, data, arrays["spans"], arrays["digests"], ids, arrays["numbers"])
+
+
+def _names(cache: Path, digest: str) -> tuple[Path, Path]:
+    return cache / f"{digest}-v{_FORMAT}.jsonl", cache / f"{digest}-v{_FORMAT}.npz"
+
+
+def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
+    """None where the cache lacks the file, or holds something that does not fit together."""
+    data_path, index_path = _names(cache, digest)
+    try:
+        with np.load(index_path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in ("spans", "digests", "ids", "numbers", "size")}
+        size = int(arrays["size"][0])
+        if data_path.stat().st_size != size:
+            return None
+        with open(data_path, "rb") as stream:
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        return _index(path, data, arrays)
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zlib.error):
+        return None  # absent or damaged: it is built anew
+
+
+def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
+    """Unpacks into the cache; None where the cache cannot take it (full, gone, read-only)."""
+    data_path, index_path = _names(cache, digest)
+    collector = _Collector()
+    with _Scratch(cache) as scratch:
+        for number, line in _lines(path):
+            if not scratch.write(line + b"\n"):
+                return None
+            collector.add(number, line)
+        if not scratch.finish(data_path):
+            return None
+    buffer = io.BytesIO()
+    np.savez(buffer, **cast(Any, collector.arrays()))
+    with _Scratch(cache) as scratch:
+        if not (scratch.write(buffer.getvalue()) and scratch.finish(index_path)):
+            return None
+    return _from_cache(path, cache, digest)
+
+
+class _Scratch:
+    """A file that appears under its name when it is whole, or not at all.
+
+    Its methods return False when the cache cannot take the data, so that the errors of the cache
+    are not mistaken for those of the source that is being read meanwhile.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path: Path | None = None
+        try:
+            descriptor, name = tempfile.mkstemp(dir=folder, prefix="part-")
+        except OSError:
+            return
+        self._path = Path(name)
+        self._stream = os.fdopen(descriptor, "wb")
+
+    def __enter__(self) -> _Scratch:
+        return self
+
+    def write(self, data: bytes) -> bool:
+        if self._path is None:
+            return False
+        try:
+            self._stream.write(data)
+        except OSError:
+            return False
+        return True
+
+    def finish(self, final: Path) -> bool:
+        if self._path is None:
+            return False
+        try:
+            self._stream.close()
+            os.replace(self._path, final)
+        except OSError:
+            return False
+        return True
+
+    def __exit__(self, *_: object) -> None:
+        if self._path is None:
+            return
+        with contextlib.suppress(OSError):  # a full disk also fails to flush what is thrown away
+            self._stream.close()
+        self._path.unlink(missing_ok=True)
+
+
+def _build_in_memory(path: Path) -> LineIndex:
+    collector = _Collector()
+    lines: list[bytes] = []
+    for number, line in _lines(path):
+        collector.add(number, line)
+        lines.append(line)
+        if collector.offset > _MAX_IN_MEMORY_BYTES:
+            mend = "Set DATAGEN_CACHE to a folder with room for the unpacked houses."
+            raise InputError(path, "", "too large to unpack in memory", mend)
+    return _index(path, b"\n".join(lines) + b"\n", collector.arrays())

@@ -1,0 +1,102 @@
+"""Folders of ProcTHOR houses: JSON lines (compressed or not) or single JSON files, and a size table."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.houses.asset_table import TABLE_NAMES, Asset, read_asset_table
+from workers.houses.colours import hash_bytes
+from workers.houses.house import House
+from workers.houses.line_index import LineIndex, cache_folder, open_lines
+from workers.houses.loader import build_house
+from workers.houses.reading import parse_json
+
+_MAX_FILES = 100_000
+_SUFFIXES = (".jsonl.gz", ".jsonl", ".json")
+# Tables that may lie beside the houses.
+_NOT_HOUSES = {
+    *TABLE_NAMES, "type_annotations.json", "placement-annotations.json", "receptacles.json",
+    "wall-holes.json", "asset_groups.json", "metadata.json",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ProcthorHouses:
+    """The houses of one folder, found by id in mapped files."""
+
+    digest: str
+    folder: Path
+    assets: dict[str, Asset]
+    files: list[LineIndex]
+    rows: dict[str, tuple[int, int]]  # id -> file and row
+    clashes: dict[str, str] = field(default_factory=dict)  # id -> the places that both claim it
+    kind: str = "procthor"
+
+    def house_ids(self) -> list[str]:
+        """Ids, sorted."""
+        return list(self.rows)
+
+    def load(self, house_id: str) -> House:
+        """The house. Raises InputError that names the file, its line, the house and the JSON path."""
+        if house_id not in self.rows:
+            raise InputError(self.folder, "", f"no house {house_id!r}", "Choose an id that it holds.")
+        if house_id in self.clashes:
+            mend = "Rename or remove one of them."
+            raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", mend)
+        file, row = self.rows[house_id]
+        index = self.files[file]
+        text = index.line(row)
+        place = f"{index.path}:{index.line_numbers[row]} ({house_id})"
+        return build_house(parse_json(text, place), house_id, index.digests[row].tobytes().hex(), self.assets)
+
+
+def open_procthor(folder: str) -> ProcthorHouses:
+    """The houses below a folder. A broken house is found out when it is loaded, not here.
+
+    The digest covers the ids and bytes of all houses and the size table, not the names of files,
+    so that another compression or another cut into files gives the same digest.
+    """
+    path = Path(folder)
+    mend = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json."
+    if not folder or not path.is_dir():
+        raise InputError(folder or "procthor", "", "no such folder of houses", mend)
+    assets, table = read_asset_table(path)
+    names = sorted(
+        p.name for p in path.iterdir()
+        if p.name.endswith(_SUFFIXES) and p.name not in _NOT_HOUSES and p.is_file()
+    )  # fmt: skip
+    if not names:
+        raise InputError(path, "", "no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
+    if len(names) > _MAX_FILES:
+        raise InputError(path, "", f"{len(names)} files, more than {_MAX_FILES}", "Join them as JSON lines.")
+    cache = cache_folder()
+    # Single small files are read where they lie; only what holds many houses is worth unpacking.
+    files = [open_lines(path / n, None if n.endswith(".json") else cache) for n in names]
+    rows, clashes = _rows(files)
+    if not rows:
+        raise InputError(path, "", "its files hold no house", mend)
+    digests = [[i, files[f].digests[r].tobytes().hex()] for i, (f, r) in rows.items()]
+    digest = digest_of([digests, hash_bytes(table.decode("utf-8", "replace")).hex()])
+    return ProcthorHouses(digest, path, assets, files, rows, clashes)
+
+
+def _rows(files: list[LineIndex]) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """Where each id lies, sorted by id; a house that is there twice, byte for byte, counts once."""
+    found: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for f, index in enumerate(files):
+        stem = index.path.name.split(".")[0]
+        for row, own in enumerate(index.ids):
+            found[own or f"{stem}-{int(index.line_numbers[row]):06d}"].append((f, row))
+    rows: dict[str, tuple[int, int]] = {}
+    clashes: dict[str, str] = {}
+    for house_id in sorted(found):
+        places = found[house_id]
+        rows[house_id] = places[0]
+        if len({files[f].digests[r].tobytes() for f, r in places}) > 1:
+            named = [f"{files[f].path.name}:{files[f].line_numbers[r]}" for f, r in places[:4]]
+            clashes[house_id] = " and ".join(named)
+    return rows, clashes
