@@ -1,0 +1,95 @@
+"""The embedded default set of objects: parametric solids with published YCB sizes and masses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.geometry.mesh import Mesh
+from workers.objects import shapes
+from workers.objects.builtin_table import RECIPES
+from workers.objects.convex import ConvexParts, convex_parts, fits_gripper
+from workers.objects.model import ObjectModel
+from workers.objects.shapes import Paint, Solid
+from workers.objects.ycb_masses import PUBLISHED_MASS_KG
+
+# Part of every digest: raise it when `shapes` or the assembly here changes what comes out.
+GENERATOR_VERSION = 1
+
+_SHAPES: dict[str, Callable[..., Solid]] = {
+    "block": shapes.block,
+    "lathe": shapes.lathe,
+    "vessel": shapes.vessel,
+    "tube": shapes.tube,
+}
+_PAINTS: dict[str, Callable[..., Paint]] = {
+    "plain": shapes.plain,
+    "bands": shapes.bands,
+    "label": shapes.label,
+    "checks": shapes.checks,
+    "faces_of_box": shapes.faces_of_box,
+}
+
+
+class BuiltinObjects:
+    """All recipes of `builtin_table`, built on first use; nothing is read from disk."""
+
+    kind = "builtin"
+
+    def __init__(self) -> None:
+        self.excluded: Mapping[str, str] = {}
+        self._digests = {name: _digest(name) for name in sorted(RECIPES)}
+        self._models: dict[str, ObjectModel] = {}
+        self.digest = digest_of(self._digests)
+
+    def names(self) -> list[str]:
+        """Usable objects, sorted."""
+        return list(self._digests)
+
+    def load(self, name: str) -> ObjectModel:
+        """The model; the same object at every call. Raises InputError for an unknown name."""
+        if name not in self._digests:
+            raise InputError("builtin objects", name, "there is no such object", "See `names()` for all")
+        model = self._models.get(name)
+        if model is None:
+            model = self._models[name] = _model(name, self._digests[name])
+        return model
+
+
+def _digest(name: str) -> str:
+    return digest_of([GENERATOR_VERSION, name, PUBLISHED_MASS_KG[name], RECIPES[name]])
+
+
+def _model(name: str, digest: str) -> ObjectModel:
+    solid = shapes.joined(*[_piece(piece) for piece in RECIPES[name]])
+    vertices = solid.mesh.vertices_m.astype(np.float64)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    centre = (low + high) / 2
+    centred = (vertices - centre).astype(np.float32)
+    parts: ConvexParts = convex_parts(part - centre for part in solid.parts_m)
+    mass_kg = PUBLISHED_MASS_KG[name]
+    size = high - low
+    return ObjectModel(
+        name=name,
+        digest=digest,
+        mass_kg=mass_kg,
+        size_m=(float(size[0]), float(size[1]), float(size[2])),
+        radius_m=float(np.linalg.norm(centred.astype(np.float64), axis=1).max()),
+        visual=Mesh(centred, solid.mesh.faces, solid.mesh.face_rgb),
+        convex_parts_m=parts.vertices_m,
+        can_be_target=fits_gripper(centred, parts, mass_kg),
+    )
+
+
+def _piece(piece: dict[str, Any]) -> Solid:
+    arguments = {key: value for key, value in piece.items() if key not in ("shape", "with", "put")}
+    for key in ("centres_m", "radii_m"):
+        if key in arguments:
+            arguments[key] = np.array(arguments[key], np.float64)
+    paint = {key: value for key, value in piece["with"].items() if key != "paint"}
+    solid = _SHAPES[piece["shape"]](**arguments, paint=_PAINTS[piece["with"]["paint"]](**paint))
+    return shapes.moved(solid, **piece["put"])

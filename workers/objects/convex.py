@@ -1,0 +1,182 @@
+"""Convex parts: reading them, dropping flat ones, their volume and how a hand fits around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F32, F64
+from workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
+
+# A part thinner than this cannot be told from a sheet: physics engines reject or explode on it.
+MIN_THICKNESS_M = 1e-4
+MAX_PARTS = 1024
+
+GRIPPER_STROKE_M = 0.08
+# Half a millimetre of air on each side while the hand comes down.
+MAX_GRASP_WIDTH_M = GRIPPER_STROKE_M - 0.001
+# Lower things leave the fingertips no side to hold above the table.
+MIN_GRASP_HEIGHT_M = 0.012
+MAX_TARGET_MASS_KG = 1.3
+# A rim can be held when fingers reach this far down into the opening; plates are shallower.
+MIN_OPENING_DEPTH_M = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexParts:
+    """`vertices_m` holds the hull vertices of each part, (V, 3) each."""
+
+    vertices_m: tuple[F32, ...]
+    volume_m3: float  # sum over the parts; parts of a decomposition hardly overlap
+    n_dropped: int  # flat parts left out
+
+
+def read_convex_parts(path: Path) -> ConvexParts:
+    """Reads a convex decomposition: OBJ with one `o` group a part, or PLY.
+
+    Without groups (PLY, plain OBJ) each connected component is a part, which is how SAPIEN splits
+    such files too. Raises InputError naming the file: unreadable, no faces, only flat parts, more
+    than `MAX_PARTS` parts.
+    """
+    if path.suffix.lower() == ".ply":
+        vertices, groups = _read_ply(path)
+    else:
+        mesh = read_obj(path)
+        vertices, groups = mesh.vertices, mesh.group_faces()
+    if len(groups) == 1:
+        groups = _components(groups[0], len(vertices))
+    if len(groups) > MAX_PARTS:
+        raise InputError(
+            path,
+            "",
+            f"{len(groups)} convex parts, more than the {MAX_PARTS} allowed",
+            "Merge them to a coarser decomposition",
+        )
+    parts = convex_parts(vertices[np.unique(faces)] for faces in groups)
+    if not parts.vertices_m:
+        raise InputError(path, "", "every collision part is flat", "Give convex parts with volume")
+    return parts
+
+
+def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
+    """The hulls of point sets, each (V, 3); sets without volume are dropped and counted."""
+    kept: list[F32] = []
+    volume, dropped = 0.0, 0
+    for points in points_m:
+        try:
+            hull = ConvexHull(np.asarray(points, np.float64))
+        except (QhullError, ValueError):
+            dropped += 1
+            continue
+        if hull.volume < MIN_THICKNESS_M * hull.area / 2:
+            dropped += 1
+            continue
+        volume += float(hull.volume)
+        kept.append(np.asarray(points, np.float32)[np.sort(hull.vertices)])
+    return ConvexParts(tuple(kept), volume, dropped)
+
+
+def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(
+                path, "", f"the file has more than {MAX_FILE_BYTES:,} bytes", "Simplify the mesh"
+            )
+        mesh = trimesh.load_mesh(path, file_type="ply", process=False)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        faces = np.asarray(mesh.faces, np.int64)
+    except OSError as error:
+        raise InputError(
+            path, "", f"cannot be read: {error.strerror or error}", "Check the path and its rights"
+        ) from error
+    except InputError:
+        raise
+    # Broken PLY files surface in the reader in all of these ways.
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, MemoryError) as error:
+        raise InputError(path, "", f"not a PLY mesh ({type(error).__name__})", "Export it again") from error
+    if len(faces) == 0 or len(faces) > MAX_FACES:
+        raise InputError(path, "", f"the mesh has {len(faces):,} faces", f"Give 1 to {MAX_FACES:,} faces")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(path, "", "a face refers to a missing vertex", "Export the mesh again")
+    if not np.isfinite(vertices).all():
+        raise InputError(path, "", "a vertex is not finite", "Export the mesh again")
+    return vertices, [faces]
+
+
+def _components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
+    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n_vertices, n_vertices))
+    of_face = connected_components(graph, directed=False)[1][faces[:, 0]]
+    order = np.argsort(of_face, kind="stable")
+    cuts = np.flatnonzero(np.diff(of_face[order])) + 1
+    # In order of first appearance in the file, as groups are.
+    return sorted(np.split(faces[order], cuts), key=lambda part: int(part.min()))
+
+
+def fits_gripper(
+    visual_m: F32,  # (V, 3), object frame, z up at rest
+    parts: ConvexParts,
+    mass_kg: float,
+) -> bool:
+    """Whether an 8 cm parallel gripper can pick the object up from a table where it stands upright.
+
+    The fingers close in a horizontal direction, so what must fit is the smallest width of the
+    hull's outline seen from above, or, for open vessels, the rim. The mass limit leaves margin
+    below a Panda's 3 kg payload at a long reach.
+    """
+    points = np.concatenate(parts.vertices_m).astype(np.float64)
+    height_m = float(np.ptp(points[:, 2]))
+    if mass_kg > MAX_TARGET_MASS_KG or height_m < MIN_GRASP_HEIGHT_M:
+        return False
+    return (
+        outline_width(points[:, :2]) <= MAX_GRASP_WIDTH_M
+        or opening_depth(visual_m, parts.vertices_m) >= MIN_OPENING_DEPTH_M
+    )
+
+
+def outline_width(points_m: F64) -> float:
+    """The smallest distance of two parallel lines around (N, 2) points, metres.
+
+    It is attained with one line along an edge of the convex hull (rotating calipers).
+    """
+    corners = points_m[ConvexHull(points_m).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    reach = corners @ normals.T
+    return float((reach.max(axis=0) - reach.min(axis=0)).min())
+
+
+def opening_depth(visual_m: F32, parts_m: tuple[F32, ...]) -> float:
+    """How far an upright object's middle lies below its rim, metres: 0 unless it is an open vessel.
+
+    Looks at the visual vertices within half the rim's smaller half-width around the rim's axis. It
+    is a vessel only if the rim goes all the way round (each of 12 sectors rises above the middle)
+    and if the convex parts leave the opening free, so that fingers can enter it in physics too.
+    """
+    points = visual_m.astype(np.float64)
+    top = float(points[:, 2].max())
+    rim = points[points[:, 2] > top - 0.25 * np.ptp(points[:, 2])]
+    centre = (rim[:, :2].max(axis=0) + rim[:, :2].min(axis=0)) / 2
+    offset = points[:, :2] - centre
+    radius = np.hypot(offset[:, 0], offset[:, 1])
+    inside = radius < 0.25 * np.ptp(rim[:, :2], axis=0).min()
+    if not inside.any():
+        return 0.0
+    depth = top - float(points[inside, 2].max())
+    sector = ((np.arctan2(offset[:, 1], offset[:, 0]) + np.pi) / (2 * np.pi) * 12).astype(int) % 12
+    raised = np.unique(sector[~inside & (points[:, 2] > top - 0.5 * depth)])
+    if len(raised) < 12:
+        return 0.0
+    middle = np.array([centre[0], centre[1], top - depth / 2, 1.0])
+    filled = any(bool(np.all(ConvexHull(part).equations @ middle <= 0)) for part in parts_m)
+    return 0.0 if filled else depth

@@ -1,0 +1,192 @@
+"""One scanned object, read from its files or from the cache of what was read before."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.geometry.mesh import F32, Mesh, Texture
+from workers.objects.convex import ConvexParts, read_convex_parts
+from workers.objects.obj_file import ObjMesh, read_obj
+from workers.objects.texture import face_colours, read_texture
+
+# Part of every cache key: raise it when the reading changes what comes out.
+READER_VERSION = 1
+MIN_SIZE_M = 0.002
+MAX_SIZE_M = 2.0
+
+
+@dataclass(frozen=True)
+class ScanFiles:
+    """The files of one object and the sha256 over their bytes."""
+
+    visual: Path
+    texture: Path
+    collision: Path
+    digest: str
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Mesh and convex parts in one frame: origin at the centre of the visual's bounding box."""
+
+    visual: Mesh
+    parts: ConvexParts
+    size_m: tuple[float, float, float]
+
+
+def scan_files(visual: Path, texture: Path, collision: Path) -> ScanFiles:
+    """Hashes the three files. Raises InputError that names a missing or unreadable one."""
+    digests: list[str] = []
+    for path in (visual, texture, collision):
+        try:
+            with path.open("rb") as file:
+                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+        except OSError as error:
+            raise InputError(
+                path, "", f"cannot be read: {error.strerror or error}", "Fetch or restore the asset"
+            ) from error
+    return ScanFiles(visual, texture, collision, digest_of(digests))
+
+
+def cache_folder() -> Path:
+    """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories)."""
+    if explicit := os.environ.get("DATAGEN_CACHE"):
+        return Path(explicit)
+    try:
+        home = Path.home()
+    except RuntimeError:  # a container may run a user id without a home
+        home = Path(tempfile.gettempdir())
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "datagen"
+
+
+def load_scan(files: ScanFiles) -> Scan:
+    """The scan, from the cache where it is, else from the files (and then cached).
+
+    Raises InputError as `read_scan` does; a cache that cannot be used costs time, never a result.
+    """
+    path = cache_folder() / "objects" / f"{files.digest}-{READER_VERSION}.npz"
+    cached = _from_cache(path)
+    if cached is not None:
+        return cached
+    scan = read_scan(files.visual, files.texture, files.collision)
+    _to_cache(path, scan)
+    return scan
+
+
+def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
+    """Reads and joins the files of one object.
+
+    Vertices that carry several texture coordinates are split, so that `uv` has one per vertex.
+    Raises InputError naming the file: see `read_obj`, `read_texture` and `read_convex_parts`, and
+    a mesh without texture coordinates, of absurd size, or away from its collision parts.
+    """
+    mesh = read_obj(visual)
+    if (mesh.uv_faces < 0).any():
+        raise InputError(visual, "f", "a face has no texture coordinates", "Export the mesh with UVs")
+    used = mesh.vertices[np.unique(mesh.faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    size = high - low
+    if np.abs(used).max() > 100 or size.max() > MAX_SIZE_M or size.max() < MIN_SIZE_M:
+        raise InputError(
+            visual,
+            "v",
+            f"the mesh spans {size.max():.4g} m, where {MIN_SIZE_M} to {MAX_SIZE_M} m are expected",
+            "Scale the mesh to metres",
+        )
+    centre = (low + high) / 2
+    vertices, uv, faces = _split_seams(mesh)
+    image = read_texture(texture)
+    colours = face_colours(image, uv, faces)
+    vertices_m = (vertices - centre).astype(np.float32)
+
+    parts = read_convex_parts(collision)
+    corners = np.concatenate(parts.vertices_m)
+    gap = max(np.abs(corners.min(axis=0) - low).max(), np.abs(corners.max(axis=0) - high).max())
+    # Decompositions are a little larger or smaller than the scan (8.5 mm at most in the YCB set).
+    if gap > 0.01 + 0.05 * size.max():
+        raise InputError(
+            collision,
+            "v",
+            f"its bounding box is {gap:.3g} m off that of the visual mesh",
+            "Give both meshes in one frame and unit",
+        )
+    centred = tuple((part - centre).astype(np.float32) for part in parts.vertices_m)
+    return Scan(
+        Mesh(vertices_m, faces, colours, Texture(image, uv)),
+        ConvexParts(centred, parts.volume_m3, parts.n_dropped),
+        (float(size[0]), float(size[1]), float(size[2])),
+    )
+
+
+def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:
+    """One vertex for each used (vertex, texture coordinate) pair: (V, 3), (V, 2), faces (F, 3)."""
+    keys = mesh.faces * len(mesh.uv) + mesh.uv_faces
+    pairs, faces = np.unique(keys, return_inverse=True)
+    vertex, uv = np.divmod(pairs, len(mesh.uv))
+    return (
+        mesh.vertices[vertex],
+        mesh.uv[uv].astype(np.float32),
+        faces.reshape(-1, 3).astype(np.int32),
+    )
+
+
+def _from_cache(path: Path) -> Scan | None:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            cuts = data["part_cuts"]
+            size = data["size_m"]
+            return Scan(
+                Mesh(
+                    data["vertices"],
+                    data["faces"],
+                    data["face_rgb"],
+                    Texture(data["image"], data["uv"]),
+                ),
+                ConvexParts(
+                    tuple(np.split(data["part_vertices"], cuts)),
+                    float(data["volume"]),
+                    int(data["n_dropped"]),
+                ),
+                (float(size[0]), float(size[1]), float(size[2])),
+            )
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        return None  # absent or damaged: it is read from the files and written anew
+
+
+def _to_cache(path: Path, scan: Scan) -> None:
+    texture = scan.visual.texture
+    assert texture is not None
+    counts = [len(part) for part in scan.parts.vertices_m]
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            np.savez(
+                file,
+                vertices=scan.visual.vertices_m,
+                faces=scan.visual.faces,
+                face_rgb=scan.visual.face_rgb,
+                image=texture.image,
+                uv=texture.uv,
+                part_vertices=np.concatenate(scan.parts.vertices_m),
+                part_cuts=np.cumsum(counts)[:-1],
+                volume=np.float64(scan.parts.volume_m3),
+                n_dropped=np.int64(scan.parts.n_dropped),
+                size_m=np.array(scan.size_m),
+            )
+        # Atomic, so that workers that fill the cache together never see half a file.
+        temporary.replace(path)
+    except OSError:
+        # A read-only or full cache folder only means that the next worker reads the files again.
+        with contextlib.suppress(OSError):
+            temporary.unlink()

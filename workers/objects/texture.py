@@ -1,0 +1,108 @@
+"""Texture images and the colours they give to faces."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F32, I32, U8
+
+MAX_FILE_BYTES = 256 * 2**20
+MAX_SIDE_PX = 16_384
+MAX_PIXELS = 8192 * 8192
+# Larger images are reduced to this side: finer than a 640x480 frame can show of an object.
+KEPT_SIDE_PX = 512
+
+# Barycentric points at which a face's colour is sampled: its centre and half way to each corner.
+_SAMPLES = np.array([[2, 2, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]], np.float64) / 6
+
+
+def read_texture(path: Path) -> U8:
+    """The image as (H, W, 3) RGB, its longer side at most `KEPT_SIDE_PX`.
+
+    The size is checked before pixels are decoded. Raises InputError naming the file: missing, not
+    an image, broken, or too large.
+    """
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(
+                path, "", f"the image file has more than {MAX_FILE_BYTES:,} bytes", "Give a smaller one"
+            )
+        with warnings.catch_warnings():
+            # Our own limit, checked below, is stricter than the one that warns.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=("JPEG", "PNG")) as image:
+                width, height = image.size
+                if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
+                    raise InputError(
+                        path,
+                        "",
+                        f"the image has {width}x{height} pixels",
+                        f"Give at most {MAX_PIXELS:,} pixels",
+                    )
+                image.draft("RGB", (KEPT_SIDE_PX, KEPT_SIDE_PX))
+                pixels = image.convert("RGB")
+                pixels.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
+                return np.asarray(pixels, np.uint8)
+    except FileNotFoundError as error:
+        raise InputError(
+            path, "", "the texture file is missing", "Put it back or fetch the asset again"
+        ) from error
+    except InputError:
+        raise
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            path, "", f"not a readable JPEG or PNG image ({type(error).__name__})", "Fetch the asset again"
+        ) from error
+
+
+def face_colours(image: U8, uv: F32, faces: I32) -> U8:
+    """The mean texture colour of each face, (F, 3), over four points of it.
+
+    `uv` is (V, 2) with the origin at the lower left corner; coordinates outside [0, 1] repeat.
+    """
+    height, width, _ = image.shape
+    total = np.zeros((len(faces), 3), np.float64)
+    corners = uv.astype(np.float64)[faces]  # (F, 3, 2)
+    for weights in _SAMPLES:
+        point = np.einsum("k,fkc->fc", weights, corners) % 1.0
+        column = np.minimum((point[:, 0] * width).astype(np.int64), width - 1)
+        row = np.minimum(((1.0 - point[:, 1]) * height).astype(np.int64), height - 1)
+        total += image[row, column]
+    return np.rint(total / len(_SAMPLES)).astype(np.uint8)
+
+
+def texture_of_material(library: Path, materials: tuple[str, ...]) -> str:
+    """The `map_Kd` image name that a material library gives to the used materials.
+
+    Raises InputError naming the library: missing, no image, or several images on one mesh.
+    """
+    try:
+        if library.stat().st_size > 2**20:
+            raise InputError(library, "", "the material library is larger than 1 MiB", "Export it again")
+        text = library.read_text("utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(
+            library, "", f"cannot be read: {error.strerror or error}", "Put it next to the mesh"
+        ) from error
+    images: dict[str, str] = {}
+    material = ""
+    for line in text.splitlines():
+        keyword, _, value = line.strip().partition(" ")
+        if keyword == "newmtl":
+            material = value.strip()
+        elif keyword == "map_Kd":
+            images[material] = value.strip()
+    used = {images[m] for m in materials if m in images} or set(images.values())
+    if len(used) != 1:
+        raise InputError(
+            library,
+            "map_Kd",
+            f"{len(used)} texture images for one mesh, where 1 is needed",
+            "Bake the mesh into one texture",
+        )
+    return used.pop()

@@ -1,0 +1,84 @@
+"""Objects of the YCB set, as laser scans with convex collision parts, from a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.objects.convex import fits_gripper
+from workers.objects.credibility import reason_to_exclude
+from workers.objects.model import ObjectModel
+from workers.objects.scan import READER_VERSION, Scan, load_scan
+from workers.objects.ycb_layouts import Entry, read_layout
+
+
+class YcbObjects:
+    """The credible objects of one folder (see `ycb_layouts` for the layouts).
+
+    Opening it hashes and reads every object once, so that broken or unbelievable data shows before
+    a job starts; what was read is cached by content, and later openings take a fraction of a
+    second. Masses above 50 kg are refused by the index's schema.
+    """
+
+    kind = "ycb"
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError that names the file, the object and the field."""
+        index, entries = read_layout(folder)
+        excluded: dict[str, str] = {}
+        self._entries: dict[str, tuple[Entry, float]] = {}
+        self._models: dict[str, ObjectModel] = {}
+        for entry in entries:
+            volume_m3 = load_scan(entry.files).parts.volume_m3
+            measured = entry.mass_kg is not None
+            mass_kg = entry.density_kg_m3 * volume_m3 if entry.mass_kg is None else entry.mass_kg
+            reason = reason_to_exclude(entry.name, mass_kg, volume_m3, measured)
+            if reason is not None:
+                excluded[entry.name] = reason
+            else:
+                self._entries[entry.name] = (entry, mass_kg)
+        self.excluded: Mapping[str, str] = excluded
+        if not self._entries:
+            raise InputError(
+                index,
+                "",
+                "no object is left: all were excluded",
+                f"First reason: {next(iter(excluded.values()))}",
+            )
+        self.digest = digest_of({name: _digest(e, mass_kg) for name, (e, mass_kg) in self._entries.items()})
+
+    def names(self) -> list[str]:
+        """Usable objects, sorted."""
+        return list(self._entries)
+
+    def load(self, name: str) -> ObjectModel:
+        """The model; the same object at every call. Raises InputError for an unknown name."""
+        model = self._models.get(name)
+        if model is None:
+            if name not in self._entries:
+                why = self.excluded.get(name, "there is no such object")
+                raise InputError("ycb objects", name, why, "See `names()` for those that can be used")
+            entry, mass_kg = self._entries[name]
+            model = self._models[name] = _model(entry, mass_kg, load_scan(entry.files))
+        return model
+
+
+def _digest(entry: Entry, mass_kg: float) -> str:
+    return digest_of([entry.files.digest, float(mass_kg).hex(), READER_VERSION])
+
+
+def _model(entry: Entry, mass_kg: float, scan: Scan) -> ObjectModel:
+    return ObjectModel(
+        name=entry.name,
+        digest=_digest(entry, mass_kg),
+        mass_kg=mass_kg,
+        size_m=scan.size_m,
+        radius_m=float(np.linalg.norm(scan.visual.vertices_m.astype(np.float64), axis=1).max()),
+        visual=scan.visual,
+        convex_parts_m=scan.parts.vertices_m,
+        can_be_target=fits_gripper(scan.visual.vertices_m, scan.parts, mass_kg),
+    )

@@ -1,0 +1,165 @@
+"""What a folder of YCB objects says of itself, in either of the two layouts on disk.
+
+    DIR/objects.json                          DIR/info_pick_v0.json (or info_raw.json)
+    DIR/<key>/textured.obj, collision.obj ..  DIR/models/<key>/textured.obj, collision.ply|obj ..
+
+The right one is ManiSkill's `mani_skill2_ycb`, as its asset download unpacks it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from schemas.errors import InputError
+from workers.objects.obj_file import read_obj_header
+from workers.objects.scan import ScanFiles, scan_files
+from workers.objects.texture import texture_of_material
+from workers.objects.ycb_masses import PUBLISHED_MASS_KG
+
+MAX_INDEX_BYTES = 16 * 2**20
+MAX_OBJECTS = 10_000
+MANISKILL_INDEXES = ("info_pick_v0.json", "info_raw.json")
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}$")]
+_Mass = Annotated[float, Field(gt=0, le=50, allow_inf_nan=False)]
+_Density = Annotated[float, Field(gt=0, le=25_000, allow_inf_nan=False)]
+
+
+class _Files(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    visual: str
+    texture: str
+    collision: str
+
+
+class _Object(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    key: _Name
+    mass_kg: _Mass
+    files: _Files
+
+
+class _ManiSkillModel(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    density: _Density = 1000.0
+
+
+_OBJECTS = TypeAdapter(Annotated[list[_Object], Field(min_length=1, max_length=MAX_OBJECTS)])
+_MODELS = TypeAdapter(Annotated[dict[_Name, _ManiSkillModel], Field(min_length=1, max_length=MAX_OBJECTS)])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One object of a folder: its files and either its mass or, failing that, a density."""
+
+    name: str
+    place: str  # where a message about it points: "<index file>: [12]"
+    files: ScanFiles
+    mass_kg: float | None
+    density_kg_m3: float
+
+
+def read_layout(folder: Path) -> tuple[Path, list[Entry]]:
+    """The index file and its objects, in order of name, with their files hashed.
+
+    Raises InputError that names the folder, or the index and the field, or the missing file.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "", "there is no such folder", "Give the folder that holds objects.json")
+    index = folder / "objects.json"
+    if index.is_file():
+        return index, _bundle(folder, index)
+    for name in MANISKILL_INDEXES:
+        index = folder / name
+        if index.is_file():
+            return index, _maniskill(folder, index)
+    wanted = ", ".join(("objects.json", *MANISKILL_INDEXES))
+    raise InputError(
+        folder,
+        "",
+        f"no YCB objects here: none of {wanted}",
+        "Run `datagen assets fetch` or give another folder",
+    )
+
+
+def _bundle(folder: Path, index: Path) -> list[Entry]:
+    entries: dict[str, Entry] = {}
+    for number, item in enumerate(_validated(index, _OBJECTS)):
+        field = f"[{number}]"
+        if item.key in entries:
+            raise InputError(
+                index, f"{field}.key", f"{item.key} occurs twice", "Give every object its own key"
+            )
+        files = scan_files(
+            _inside(folder, index, f"{field}.files.visual", item.files.visual),
+            _inside(folder, index, f"{field}.files.texture", item.files.texture),
+            _inside(folder, index, f"{field}.files.collision", item.files.collision),
+        )
+        entries[item.key] = Entry(item.key, f"{index}: {field}", files, item.mass_kg, 0.0)
+    return [entries[name] for name in sorted(entries)]
+
+
+def _maniskill(folder: Path, index: Path) -> list[Entry]:
+    """Objects at their true size: ManiSkill's `scales` shrink some for one of its tasks.
+
+    Its densities are rough (1000 or 50 kg/m3 for most), so published masses are used where known.
+    """
+    entries: list[Entry] = []
+    for name, model in sorted(_validated(index, _MODELS).items()):
+        home = _inside(folder, index, name, f"models/{name}")
+        visual = home / "textured.obj"
+        header = read_obj_header(visual)
+        library = _inside(home, visual, "mtllib", header.material_library or "textured.mtl")
+        image = texture_of_material(library, header.materials)
+        collision = next((c for c in (home / "collision.ply", home / "collision.obj") if c.is_file()), None)
+        if collision is None:
+            raise InputError(
+                home, "", "neither collision.ply nor collision.obj is here", "Fetch the asset again"
+            )
+        files = scan_files(visual, _inside(home, library, "map_Kd", image), collision)
+        entries.append(Entry(name, f"{index}: {name}", files, PUBLISHED_MASS_KG.get(name), model.density))
+    return entries
+
+
+def _validated(index: Path, adapter: TypeAdapter[Any]) -> Any:
+    try:
+        if index.stat().st_size > MAX_INDEX_BYTES:
+            raise InputError(index, "", f"larger than {MAX_INDEX_BYTES:,} bytes", "Give the set's own index")
+        value = json.loads(index.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(
+            index, "", f"cannot be read: {error.strerror or error}", "Check its rights"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(index, "", f"not JSON: {error}", "Fetch the index again") from error
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"])
+        given = repr(first["input"])[:60]
+        raise InputError(
+            index, field.lstrip("."), f"{first['msg']}, got {given}", "Correct it or fetch the index again"
+        ) from error
+
+
+def _inside(folder: Path, place: Path, field: str, relative: str) -> Path:
+    """`folder / relative`, refused where it leaves the folder, also through a link."""
+    try:
+        path = (folder / relative).resolve()
+        inside = path.is_relative_to(folder.resolve()) and "\0" not in relative
+    except (OSError, ValueError, RuntimeError):
+        inside = False
+    if not inside or not relative:
+        raise InputError(
+            place,
+            field,
+            f"{relative[:80]!r} is not a path inside {folder}",
+            "Give a path relative to the folder",
+        )
+    return folder / relative
