@@ -9,10 +9,10 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.specification import Specification
+from workers.bases.clearance import Obstacles, obstacles_of
 from workers.geometry.mesh import F64
 from workers.houses import ids_of_split, open_houses
 from workers.houses.house import House, HouseSource
-from workers.bases.clearance import Obstacles, obstacles_of
 from workers.objects import open_objects
 from workers.objects.model import ObjectModel, ObjectSource
 from workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays

@@ -35,17 +35,18 @@ def draw_scene(world: World, index: int, clock: StageClock) -> Scene:
 
     Raises InputError when `scene.max_retries` redraws were not enough.
     """
-    redraws: Counter[str] = Counter()
+    redraws, detail = Counter[str](), ""
     for retry in range(world.spec.scene.max_retries):
         try:
             return _try_scene(world, index, retry, dict(redraws), clock)
         except Redraw as redraw:
             redraws[redraw.cause] += 1
+            detail = redraw.detail or detail
     causes = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
     raise InputError(
         f"scene {index}",
         "scene.max_retries",
-        f"no usable scene in {world.spec.scene.max_retries} tries ({causes})",
+        f"no usable scene in {world.spec.scene.max_retries} tries ({causes}) {detail}",
         "Look at the most frequent cause: other houses or objects, or wider limits, may help",
     )
 
@@ -54,7 +55,7 @@ def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], cl
     spec = world.spec
     with clock.stage("draw"):
         rng = generator(spec.seed, Stream.SCENE, index, retry)
-        house = world.house(world.house_ids[rng.integers(len(world.house_ids))])
+        house = _load_house(world, world.house_ids[rng.integers(len(world.house_ids))])
         surfaces = eligible_surfaces(house.house, spec.scene)
         if not surfaces:
             raise Redraw("no_surface")
@@ -81,6 +82,14 @@ def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], cl
         noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
         cloud = _observe(world, stage, rays, camera, rng, noise_rng)
     return Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
+
+
+def _load_house(world: World, house_id: str) -> PreparedHouse:
+    """The house; one broken record among thousands costs a redraw, not the job."""
+    try:
+        return world.house(house_id)
+    except InputError as error:
+        raise Redraw("bad_house", str(error)) from error
 
 
 def _draw_names(world: World, rng: np.random.Generator) -> list[str]:

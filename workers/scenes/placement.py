@@ -15,7 +15,7 @@ from workers.objects.model import ObjectModel
 from workers.scenes.scene import Redraw
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
-_NEAR_TRIES, _FAR_TRIES = 24, 40
+_NEAR_TRIES, _FAR_TRIES = 36, 40
 _ABOVE_M = 0.5  # things this far above the surface cannot be in the way of a drop
 
 
@@ -61,7 +61,8 @@ def drop_poses(
 ) -> F64:
     """Start poses (K, 4, 4), world: upright, turned at random, just above the surface, disjoint.
 
-    Object 0, the target, goes anywhere; the others near it, and anywhere once that is full.
+    Object 0, the target, goes anywhere; the others within `clutter_radius_m` of it, then up to
+    twice as far, and anywhere once that is full.
     `taken` are footprints in the surface frame that are kept free. Raises Redraw("no_placement").
     """
     half = np.array(surface.size_m) / 2 - params.edge_margin_m
@@ -73,7 +74,9 @@ def drop_poses(
         for attempt in range(tries):
             yaw = rng.uniform(-np.pi, np.pi)
             if k > 0 and attempt < _NEAR_TRIES:
-                angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0, params.clutter_radius_m)
+                # The ring widens with every try, so that a crowded middle is left step by step.
+                reach_m = params.clutter_radius_m * (1 + attempt / _NEAR_TRIES)
+                angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0, reach_m)
                 xy = target_xy + radius * np.array([np.cos(angle), np.sin(angle)])
             else:
                 xy = rng.uniform(-half, half)

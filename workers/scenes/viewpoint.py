@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.specification import CandidateParams, ObservationParams
+from workers.bases.candidates import Candidates
+from workers.bases.clearance import Obstacles, base_clearance_m
 from workers.geometry.mesh import F64
 from workers.geometry.planar import inside_polygon
 from workers.geometry.transforms import look_at
 from workers.houses.house import Room
-from workers.bases.candidates import Candidates
-from workers.bases.clearance import Obstacles, base_clearance_m
-from workers.rendering.visibility import visible_pixels
 from workers.rendering.frame import Camera
 from workers.rendering.rays import RayStage
+from workers.rendering.visibility import visible_pixels
 from workers.scenes.scene import Redraw
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels

@@ -1,0 +1,87 @@
+"""What the ledger and the commits of runs say together: labels, cost and waste."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from schemas.run import Run
+from schemas.run_records import Cost
+
+
+@dataclass
+class Account:
+    """Sums over some attempts; seconds, bytes."""
+
+    attempts: int = 0
+    unaccounted: int = 0  # attempts that left no account of their cost
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    stage_wall_s: Counter[str] = field(default_factory=Counter)
+    stage_cpu_s: Counter[str] = field(default_factory=Counter)
+    stage_gpu_s: Counter[str] = field(default_factory=Counter)
+    written_bytes: int = 0
+    peak_rss_bytes: int = 0
+
+    def add(self, cost: Cost | None) -> None:
+        """Add one attempt."""
+        self.attempts += 1
+        if cost is None:
+            self.unaccounted += 1
+            return
+        self.wall_s += cost.wall_s
+        self.cpu_s += cost.cpu_s
+        self.stage_wall_s.update(cost.stage_wall_s)
+        self.stage_cpu_s.update(cost.stage_cpu_s)
+        self.stage_gpu_s.update(cost.stage_gpu_s)
+        self.written_bytes += cost.written_bytes
+        self.peak_rss_bytes = max(self.peak_rss_bytes, cost.peak_rss_bytes)
+
+    @property
+    def unnamed_wall_s(self) -> float:
+        """Wall seconds that no stage claimed."""
+        return max(0.0, self.wall_s - sum(self.stage_wall_s.values()))
+
+
+@dataclass
+class Books:
+    """All that was paid for a set of runs, split into what became data and what did not."""
+
+    labels: int = 0
+    positives: int = 0
+    scenes: int = 0
+    redraws: Counter[str] = field(default_factory=Counter)
+    useful: Account = field(default_factory=Account)
+    waste: dict[str, Account] = field(default_factory=dict)  # by outcome
+    running: int = 0  # attempts that began and have not ended
+    machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
+
+    @property
+    def total_wall_s(self) -> float:
+        return self.useful.wall_s + sum(a.wall_s for a in self.waste.values())
+
+
+def account_for(runs: Iterable[Run]) -> Books:
+    """Read commits and ledgers. A committed attempt is counted from its commit, once.
+
+    The ledger's other entries are waste by their outcome: ledger = commits + waste. An attempt
+    whose commit exists and whose ledger entry does not (the driver died between the two) is useful
+    all the same.
+    """
+    books = Books()
+    for run in runs:
+        committed: set[str] = set()
+        for commit in run.commits():
+            committed.add(commit.attempt)
+            books.labels += commit.samples
+            books.positives += commit.positives
+            books.scenes += commit.scenes
+            books.redraws.update(commit.redraws)
+            books.useful.add(commit.cost)
+            books.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
+        for entry in run.ledger():
+            if entry.attempt not in committed:
+                books.waste.setdefault(entry.outcome, Account()).add(entry.cost)
+        books.running += sum(start.attempt not in committed for start in run.unfinished_attempts())
+    return books

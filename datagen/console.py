@@ -1,0 +1,47 @@
+"""What verbs print: tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on standard output."""
+    json.dump(value, sys.stdout, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:
+    """A table; the first column is left-aligned, the others right-aligned when there are heads."""
+    table = Table(title=title, title_justify="left", show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
+    for k in range(len(heads)) if heads else range(2):
+        table.add_column(heads[k] if heads else "", justify="right" if heads and k else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console(highlight=False, width=None if sys.stdout.isatty() else 110).print(table)
+
+
+def seconds(value: float) -> str:
+    """A duration as people read it: 0.8 s, 3 min 20 s, 2 h 5 min, 3.1 days."""
+    if value < 60:
+        return f"{value:.2g} s" if value < 1 else f"{value:.1f} s"
+    if value < 3600:
+        return f"{int(value // 60)} min {int(value % 60)} s"
+    if value < 48 * 3600:
+        return f"{int(value // 3600)} h {int(value % 3600 // 60)} min"
+    return f"{value / 86400:.1f} days"
+
+
+def size(value: float) -> str:
+    """Bytes as people read them."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000:
+            return f"{value:.3g} {unit}"
+        value /= 1000
+    return f"{value:.3g} TB"

@@ -1,0 +1,117 @@
+"""From options and a TOML file to a specification and a layout."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from schemas.errors import InputError, choices
+from schemas.run_records import Layout
+from schemas.specification import Source, Specification
+from workers.houses.house import HouseSource
+from workers.labels import LABEL_SOURCES
+from workers.objects.model import ObjectSource
+from workers.rendering import RENDERERS
+from workers.settling import SETTLERS
+
+_MAX_CONFIG_BYTES = 1 << 20
+# Distributions whose version can move bits of a sample, by the engine that needs them.
+_ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
+_SCENES_PER_SHARD = 32
+_SHARDS_AT_LEAST = 8
+
+
+def specify(
+    label_source: str,
+    houses: HouseSource,
+    objects: ObjectSource,
+    options: dict[str, Any],
+    config: Path | None,
+) -> Specification:
+    """The specification that the options (dotted names, None where not given) and the file ask for.
+
+    An option wins over the file, the file over the default. Raises InputError naming the option or
+    the file and the field.
+    """
+    fields = _read_config(config) if config else {}
+    for reserved in ("label_source", "houses", "objects", "engines"):
+        if reserved in fields:
+            raise InputError(
+                config or "", reserved, "is not set in this file", "Give it on the command line instead"
+            )
+    for name, value in options.items():
+        if value is not None:
+            _put(fields, name, value, config)
+    fields |= {
+        "label_source": label_source,
+        "houses": Source(kind=houses.kind, digest=houses.digest),
+        "objects": Source(kind=objects.kind, digest=objects.digest),
+    }
+    place = str(config) if config else "options"
+    try:
+        spec = Specification.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        mend = (
+            "Take the key out, or correct it: docs/data-format.md lists all"
+            if (first["type"] == "extra_forbidden")
+            else "Correct the value"
+        )
+        raise InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend) from None
+    for field, name, registry in (
+        ("label_source", spec.label_source, LABEL_SOURCES),
+        ("settle.engine", spec.settle.engine, SETTLERS),
+        ("observation.renderer", spec.observation.renderer, RENDERERS),
+    ):
+        if name not in registry:
+            raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
+    return spec.model_copy(update={"engines": _engines(spec)})
+
+
+def layout_of(spec: Specification, n: int) -> Layout:
+    """Scenes in shards of about 32, fewer for a small run so that workers share it evenly.
+
+    A number of scenes that divides evenly is preferred: then nothing beyond n is made.
+    """
+    scenes = -(-n // spec.candidates.count)
+    most = max(1, min(_SCENES_PER_SHARD, scenes // _SHARDS_AT_LEAST))
+    even = next((k for k in range(most, most // 2, -1) if scenes % k == 0), most)
+    return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
+
+
+def _engines(spec: Specification) -> dict[str, str]:
+    names = {"embree", spec.settle.engine, spec.observation.renderer}
+    engines = {_ENGINE_PACKAGES[name]: version(_ENGINE_PACKAGES[name]) for name in sorted(names)}
+    # numpy may change what a generator draws between feature releases, never between patches.
+    engines["numpy"] = ".".join(version("numpy").split(".")[:2])
+    engines["labels"] = str(LABEL_SOURCES[spec.label_source].version)
+    return engines
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    mend = "Give a TOML file as docs/data-format.md describes it"
+    try:
+        size = path.stat().st_size
+        if size > _MAX_CONFIG_BYTES:
+            raise InputError(path, "", f"{size} bytes is too large for a configuration", mend)
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read: {error.strerror}", mend) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(path, "", f"is not TOML: {error}", mend) from None
+
+
+def _put(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
+    """Set a dotted name in nested dictionaries."""
+    *parents, leaf = name.split(".")
+    for parent in parents:
+        below = fields.setdefault(parent, {})
+        if not isinstance(below, dict):
+            raise InputError(config or "", parent, "is a value where a section belongs", f"Write [{parent}]")
+        fields = below
+    fields[leaf] = value

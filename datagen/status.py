@@ -1,0 +1,83 @@
+"""`datagen status`: how far a run is, and what failed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from datagen.console import print_json, print_rows
+from schemas.run import Run
+from schemas.seal import SEALED
+
+
+def status(
+    run: Annotated[str, Parameter(help="The run's folder.")],
+    *,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+) -> int:
+    """How far a run is: shards, labels, failed attempts by cause, quarantine."""
+    report = status_report(Run.open(run))
+    if json:
+        print_json(report)
+    else:
+        _print(run, report)
+    return 0
+
+
+def status_report(run: Run) -> dict[str, Any]:
+    """The state of a run as plain values."""
+    planned, committed, quarantined = run.planned(), run.committed(), run.quarantined()
+    commits = list(run.commits())
+    outcomes: Counter[str] = Counter()
+    causes: Counter[str] = Counter()
+    for entry in run.ledger():
+        outcomes[entry.outcome] += 1
+        if entry.cause:
+            causes[f"{entry.outcome}: {entry.cause}"] += 1
+    unfinished = {start.attempt for start in run.unfinished_attempts()} - {c.attempt for c in commits}
+    done = [c for c in commits if c.shard in planned]
+    return {
+        "run": run.storage.url,
+        "label_source": run.manifest.spec.label_source,
+        "spec_hash": run.manifest.spec_hash,
+        "created": run.manifest.created,
+        "n": run.n,
+        "labels": sum(run.planned_rows(c.shard)[1] for c in done),
+        "positives": sum(c.positives for c in commits),
+        "shards": {
+            "planned": len(planned),
+            "committed": len(committed & set(planned)),
+            "quarantined": sorted(quarantined),
+            "missing": len(planned) - len(committed & set(planned)) - len(quarantined & set(planned)),
+        },
+        "attempts": dict(sorted(outcomes.items())),
+        "attempts_without_end": len(unfinished),
+        "causes": dict(causes.most_common(20)),
+        "sealed": run.storage.exists(f"{SEALED}/zarr.json"),
+        "complete": len(committed & set(planned)) == len(planned),
+    }
+
+
+def _print(place: str, report: dict[str, Any]) -> None:
+    shards = report["shards"]
+    state = "complete" if report["complete"] else f"{shards['missing']} shards to make"
+    if shards["quarantined"]:
+        state += f", {len(shards['quarantined'])} in quarantine: {shards['quarantined'][:10]}"
+    attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
+    rows = [
+        ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
+        ("shards", f"{shards['committed']} of {shards['planned']} committed; {state}"),
+        ("attempts", attempts),
+        ("sealed", "yes, data.zarr" if report["sealed"] else "no"),
+        ("specification", report["spec_hash"][:16]),
+        ("created", report["created"]),
+    ]
+    if report["attempts_without_end"]:
+        rows.insert(3, ("without end", f"{report['attempts_without_end']} attempts run now, or were lost"))
+    print_rows(f"run {place}", rows)
+    if report["causes"]:
+        print_rows(
+            "causes", [(str(n), cause) for cause, n in report["causes"].items()], ("attempts", "cause")
+        )

@@ -1,0 +1,127 @@
+"""rho on stages whose answer is known, and against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.independent import pixel_counts
+from tests.workers.worlds import (
+    ROOM_M,
+    TABLE_TOP_M,
+    ball_model,
+    box_body,
+    box_model,
+    cylinder_model,
+    stage_with,
+)
+from workers.rendering.embree_renderer import ray_stage
+from workers.rendering.frame import Stage
+from workers.rendering.visibility import visible_pixels
+
+CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
+
+
+def rho(stage: Stage, eye_m: tuple[float, float, float], window: int = 64) -> float:
+    alone, seen = visible_pixels(ray_stage(stage), 0, np.array([eye_m]), window)
+    return seen[0] / alone[0]
+
+
+def triangles_of(stage: Stage) -> list[np.ndarray]:
+    """World triangles (F, 3, 3) of each object and, last, of the house."""
+    placed = [m.visual.transformed(T) for m, T in zip(stage.objects, stage.T_world_object, strict=True)]
+    bodies = [b.visual for b in stage.house.bodies]
+    own = [m.vertices_m.astype(np.float64)[m.faces] for m in placed]
+    return [*own, np.concatenate([m.vertices_m.astype(np.float64)[m.faces] for m in bodies])]
+
+
+def test_a_lone_target_is_wholly_seen_from_every_side() -> None:
+    stage = stage_with([box_model("target", (0.08, 0.06, 0.12))], [(0, 0)])
+    eyes = [(0.5, 1.5, 1.2), (3.5, 1.5, 1.0), (2.0, 0.4, 1.5), (2.0, 1.5, 2.2)]
+    assert [rho(stage, eye) for eye in eyes] == [1.0] * 4
+
+
+def test_a_wall_a_board_and_the_table_itself_hide_the_target() -> None:
+    target = box_model("target", (0.08, 0.06, 0.12))
+    stage = stage_with([target], [(0, 0)])
+    assert rho(stage, (-1.0, 1.5, 1.2)) == 0  # outside, behind the wall
+    assert rho(stage, (2.0, 1.5, 0.3)) == 0  # under the table
+    tall = box_model("board", (0.02, 0.4, 0.5))
+    assert rho(stage_with([target, tall], [(0, 0), (-0.2, 0)]), (0.5, 1.5, 0.85)) == 0
+    assert rho(stage_with([target, tall], [(0, 0), (0.2, 0)]), (0.5, 1.5, 0.85)) == 1
+
+
+def test_half_a_target_behind_a_board_is_half_seen() -> None:
+    target = box_model("target", (0.1, 0.1, 0.1))
+    board = box_model("board", (0.01, 0.6, 0.6))
+    # The board's edge lies on the sight line's plane: it hides what is left of it.
+    stage = stage_with([target, board], [(0, 0), (-0.3, -0.3)])
+    assert rho(stage, (0.3, CENTRE[1], TABLE_TOP_M + 0.05)) == pytest.approx(0.5, abs=0.03)
+
+
+def test_furniture_counts_as_much_as_objects() -> None:
+    screen = box_body("screen", "furniture", "Dresser", (0.1, 2.0, 2.0), (1.0, 1.5, 1.0))
+    from tests.workers.worlds import table_house
+
+    target = box_model("target", (0.08, 0.06, 0.12))
+    stage = stage_with([target], [(0, 0)], table_house([screen]))
+    assert rho(stage, (0.4, 1.5, 1.2)) == 0
+    assert rho(stage, (3.6, 1.5, 1.2)) == 1
+
+
+def test_an_eye_inside_the_target_sees_nothing() -> None:
+    stage = stage_with([ball_model("target", 0.05)], [(0, 0)])
+    eye = stage.T_world_object[:1, :3, 3]
+    alone, seen = visible_pixels(ray_stage(stage), 0, eye, 64)
+    assert (alone[0], seen[0]) == (0, 0)
+
+
+def test_a_ball_fills_its_window_as_a_disc_does() -> None:
+    stage = stage_with([ball_model("target", 0.06)], [(0, 0)])
+    alone, _ = visible_pixels(ray_stage(stage), 0, np.array([[0.6, 1.5, 1.4], [2.0, 0.2, 0.9]]), 64)
+    np.testing.assert_allclose(alone / 64**2, np.pi / 4, rtol=0.03)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-0.4, 0.4), st.floats(-0.3, 0.3)), min_size=4, max_size=4),
+    st.floats(-np.pi, np.pi),
+    st.floats(0.25, 1.2),
+    st.floats(0.4, 1.5),
+)
+@settings(max_examples=60, deadline=None)
+def test_pixel_counts_equal_those_of_a_second_implementation(
+    offsets: list[tuple[float, float]], angle: float, distance: float, height: float
+) -> None:
+    models = [
+        cylinder_model("target", 0.03, 0.15),
+        box_model("a", (0.1, 0.05, 0.2)),
+        ball_model("b", 0.05),
+        box_model("c", (0.04, 0.3, 0.04)),
+    ]
+    stage = stage_with(models, offsets)
+    triangles = triangles_of(stage)
+    eye = np.array(
+        [
+            np.clip(CENTRE[0] + distance * np.cos(angle), 0.05, ROOM_M[0] - 0.05),
+            np.clip(CENTRE[1] + distance * np.sin(angle), 0.05, ROOM_M[1] - 0.05),
+            height,
+        ]
+    )
+    centre = stage.T_world_object[0, :3, 3]
+    expected = pixel_counts(triangles[0], np.concatenate(triangles[1:]), centre, models[0].radius_m, eye, 48)
+    alone, seen = visible_pixels(ray_stage(stage), 0, eye[None], 48)
+    # A pixel centre that falls on an edge may round either way.
+    assert alone[0] == pytest.approx(expected[0], abs=3)
+    assert seen[0] == pytest.approx(expected[1], abs=6)
+
+
+def test_blocks_of_rays_do_not_change_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = ray_stage(
+        stage_with([ball_model("t", 0.05), box_model("a", (0.1, 0.1, 0.2))], [(0, 0), (0.15, 0)])
+    )
+    eyes = np.random.default_rng(1).uniform((0.2, 0.2, 0.8), (3.8, 2.8, 1.5), (50, 3))
+    whole = visible_pixels(stage, 0, eyes, 32)
+    monkeypatch.setattr("workers.rendering.visibility._MAX_RAYS", 32 * 32 * 7)
+    np.testing.assert_array_equal(whole, visible_pixels(stage, 0, eyes, 32))

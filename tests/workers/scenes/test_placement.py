@@ -1,0 +1,110 @@
+"""Drops: on the surface, disjoint, clear of what stands there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.specification import SceneParams
+from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, cylinder_model, table_house
+from workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
+from workers.scenes.scene import Redraw
+
+MODELS = [
+    box_model("target", (0.07, 0.05, 0.2)),
+    box_model("a", (0.2, 0.06, 0.1)),
+    cylinder_model("b", 0.04, 0.12),
+    cylinder_model("c", 0.05, 0.05),
+    box_model("d", (0.3, 0.03, 0.03)),
+    box_model("e", (0.06, 0.06, 0.06)),
+    box_model("f", (0.15, 0.15, 0.04)),
+]
+PARAMS = SceneParams()
+
+
+def corners(model, T: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+    x, y, _ = np.array(model.size_m) / 2
+    local = np.array([[-x, -y, 0, 1], [x, -y, 0, 1], [x, y, 0, 1], [-x, y, 0, 1]])
+    return (local @ T.T)[:, :2]
+
+
+def boxes_overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two rectangles overlap, by sampling one densely inside the other."""
+    t = np.linspace(0, 1, 25)
+    grid = np.array([[u, v] for u in t for v in t])
+    for p, q in ((a, b), (b, a)):
+        points = p[0] + grid[:, :1] * (p[1] - p[0]) + grid[:, 1:] * (p[3] - p[0])
+        e0, e1 = q[1] - q[0], q[3] - q[0]
+        s, r = (points - q[0]) @ e0 / (e0 @ e0), (points - q[0]) @ e1 / (e1 @ e1)
+        if ((s > 0) & (s < 1) & (r > 0) & (r < 1)).any():
+            return True
+    return False
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=40, deadline=None)
+def test_drops_are_on_the_table_above_it_and_disjoint(seed: int) -> None:
+    house = table_house()
+    surface = house.surfaces[0]
+    poses = drop_poses(MODELS, surface, [], PARAMS, np.random.default_rng(seed))
+    low = np.array([ROOM_M[0] / 2 - 0.6, ROOM_M[1] / 2 - 0.4])
+    outlines = [corners(m, T) for m, T in zip(MODELS, poses, strict=True)]
+    for model, T, outline in zip(MODELS, poses, outlines, strict=True):
+        assert T[2, 3] - model.size_m[2] / 2 == pytest.approx(TABLE_TOP_M + PARAMS.drop_height_m)
+        assert (outline >= low).all() and (outline <= low + [1.2, 0.8]).all()
+    pairs = [(i, j) for i in range(len(MODELS)) for j in range(i)]
+    assert not any(boxes_overlap(outlines[i], outlines[j]) for i, j in pairs)
+
+
+def test_most_clutter_is_near_the_target() -> None:
+    surface = table_house().surfaces[0]
+    gaps = []
+    for seed in range(30):
+        poses = drop_poses(MODELS, surface, [], PARAMS, np.random.default_rng(seed))
+        gaps.extend(np.linalg.norm(poses[1:, :2, 3] - poses[0, :2, 3], axis=1))
+    assert np.mean(np.array(gaps) <= 2 * PARAMS.clutter_radius_m) > 0.9
+    assert np.mean(np.array(gaps) <= PARAMS.clutter_radius_m) > 0.5
+
+
+def test_things_that_stand_there_are_kept_free() -> None:
+    vase = box_body("vase", "small", "Vase", (0.5, 0.8, 0.3), (ROOM_M[0] / 2 + 0.3, ROOM_M[1] / 2, 0.9))
+    lamp = box_body("lamp", "furniture", "Lamp", (1.0, 1.0, 0.1), (ROOM_M[0] / 2, ROOM_M[1] / 2, 2.2))
+    house = table_house([vase, lamp])
+    taken = standing_footprints(house, house.surfaces[0])
+    assert len(taken) == 1  # the vase, and neither the lamp above nor the table itself
+    small = [m for m in MODELS if m.name in ("target", "b", "e")]
+    for seed in range(20):
+        poses = drop_poses(small, house.surfaces[0], taken, PARAMS, np.random.default_rng(seed))
+        reach = [np.abs(corners(m, T)[:, 0]).max() for m, T in zip(small, poses, strict=True)]
+        assert max(reach) <= ROOM_M[0] / 2 + 0.05 + 1e-6
+
+
+def test_a_full_surface_is_a_redraw_with_its_cause() -> None:
+    cover = [np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)]
+    with pytest.raises(Redraw) as caught:
+        drop_poses(MODELS, table_house().surfaces[0], cover, PARAMS, np.random.default_rng(0))
+    assert caught.value.cause == "no_placement"
+
+
+def test_surfaces_are_chosen_by_height() -> None:
+    house = table_house()
+    assert len(eligible_surfaces(house, PARAMS)) == 1
+    too_low = SceneParams.model_validate({"support_height_m": {"low": 0.8, "high": 1.2}})
+    assert eligible_surfaces(house, too_low) == []
+
+
+def test_only_parts_around_the_support_go_into_the_physics() -> None:
+    far = box_body("far", "furniture", "Sofa", (0.2, 0.2, 0.5), (0.2, 0.2, 0.25))
+    near = box_body("near", "furniture", "Chair", (0.2, 0.2, 0.5), (1.2, 1.5, 0.25))
+    house = table_house([far, near])
+    parts = nearby_parts(house, house.surfaces[0], 0.3)
+    assert any(p is near.convex_parts_m[0] for p in parts)
+    assert not any(p is far.convex_parts_m[0] for p in parts)
+    assert sum(p is q for p in parts for q in house.bodies[5].convex_parts_m) == 5  # table top and legs
+
+
+def test_an_unknown_cause_is_a_defect() -> None:
+    with pytest.raises(KeyError, match="unknown redraw cause"):
+        Redraw("bored")
