@@ -1,14 +1,15 @@
 """Makes the project's virtual environment, .venv, with the versions that constraints.txt pins.
 
-Only the standard library is used. A second call finds its stamp and returns at once. A stamp names
-the contents of pyproject.toml and constraints.txt and the interpreter, so that a change of any of
-them installs again, and a fresh clone with old file times does not.
+Only the standard library is used. A second call finds its stamp and returns at once. The stamp names
+what pyproject.toml asks for, constraints.txt, the interpreter and the folder: when one of them changes,
+the environment is made anew; settings of linters and tests change nothing in it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import shutil
 import subprocess
 import sys
@@ -22,10 +23,15 @@ OLDEST = (3, 11)
 
 def fingerprint() -> str:
     """sha256 over everything that decides what is installed."""
-    h = hashlib.sha256(sys.version.encode() + sys.prefix.encode() + str(ROOT).encode())
-    for name in ("pyproject.toml", "constraints.txt"):
-        h.update((ROOT / name).read_bytes())
-    return h.hexdigest()
+    # Not at the top: an interpreter too old to have it shall reach the message about its age.
+    import tomllib
+
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    asked = {key: pyproject[key] for key in ("build-system", "project")}
+    asked["setuptools"] = pyproject["tool"]["setuptools"]
+    parts = [sys.version, sys.prefix, str(ROOT), json.dumps(asked, sort_keys=True)]
+    parts.append((ROOT / "constraints.txt").read_text())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def create() -> list[str]:
