@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -60,7 +60,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
 
 
 @contextmanager
-def _ends_job(every_input_error: bool = False) -> Iterator[None]:
+def _ends_job(every_input_error: bool = False) -> Generator[None]:
     """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
     try:
         yield

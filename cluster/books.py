@@ -49,17 +49,24 @@ def close_lost_attempts(run: Run) -> int:
     books, lost = RunBooks(run), run.unfinished_attempts()
     for start in lost:
         commit = books.commit_of(start.shard)
-        won = commit is not None and commit.attempt == start.attempt
-        books.close(
-            LedgerEntry(
+        if commit is not None and commit.attempt == start.attempt:
+            entry = LedgerEntry(
                 attempt=start.attempt,
                 shard=start.shard,
-                outcome="committed" if won else "lost",
-                cause="" if won else "its driver ended before it did",
+                outcome="committed",
                 started=start.started,
-                ended=commit.created if won else utc_now(),
-                cost=commit.cost if won else None,
-                host=commit.host if won else None,
+                ended=commit.created,
+                cost=commit.cost,
+                host=commit.host,
             )
-        )
+        else:
+            entry = LedgerEntry(
+                attempt=start.attempt,
+                shard=start.shard,
+                outcome="lost",
+                cause="its driver ended before it did",
+                started=start.started,
+                ended=utc_now(),
+            )
+        books.close(entry)
     return len(lost)

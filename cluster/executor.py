@@ -17,18 +17,18 @@ class Executor(Protocol[T_contra]):
         """Attempts that can run at the same time now."""
         ...
 
-    def submit(self, task: T_contra) -> None:
+    def submit(self, task: T_contra, /) -> None:
         """Take an attempt; return at once."""
         ...
 
-    def wait(self, timeout_s: float) -> list[AttemptReport]:
+    def wait(self, timeout_s: float, /) -> list[AttemptReport]:
         """Reports of attempts that ended, as soon as there is one, or none after the timeout."""
         ...
 
-    def has_begun(self, attempt: str) -> bool:
+    def has_begun(self, attempt: str, /) -> bool:
         """Whether a worker is known to have begun the attempt."""
         ...
 
-    def kill(self, attempt: str) -> None:
+    def kill(self, attempt: str, /) -> None:
         """End an attempt by force. Its report follows through `wait`, with outcome `cancelled`."""
         ...

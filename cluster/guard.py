@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -69,7 +69,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
     with _notes(task, started, deadline):
         try:
             product = function(task, meter)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
             cause = " ".join(str(error).split())
             ends_job = isinstance(error, JobCannotGoOn)
             return AttemptReport(
@@ -98,7 +98,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
 
 
 @contextmanager
-def _notes(task: Task, started: str, deadline: bool) -> Iterator[None]:
+def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
     """Keep the note and the stack file of an attempt while it runs, and remove them after it."""
     if not task.notes:
         yield
@@ -115,7 +115,7 @@ def _notes(task: Task, started: str, deadline: bool) -> Iterator[None]:
         return
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
-    with open(stack, "w") as file:
+    with stack.open("w") as file:
         faulthandler.enable(file)  # a native crash leaves its stack here too
         faulthandler.dump_traceback_later(task.deadline_s, exit=True, file=file)
         try:
@@ -155,7 +155,7 @@ def collect_stack(notes: str, attempt: str) -> str:
         return ""
     path = _stack_path(notes, attempt)
     try:
-        with open(path, "rb") as file:
+        with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - STACK_LIMIT))
             text = file.read(STACK_LIMIT).decode(errors="replace")
     except FileNotFoundError:

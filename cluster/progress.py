@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TextIO
 
@@ -193,7 +193,7 @@ def clock_text(seconds: float | None) -> str:
 @contextmanager
 def progress(
     labels_per_shard: int, shards: int, done_before: int = 0, as_json: bool | None = None
-) -> Iterator[TerminalBar | JsonLines]:
+) -> Generator[TerminalBar | JsonLines]:
     """The display that suits standard error, closed whatever ends the block.
 
     `shards` are those of this job and `done_before` those that earlier jobs had done. `as_json`

@@ -7,11 +7,12 @@ slot, so attempts are only ever ended by force.
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,8 +118,7 @@ class RayExecutor(Generic[T]):
         try:
             return self._ray.get(ref)
         except e.RayTaskError as error:  # outside the guard: the task or its module did not arrive whole
-            report = obituary(task, "failed", f"{type(error.cause).__name__}: {error.cause}")
-            return report
+            return obituary(task, "failed", f"{type(error.cause).__name__}: {error.cause}")
         except e.TaskCancelledError:
             return obituary(task, "cancelled", "ended by force")
         except e.OutOfMemoryError as error:
@@ -132,7 +132,7 @@ class RayExecutor(Generic[T]):
 
 
 @contextmanager
-def ray_cluster(settings: RaySettings) -> Iterator[Any]:
+def ray_cluster(settings: RaySettings) -> Generator[Any]:
     """Start a local cluster, or connect to a running one, for the time of the block; gives `ray`.
 
     A local cluster opens no dashboard and listens on the loopback address alone. Raises InputError
@@ -152,7 +152,7 @@ def ray_cluster(settings: RaySettings) -> Iterator[Any]:
                 "include_dashboard": False,
                 "object_store_memory": settings.object_store_bytes,
             }
-        ray.init(address=settings.address, log_to_driver=False, logging_level="error", **options)
+        ray.init(address=settings.address, log_to_driver=False, logging_level=logging.ERROR, **options)
     except (ConnectionError, ValueError, TimeoutError) as error:
         raise InputError(
             "--address", settings.address, _first_line(error), "Start Ray there, or use --address local"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -29,7 +29,7 @@ class StopRequest:
 
 
 @contextmanager
-def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Iterator[StopRequest]:
+def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[StopRequest]:
     """Let Ctrl-C and SIGTERM ask `stop` while the block runs; the former handlers come back after.
 
     With `interrupt` the second signal also raises KeyboardInterrupt: shards that run in this very

@@ -58,7 +58,7 @@ class SimulatedExecutor:
     most_in_flight: int = 0
     orders: list[Order] = field(default_factory=list)
     keep_orders: bool = False
-    _tries: Counter[int] = field(default_factory=Counter)
+    _tries: Counter[int] = field(default_factory=Counter[int])
     _queue: list[Order] = field(default_factory=list)
     _running: dict[str, Order] = field(default_factory=dict)
     _ends: list[tuple[float, str, str, float]] = field(default_factory=list)
@@ -69,7 +69,7 @@ class SimulatedExecutor:
         if self.keep_orders:
             self.orders.append(order)
         self._start()
-        self.most_in_flight = max(self.most_in_flight, len(self._queue) + len(self._running))
+        self.most_in_flight = max(self.most_in_flight, self.in_flight)
 
     def _start(self) -> None:
         while self._queue and len(self._running) < self.slots:
@@ -93,6 +93,10 @@ class SimulatedExecutor:
         if not ready:
             self.clock.now_s = max(limit_s, self.clock.now_s + 1e-3)
         return ready
+
+    @property
+    def in_flight(self) -> int:
+        return len(self._queue) + len(self._running)
 
     def has_begun(self, attempt: str) -> bool:
         return self.notes and attempt in self._running

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cluster.driver import Order, drive
 from cluster.policy import Policy
 from cluster.stop import StopRequest
-from cluster.tally import JobSummary
+from cluster.tally import JobSummary, Tally
 from schemas.errors import InputError
 from schemas.run_records import Commit, Cost, Host, LedgerEntry
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
@@ -156,7 +156,7 @@ def stopping_at(
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", wall_s))
     asked_at: list[float] = []
 
-    def on_tick(tally: object) -> None:
+    def on_tick(tally: Tally) -> None:
         if tally.committed >= 10 and not asked_at:
             asked_at.append(clock.now_s)
             for _ in range(asks):
@@ -178,7 +178,7 @@ def test_one_request_drains_and_two_end_at_once() -> None:
 
 
 def test_draining_is_bounded() -> None:
-    summary, books, took_s = stopping_at(1000, 1, Policy(drain_s=30), 500.0)
+    _, books, took_s = stopping_at(1000, 1, Policy(drain_s=30), 500.0)
     assert books.closed["cancelled"] > 0 and took_s == pytest.approx(30, abs=2)
 
 
@@ -199,7 +199,7 @@ def test_books_that_cannot_be_written_end_what_is_in_flight() -> None:
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", 1.0))
     with pytest.raises(InputError, match="No space left"):
         drive(range(50), lambda o: o, executor, FullBooks(), Policy(), Heard(), StopRequest(), clock)
-    assert executor._running == {} and executor._queue == []
+    assert executor.in_flight == 0
 
 
 def test_no_shards_is_a_complete_job() -> None:
