@@ -20,6 +20,7 @@ help:
 
 # Does nothing when pyproject.toml, constraints.txt and the interpreter are those of the last call.
 venv:
+	@command -v $(PYTHON) > /dev/null || { echo 'error: no $(PYTHON) here; name a Python 3.11 or newer: make PYTHON=...' >&2; exit 1; }
 	@$(PYTHON) scripts/environment.py
 
 demo: venv

@@ -55,7 +55,6 @@ def with_verbs(monkeypatch: pytest.MonkeyPatch) -> None:
     """The real program with further verbs that end in each of the ways a verb can end."""
     own = (refuse_input, interrupt, fill_disk, deny, break_model, break_program, answer)
     table = {f.__name__.replace("_", "-"): (f"{__name__}:{f.__name__}", f.__name__) for f in own}
-    monkeypatch.setitem(sys.modules, __name__, sys.modules[refuse_input.__module__])
     monkeypatch.setattr(cli, "VERBS", {**cli.VERBS, **table})
 
 
