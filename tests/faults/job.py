@@ -1,0 +1,71 @@
+"""A small job as a program of its own, for tests that interrupt or kill it.
+
+python -m tests.faults.job RUN SECONDS_PER_SHARD
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+
+from cluster.books import RunBooks, close_lost_attempts
+from cluster.driver import Order, drive
+from cluster.guard import Meter
+from cluster.policy import Policy
+from cluster.progress import progress
+from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.stop import StopRequest, stop_on_signals
+from cluster.task import Product
+from schemas.run import Run
+from tests.made_runs import write
+
+
+@dataclass(frozen=True)
+class RandomRows:
+    """A shard of random rows that takes its time."""
+
+    run: str
+    seconds: float
+    shard: int
+    attempt: str
+    deadline_s: float
+    notes: str
+    memory_factor: float = 1.0
+
+
+def make_rows(task: RandomRows, meter: Meter) -> Product:
+    """Write and commit the shard."""
+    run = Run.open(task.run)
+    run.start_attempt(task.attempt, task.shard)
+    time.sleep(task.seconds)
+    commit = write(run, task.shard, task.attempt).model_copy(update={"cost": meter.cost()})
+    return Product(run.commit(commit), commit.samples, commit.positives, commit.cost)
+
+
+def main() -> int:
+    """Run the missing shards; print the summary as JSON."""
+    place, seconds = sys.argv[1], float(sys.argv[2])
+    run, settings = Run.open(place), RaySettings(workers=2)
+    closed, missing = close_lost_attempts(run), run.missing()
+    with (
+        tempfile.TemporaryDirectory() as notes,
+        ray_cluster(settings) as ray,
+        stop_on_signals(StopRequest()) as stop,
+        progress(run.layout.samples_per_shard, len(missing)) as display,
+    ):
+
+        def make_task(order: Order) -> RandomRows:
+            return RandomRows(place, seconds, order.shard, order.attempt, order.deadline_s, notes)
+
+        executor = RayExecutor(make_rows, settings, ray)
+        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
+    said = {"end": summary.end, "closed": closed, "outcomes": summary.tally.outcomes}
+    print(json.dumps(said))
+    return summary.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
