@@ -143,11 +143,6 @@ class Run:
         """Planned shards that are neither committed nor in quarantine, in order."""
         return sorted(set(self.planned()) - self.committed() - self.quarantined())
 
-    def planned_rows(self, shard: int) -> tuple[int, int]:
-        """(scenes, samples) of a shard that the newest plan wants; the last shard may be cut."""
-        samples = min(max(self.n - shard * self.layout.samples_per_shard, 0), self.layout.samples_per_shard)
-        return -(-samples // self.layout.candidates_per_scene), samples
-
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
         if shard not in self._commits:

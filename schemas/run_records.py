@@ -41,6 +41,11 @@ class Layout(_Record):
         """Shards that hold the first n samples."""
         return -(-n // self.samples_per_shard)
 
+    def rows_wanted(self, shard: int, n: int) -> tuple[int, int]:
+        """(scenes, samples) of a shard among the first n samples; the last shard may be cut."""
+        samples = min(max(n - shard * self.samples_per_shard, 0), self.samples_per_shard)
+        return -(-samples // self.candidates_per_scene), samples
+
 
 class Manifest(_Record):
     """manifest.json: what the run is. Written once, create-only."""

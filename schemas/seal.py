@@ -49,8 +49,8 @@ def seal(run: Run) -> Path:
             run.storage.url, "", "sealing needs a local folder", "Copy the run to a disk and seal it there"
         )
     schema = run.schema
-    planned = run.planned()
-    commits = [commit for commit in run.commits() if commit.shard in planned]
+    n = run.n  # read once: the run may grow meanwhile
+    commits = [commit for commit in run.commits() if commit.shard < run.layout.shards_for(n)]
     if not commits:
         raise InputError(run.storage.url, "commits", "no shard is committed", "Submit the run again")
     for commit in commits:
@@ -60,8 +60,8 @@ def seal(run: Run) -> Path:
         _refuse_odd_files(run, commit, expected)
     draft = folder / f"{SEALED}.{secrets.token_hex(8)}.partial"
     try:
-        _write(draft, sealed_metadata(run, schema, [commit.shard for commit in commits]))
-        _link(run, schema, commits, draft)
+        _write(draft, sealed_metadata(run, schema, n, [commit.shard for commit in commits]))
+        _link(run, schema, n, commits, draft)
         _sync_folders(draft)
         _take_the_name(draft, folder / SEALED)
     except OSError as e:
@@ -71,14 +71,14 @@ def seal(run: Run) -> Path:
     return folder / SEALED
 
 
-def sealed_metadata(run: Run, schema: RecordSchema, shards: list[int]) -> dict[str, bytes]:
+def sealed_metadata(run: Run, schema: RecordSchema, n: int, shards: list[int]) -> dict[str, bytes]:
     """zarr.json files of the sealed store, the root's with consolidated metadata."""
-    wanted = [run.planned_rows(shard) for shard in shards]
+    wanted = [run.layout.rows_wanted(shard, n) for shard in shards]
     rows = {"scene": sum(scenes for scenes, _ in wanted), "sample": sum(samples for _, samples in wanted)}
-    absent = sorted(set(run.planned()) - set(shards))
+    absent = sorted(set(range(run.layout.shards_for(n))) - set(shards))
     attributes: dict[str, Any] = {
         **root_attributes(schema, run.layout, run.manifest.spec_hash),
-        "n": run.n,
+        "n": n,
         "missing_shards": absent,
         "specification": run.manifest.spec.model_dump(mode="json"),
     }
@@ -123,10 +123,10 @@ def _write(draft: Path, files: Mapping[str, bytes]) -> None:
             os.fsync(f.fileno())
 
 
-def _link(run: Run, schema: RecordSchema, commits: Iterable[Commit], draft: Path) -> None:
+def _link(run: Run, schema: RecordSchema, n: int, commits: Iterable[Commit], draft: Path) -> None:
     for position, commit in enumerate(commits):
         source = shard_folder(commit.shard, commit.attempt)
-        scenes, samples = run.planned_rows(commit.shard)
+        scenes, samples = run.layout.rows_wanted(commit.shard, n)
         for table, wanted in zip(TABLES, (scenes, samples), strict=True):
             rows = rows_per_shard(run.layout, table)
             for field in schema.table(table):

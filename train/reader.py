@@ -169,8 +169,8 @@ def _open(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], di
     if is_sealed_store(place):
         return open_sealed(place, names)
     run = Run.open(place)
-    planned = run.planned()
-    commits = [commit for commit in run.commits() if commit.shard in planned]
+    n = run.n
+    commits = [commit for commit in run.commits() if commit.shard < run.layout.shards_for(n)]
     if not commits:
         raise InputError(run.storage.url, "commits", "no shard is committed", "Submit the run again")
     folders = [shard_folder(commit.shard, commit.attempt) for commit in commits]
@@ -190,7 +190,7 @@ def _open(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], di
                 )
     arrays = read_metadata(run.storage, folders[0], names)
     shards = [
-        committed_place(run.storage, folder, commit, *run.planned_rows(commit.shard))
+        committed_place(run.storage, folder, commit, *run.layout.rows_wanted(commit.shard, n))
         for folder, commit in zip(folders, commits, strict=True)
     ]
     return shards, arrays

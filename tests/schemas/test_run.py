@@ -23,7 +23,7 @@ def test_resume_is_planned_minus_commits(tmp_path: Path):
     again = make_run(tmp_path, n=45, shards=[])
     assert again.missing() == [1, 2, 4]
     assert [c.shard for c in again.commits()] == [0, 3]
-    assert again.planned_rows(4) == (1, 5)
+    assert again.layout.rows_wanted(4, again.n) == (1, 5)
     assert pickle.loads(pickle.dumps(again)).committed() == {0, 3}
 
 

@@ -1,0 +1,164 @@
+"""How fast samples with their clouds are read: the reader, tensorstore and zarr-python, as a table.
+
+    python -m benchmarks.reading [--samples 60000] [--run RUN]
+
+Without a run it makes one of random rows (4,096 points a scene, the worst case for size) in a
+temporary folder. Sequential: all samples in stored order, a shard at a time. Random: single samples
+drawn uniformly, each with its scene's cloud.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from schemas.run import Run
+from schemas.seal import SEALED, seal
+from tests.made_runs import make_run, small_spec
+from train.reader import SAMPLE_FIELDS, SCENE_FIELDS, SampleReader
+
+REPEATS = 3
+FIELDS = (*SCENE_FIELDS, *SAMPLE_FIELDS, "sample_scene_index")
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=60_000)
+    parser.add_argument("--scenes-per-shard", type=int, default=20)
+    parser.add_argument("--run", type=Path)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        if options.run is None:
+            started = time.perf_counter()
+            run = make_run(
+                Path(folder) / "run",
+                options.samples,
+                options.scenes_per_shard,
+                60,
+                spec=small_spec(n_points=4096),
+            )
+            print(f"made {run.n} samples in {time.perf_counter() - started:.1f} s")
+        else:
+            run = Run.open(options.run)
+        started = time.perf_counter()
+        seal(run)
+        print(f"sealed {len(run.committed())} shards in {time.perf_counter() - started:.2f} s")
+        _print_sizes(run)
+        _print_rates(Path(run.storage.url))
+
+
+def _print_sizes(run: Run) -> None:
+    paths = list((Path(run.storage.url) / "shards").rglob("*"))
+    size = sum(p.stat().st_size for p in paths if p.is_file())
+    blocks = sum(p.stat().st_blocks * 512 for p in paths)
+    print(f"{size / run.n:.0f} bytes a sample, {blocks / run.n:.0f} on disk with files' and folders' blocks")
+
+
+def _print_rates(folder: Path) -> None:
+    rows = [
+        ("reader", "stored order", _rate(lambda: _reader(folder, None))),
+        ("reader", "shuffled, 8 shards", _rate(lambda: _reader(folder, 0))),
+        ("tensorstore", "by whole shard", _rate(lambda: _tensorstore_shards(folder))),
+        ("tensorstore", "random, 64 in flight", _rate(lambda: _tensorstore_random(folder, 2000))),
+        ("zarr-python", "by whole shard", _rate(lambda: _zarr_shards(folder))),
+        ("zarr-python", "random", _rate(lambda: _zarr_random(folder, 100))),
+    ]
+    print(f"{'library':<12} {'order':<22} {'samples/s':>10}")
+    for library, order, rate in rows:
+        print(f"{library:<12} {order:<22} {rate:>10,.0f}")
+
+
+def _rate(work: Callable[[], int]) -> float:
+    rates: list[float] = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        count = work()
+        rates.append(count / (time.perf_counter() - started))
+    return statistics.median(rates)
+
+
+def _reader(folder: Path, seed: int | None) -> int:
+    rng = None if seed is None else np.random.default_rng(seed)
+    return sum(len(b["label"]) for b in SampleReader([folder]).epoch(256, rng))
+
+
+def _spans(group: Any) -> tuple[int, list[tuple[int, int, int, int]]]:
+    scenes, samples = group["scene_index"].shape[0], group["label"].shape[0]
+    per_shard, per_scene = group.attrs["scenes_per_shard"], group.attrs["candidates_per_scene"]
+    spans = [
+        (s, min(s + per_shard, scenes), s * per_scene, min((s + per_shard) * per_scene, samples))
+        for s in range(0, scenes, per_shard)
+    ]
+    return samples, spans
+
+
+def _open_tensorstore(folder: Path) -> dict[str, Any]:
+    import tensorstore as ts
+
+    opened = {
+        name: ts.open(
+            {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{folder / SEALED / name}/"}},
+            read=True,
+        )
+        for name in FIELDS
+    }
+    return {name: future.result() for name, future in opened.items()}
+
+
+def _tensorstore_shards(folder: Path) -> int:
+    arrays = _open_tensorstore(folder)
+    samples, spans = _spans(zarr.open_group(folder / SEALED, mode="r"))
+    for s0, s1, r0, r1 in spans:
+        reads = [arrays[name][s0:s1] if name in SCENE_FIELDS else arrays[name][r0:r1] for name in FIELDS]
+        for future in [a.read() for a in reads]:
+            future.result()
+    return samples
+
+
+def _tensorstore_random(folder: Path, count: int) -> int:
+    arrays = _open_tensorstore(folder)
+    group = zarr.open_group(folder / SEALED, mode="r")
+    rows = np.random.default_rng(0).integers(0, group["label"].shape[0], count)
+    per_scene = group.attrs["candidates_per_scene"]
+    for start in range(0, count, 64):
+        futures = [
+            arrays[name][int(row) // per_scene if name in SCENE_FIELDS else int(row)].read()
+            for row in rows[start : start + 64]
+            for name in FIELDS
+        ]
+        for future in futures:
+            future.result()
+    return count
+
+
+def _zarr_shards(folder: Path) -> int:
+    group = zarr.open_group(folder / SEALED, mode="r")
+    arrays: dict[str, Any] = {name: group[name] for name in FIELDS}
+    samples, spans = _spans(group)
+    for s0, s1, r0, r1 in spans:
+        for name in FIELDS:
+            _ = arrays[name][s0:s1] if name in SCENE_FIELDS else arrays[name][r0:r1]
+    return samples
+
+
+def _zarr_random(folder: Path, count: int) -> int:
+    group: Any = zarr.open_group(folder / SEALED, mode="r")
+    arrays: dict[str, Any] = {name: group[name] for name in FIELDS}
+    per_scene = group.attrs["candidates_per_scene"]
+    for row in np.random.default_rng(0).integers(0, group["label"].shape[0], count):
+        for name in FIELDS:
+            _ = arrays[name][int(row) // per_scene if name in SCENE_FIELDS else int(row)]
+    return count
+
+
+if __name__ == "__main__":
+    main()

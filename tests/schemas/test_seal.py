@@ -1,0 +1,155 @@
+"""The sealed store: what stock libraries read is what was committed."""
+
+from __future__ import annotations
+
+import subprocess
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+import zarr
+
+from schemas import shard_files
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.seal import SEALED, seal
+from tests.made_runs import files_of, make_run, small_spec, tables_of, write
+
+
+def expected(run: Run, shards: list[int], scenes: int, samples: int) -> dict[str, np.ndarray]:
+    tables = [tables_of(run.schema, run.layout, run.manifest.spec.seed, shard) for shard in shards]
+    out: dict[str, np.ndarray] = {}
+    for t, rows in ((0, scenes), (1, samples)):
+        out |= {k: np.concatenate([each[t][k] for each in tables])[:rows] for k in tables[0][t]}
+    return out
+
+
+def assert_equal(group: zarr.Group, arrays: dict[str, np.ndarray]) -> None:
+    assert set(group.array_keys()) == set(arrays)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(group[name][:], values, err_msg=name)
+
+
+def test_stock_zarr_reads_every_row_in_order(tmp_path: Path):
+    run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3])
+    path = seal(run)
+    assert path == tmp_path / SEALED
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        group = zarr.open(path, mode="r")
+        assert_equal(group, expected(run, [0, 1, 2, 3, 4], 9, 43))
+    assert group.attrs["spec_hash"] == run.manifest.spec_hash
+    assert group.attrs["specification"] == run.manifest.spec.model_dump(mode="json")
+    assert (group.attrs["n"], group.attrs["missing_shards"]) == (43, [])
+
+
+def test_stock_xarray_reads_dimensions_units_and_values_without_a_warning(tmp_path: Path):
+    run = make_run(tmp_path, n=43)
+    path = seal(run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xarray.open_zarr(path, chunks=None)
+        loaded = data.load()
+    assert (data.sizes["scene"], data.sizes["sample"]) == (9, 43)
+    for name, values in expected(run, [0, 1, 2, 3, 4], 9, 43).items():
+        np.testing.assert_array_equal(loaded[name].values, values, err_msg=name)
+    for table, fields in (("scene", run.schema.scene_fields), ("sample", run.schema.sample_fields)):
+        for f in fields:
+            assert data[f.name].dims == (table, *f.dims)
+            assert data[f.name].attrs.get("units", "") == f.unit
+            assert data[f.name].attrs["long_name"] == f.doc
+
+
+def test_missing_shards_are_packed_and_named(tmp_path: Path):
+    run = make_run(tmp_path, n=48, shards=[1, 4])
+    group = zarr.open(seal(run), mode="r")
+    assert_equal(group, expected(run, [1, 4], 4, 18))
+    assert group.attrs["missing_shards"] == [0, 2, 3]
+
+
+def test_sealing_again_after_growth_replaces_the_store(tmp_path: Path):
+    run = make_run(tmp_path, n=13)
+    seal(run)
+    grown = make_run(tmp_path, n=37)
+    assert_equal(zarr.open(seal(grown), mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
+
+
+def test_chunks_are_links_that_cannot_be_written(tmp_path: Path):
+    run = make_run(tmp_path, n=20)
+    path = seal(run)
+    linked, own = path / "label" / "c.1", tmp_path / "shards/000001/a-1/label/c.0"
+    assert linked.samefile(own)
+    assert own.stat().st_mode & 0o777 == 0o444
+
+
+def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_store(tmp_path: Path):
+    with pytest.raises(InputError, match="no shard is committed"):
+        seal(make_run(tmp_path / "empty", shards=[]))
+    run = make_run(tmp_path / "run", n=20)
+    before = files_of(seal(run))
+    (tmp_path / "run/shards/000001/a-1/rgb/c.0.0.0").unlink()
+    with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: missing"):
+        seal(run)
+    assert files_of(tmp_path / "run" / SEALED) == before
+
+
+def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):
+    run = make_run(tmp_path, n=20, shards=[0])
+    commit = write(run, 1, "b")
+    assert run.commit(commit.model_copy(update={"files": commit.files[:-1]}))
+    with pytest.raises(InputError, match="lacks or adds 1 files"):
+        seal(run)
+
+
+def test_what_a_killed_seal_leaves_does_not_disturb(tmp_path: Path):
+    run = make_run(tmp_path, n=20)
+    (tmp_path / f"{SEALED}.0123.partial" / "label").mkdir(parents=True)
+    assert_equal(zarr.open(seal(run), mode="r"), expected(run, [0, 1], 4, 20))
+    assert Run.open(tmp_path).committed() == {0, 1}
+
+
+def test_large_clouds_in_several_chunks_a_shard(tmp_path: Path):
+    run = make_run(tmp_path, n=1, scenes_per_shard=6, shards=[])
+    patch = pytest.MonkeyPatch()
+    with patch.context() as m:
+        m.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # of real clouds this takes gigabytes
+        shard_files._metadata.cache_clear()
+        run.grow(75)
+        for shard in run.missing():
+            assert run.commit(write(run, shard, "a"))
+        group = zarr.open(seal(run), mode="r")
+        assert_equal(group, expected(run, [0, 1, 2], 15, 75))
+        assert group["points_m"].chunks[0] == 2
+    shard_files._metadata.cache_clear()
+
+
+def test_labels_of_random_clouds_fit_the_budget(tmp_path: Path):
+    """180,000 labels in 400 MB is 2,222 bytes each; random clouds are the worst case."""
+    spec = small_spec(n_points=4096)
+    make_run(tmp_path, n=600, scenes_per_shard=10, candidates_per_scene=60, spec=spec)
+    total = sum(p.stat().st_size for p in (tmp_path / "shards").rglob("*") if p.is_file())
+    assert total / 600 < 400e6 / 180_000
+
+
+def test_a_disk_that_fills_up_keeps_what_is_committed_and_goes_on_with_room(tiny_disk: Path):
+    run = make_run(tiny_disk, n=1, shards=[])
+    run.grow(300)
+    with pytest.raises(InputError, match=r"No space left on device\. Free disk space") as e:
+        for shard in run.missing():
+            assert run.commit(write(run, shard, "a"))
+    assert "\n" not in str(e.value)
+    done = sorted(run.committed())
+    for commit in Run.open(tiny_disk).commits():
+        run.check_digests(commit)
+    with pytest.raises(InputError, match="No space left on device"):
+        seal(run)
+    assert [p.name for p in tiny_disk.iterdir() if p.name.startswith(SEALED)] == []
+    subprocess.run(["mount", "-o", "remount,size=64m", str(tiny_disk)], check=True)
+    for shard in run.missing()[:2]:
+        assert run.commit(write(run, shard, "b"))
+    group = zarr.open(seal(run), mode="r")
+    shards = [*done, len(done), len(done) + 1]
+    assert_equal(group, expected(run, shards, 2 * len(shards), 10 * len(shards)))

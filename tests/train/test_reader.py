@@ -1,0 +1,191 @@
+"""The reader: every sample once, the same for one seed, and nothing damaged passes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.seal import seal
+from tests.made_runs import make_run, small_spec, tables_of
+from train.reader import Batch, SampleReader
+
+ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
+SAMPLES = ("sample_id", "sample_scene_index", "candidate_index", "distance_m", "label", "label_source")
+
+
+def ids(batches: list[Batch]) -> np.ndarray:
+    return np.concatenate([b["sample_id"] for b in batches])
+
+
+def rows_of(run: Run) -> dict[str, np.ndarray]:
+    tables = [tables_of(run.schema, run.layout, run.manifest.spec.seed, k) for k in sorted(run.committed())]
+    return {k: np.concatenate([t[1][k] for t in tables])[: run.n] for k in tables[0][1]}
+
+
+def test_stored_order_gives_the_committed_rows_with_their_scenes(tmp_path: Path):
+    run = make_run(tmp_path, n=43)
+    reader = SampleReader([tmp_path], ALL, SAMPLES)
+    assert (len(reader), reader.n_scenes) == (43, 9)
+    batches = list(reader.epoch(10, buffer_shards=2))
+    assert [len(b["label"]) for b in batches] == [10, 10, 10, 10, 3]
+    truth = rows_of(run)
+    for name in SAMPLES:
+        np.testing.assert_array_equal(np.concatenate([b[name] for b in batches]), truth[name])
+    for b in batches:
+        np.testing.assert_array_equal(b["scene_index"][b["scene_row"]], b["sample_scene_index"])
+        assert b["points_m"].dtype == np.float32
+        assert b["points_m"].shape[1:] == (64, 3)
+
+
+def test_clouds_belong_to_their_samples_across_buffers(tmp_path: Path):
+    run = make_run(tmp_path, n=43)
+    reader = SampleReader([tmp_path], ("points_m",), SAMPLES)
+    clouds: dict[int, np.ndarray] = {}
+    for shard in run.committed():
+        scenes, _ = tables_of(run.schema, run.layout, 0, shard)
+        clouds |= dict(zip(scenes["scene_index"].tolist(), scenes["points_m"], strict=True))
+    for batch in reader.epoch(7, np.random.default_rng(0), buffer_shards=2):
+        for scene, row in zip(batch["sample_scene_index"], batch["scene_row"], strict=True):
+            np.testing.assert_array_equal(batch["points_m"][row], clouds[scene].astype(np.float32))
+
+
+def test_a_seed_decides_the_order_and_an_epoch_has_every_sample_once(tmp_path: Path):
+    run = make_run(tmp_path, n=60)
+    reader = SampleReader([tmp_path], (), SAMPLES)
+    one, same, other = (
+        ids(list(reader.epoch(8, np.random.default_rng(seed), buffer_shards=3))) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+    truth = sorted(map(bytes, rows_of(run)["sample_id"]))
+    assert sorted(map(bytes, one)) == sorted(map(bytes, other)) == truth
+
+
+def test_dropping_the_last_gives_equal_batches(tmp_path: Path):
+    make_run(tmp_path, n=43)
+    sizes = {len(b["label"]) for b in SampleReader([tmp_path]).epoch(8, drop_last=True)}
+    assert sizes == {8}
+
+
+def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
+    run = make_run(tmp_path / "run", n=48, shards=[0, 2, 4])
+    shutil.copytree(seal(run), tmp_path / "alone.zarr")
+    shutil.rmtree(tmp_path / "run/shards/000002")
+    sealed = SampleReader([tmp_path / "alone.zarr"], ALL, SAMPLES)
+    batches = list(sealed.shards())
+    assert [len(b["label"]) for b in batches] == [10, 10, 8]
+    assert len(sealed) == 28
+    truth = rows_of(run)
+    np.testing.assert_array_equal(
+        np.concatenate([b["distance_m"] for b in batches]), truth["distance_m"][:28]
+    )
+
+
+def test_many_runs_are_told_apart(tmp_path: Path):
+    for seed in (1, 2):
+        make_run(tmp_path / str(seed), n=20 * seed, spec=small_spec(seed))
+    reader = SampleReader([tmp_path / "1", tmp_path / "2"])
+    runs = np.concatenate([b["run_row"] for b in reader.epoch(16, np.random.default_rng(0))])
+    assert np.bincount(runs).tolist() == [20, 40]
+    assert reader.units()["distance_m"] == "m"
+
+
+def test_runs_with_other_clouds_are_not_mixed(tmp_path: Path):
+    make_run(tmp_path / "a")
+    make_run(tmp_path / "b", spec=small_spec(n_points=65))
+    with pytest.raises(InputError, match="points_m"):
+        SampleReader([tmp_path / "a", tmp_path / "b"])
+
+
+def test_every_bit_flip_of_a_chunk_is_noticed_and_named(tmp_path: Path):
+    make_run(tmp_path, n=20)
+    rng = np.random.default_rng(3)
+    reader = SampleReader([tmp_path], ALL, SAMPLES)
+    for name in (*ALL, *SAMPLES):
+        (victim,) = (tmp_path / "shards/000001/a-1" / name).glob("c.*")
+        whole = victim.read_bytes()
+        for bit in rng.integers(0, 8 * len(whole), 12):
+            data = bytearray(whole)
+            data[bit // 8] ^= 1 << (bit % 8)
+            victim.write_bytes(data)
+            with pytest.raises(InputError, match="crc32c") as e:
+                list(reader.shards())
+            assert e.value.place == str(victim)
+        victim.write_bytes(whole)
+    assert len(list(reader.shards())) == 2
+
+
+def test_missing_and_cut_files_are_named(tmp_path: Path):
+    make_run(tmp_path, n=20)
+    victim = tmp_path / "shards/000000/a-0/label/c.0"
+    data = victim.read_bytes()
+    reader = SampleReader([tmp_path])
+    victim.write_bytes(data[:-3])
+    with pytest.raises(InputError, match=r"label/c\.0: label: \d+ bytes, where the commit has"):
+        next(reader.shards())
+    victim.unlink()
+    with pytest.raises(InputError, match=r"label/c\.0: label: no such file"):
+        next(reader.shards())
+    (tmp_path / "shards/000000/a-0/label/zarr.json").unlink()
+    with pytest.raises(InputError, match=r"label/zarr\.json: no such file"):
+        SampleReader([tmp_path])
+
+
+def test_what_cannot_be_read_is_refused(tmp_path: Path):
+    make_run(tmp_path / "run", n=20)
+    make_run(tmp_path / "bare", n=20, shards=[])
+    (tmp_path / "odd.zarr").mkdir()
+    cases: list[tuple[list[Path], dict[str, tuple[str, ...]], str]] = [
+        ([], {}, "no run is named"),
+        ([tmp_path / "bare"], {}, "no shard is committed"),
+        ([tmp_path / "odd.zarr"], {}, "no such file"),
+        ([tmp_path / "none"], {}, "no such folder"),
+        ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: the run stores no such field"),
+        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: not a field of samples"),
+    ]
+    for places, fields, problem in cases:
+        with pytest.raises(InputError, match=problem):
+            SampleReader(places, **fields)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="below 1"):
+        next(SampleReader([tmp_path / "run"]).epoch(0))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"attributes": {}}', '{"attributes": 3}', "[" * 100_000, '{"attributes": null}']
+)
+def test_a_sealed_store_with_a_broken_root_is_refused(tmp_path: Path, text: str):
+    path = seal(make_run(tmp_path, n=20))
+    (path / "zarr.json").write_text(text)
+    with pytest.raises(InputError, match="not the root of a sealed store"):
+        SampleReader([path])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"float32"', '"float64"'),
+        ('"float32"', '"object"'),
+        ('"float32"', '"complex64"'),
+        ('"little"', '"big"'),
+        ('"zstd"', '"gzip"'),
+        ('"crc32c"', '"crc32d"'),
+        ('"sample"', '"samples"'),
+        ('"shape": [\n    20\n  ]', '"shape": [\n    1000000000000\n  ]'),
+        ('"chunk_shape": [\n        10\n      ]', '"chunk_shape": [\n        1000000000\n      ]'),
+        ('"chunk_shape": [\n        10\n      ]', '"chunk_shape": [\n        0\n      ]'),
+        ('"chunk_shape": [\n        10\n      ]', '"chunk_shape": [\n        7\n      ]'),
+    ],
+)
+def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path, old: str, new: str):
+    path = seal(make_run(tmp_path, n=20))
+    meta = path / "distance_m" / "zarr.json"
+    text = meta.read_text()
+    assert old in text
+    meta.write_text(text.replace(old, new))
+    with pytest.raises(InputError):
+        list(SampleReader([path]).shards())
