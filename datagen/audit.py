@@ -48,7 +48,7 @@ def audit(
 def audit_report(books: Books, source: str) -> dict[str, Any]:
     """The audit as plain values; times in seconds, sizes in bytes."""
     labels = books.labels
-    stages = {
+    stages: dict[str, dict[str, float]] = {
         stage: {"wall_s": books.useful.stage_wall_s[stage], "cpu_s": books.useful.stage_cpu_s[stage]}
         for stage in STAGES
         if stage in books.useful.stage_wall_s

@@ -44,7 +44,7 @@ def status_report(run: Run) -> dict[str, Any]:
         "spec_hash": run.manifest.spec_hash,
         "created": run.manifest.created,
         "n": run.n,
-        "labels": sum(run.planned_rows(c.shard)[1] for c in done),
+        "labels": sum(run.layout.rows_wanted(c.shard, run.n)[1] for c in done),
         "positives": sum(c.positives for c in commits),
         "shards": {
             "planned": len(planned),

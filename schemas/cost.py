@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -22,7 +22,7 @@ class StageClock:
     gpu_s: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> Generator[None]:
         if name not in STAGES:
             raise KeyError(f"unknown stage {name!r}; stages are {', '.join(STAGES)}")
         wall, cpu = time.perf_counter(), time.process_time()

@@ -43,25 +43,25 @@ class Range(_Frozen):
 class SceneParams(_Frozen):
     """Choice of support surface, target and clutter (DESIGN: Scene)."""
 
-    n_clutter: int = Field(6, ge=0, le=30)
+    n_clutter: int = Field(default=6, ge=0, le=30)
     support_height_m: Range = Range(low=0.3, high=1.2)
     # Clutter is dropped within this distance of the target, so that it hides it now and then.
     clutter_radius_m: Metres = 0.22
     drop_height_m: Metres = 0.01
     edge_margin_m: Metres = 0.02
-    max_retries: int = Field(200, ge=1, le=10_000)
+    max_retries: int = Field(default=200, ge=1, le=10_000)
 
 
 class SettleParams(_Frozen):
     """Physics until rest."""
 
     engine: str = "sapien"
-    max_steps: int = Field(5000, ge=10, le=1_000_000)
-    timestep_s: float = Field(1 / 240, gt=0, le=0.05)
-    friction: float = Field(0.6, ge=0, le=5)
-    rest_speed_mps: float = Field(0.005, gt=0)
-    rest_angular_speed_radps: float = Field(0.05, gt=0)
-    rest_steps: int = Field(20, ge=1, le=1000)
+    max_steps: int = Field(default=5000, ge=10, le=1_000_000)
+    timestep_s: float = Field(default=1 / 240, gt=0, le=0.05)
+    friction: float = Field(default=0.6, ge=0, le=5)
+    rest_speed_mps: float = Field(default=0.005, gt=0)
+    rest_angular_speed_radps: float = Field(default=0.05, gt=0)
+    rest_steps: int = Field(default=20, ge=1, le=1000)
     max_penetration_m: Metres = 0.005
     max_drop_m: Metres = 0.05
 
@@ -70,8 +70,8 @@ class NoiseParams(_Frozen):
     """Stereo-like depth noise; `enabled=False` leaves the frame exact."""
 
     enabled: bool = False
-    disparity_std_px: float = Field(0.08, ge=0, le=5)
-    baseline_m: float = Field(0.05, gt=0, le=1)
+    disparity_std_px: float = Field(default=0.08, ge=0, le=5)
+    baseline_m: float = Field(default=0.05, gt=0, le=1)
     grazing_dropout_cos: Fraction = 0.15
     edge_dropout: Fraction = 0.5
     hole_rate: Fraction = 0.002
@@ -81,18 +81,18 @@ class ObservationParams(_Frozen):
     """One RGB-D frame; intrinsics like a RealSense D435 colour stream at 640x480."""
 
     renderer: str = "embree"
-    width_px: int = Field(640, ge=32, le=4096)
-    height_px: int = Field(480, ge=32, le=4096)
-    fx_px: float = Field(615.0, gt=0)
-    fy_px: float = Field(615.0, gt=0)
+    width_px: int = Field(default=640, ge=32, le=4096)
+    height_px: int = Field(default=480, ge=32, le=4096)
+    fx_px: float = Field(default=615.0, gt=0)
+    fy_px: float = Field(default=615.0, gt=0)
     distance_m: Range = Range(low=0.8, high=2.5)
     camera_height_m: Range = Range(low=0.8, high=1.5)
     min_target_fraction: Fraction = 0.3
-    max_viewpoints: int = Field(64, ge=1, le=10_000)
+    max_viewpoints: int = Field(default=64, ge=1, le=10_000)
     crop_radius_m: Metres = 1.0
-    n_points: int = Field(4096, ge=64, le=65_536)
-    min_target_points: int = Field(256, ge=0, le=65_536)
-    n_farthest: int = Field(512, ge=0, le=65_536)
+    n_points: int = Field(default=4096, ge=64, le=65_536)
+    min_target_points: int = Field(default=256, ge=0, le=65_536)
+    n_farthest: int = Field(default=512, ge=0, le=65_536)
     noise: NoiseParams = NoiseParams()
 
 
@@ -100,10 +100,10 @@ class CandidateParams(_Frozen):
     """Base positions around the target and the robots that stand there (paper, Sec. IV-A)."""
 
     per_scene: Annotated[int, Field(ge=1, le=625)] | Literal["grid"] = 60
-    grid_cells: int = Field(25, ge=2, le=200)
+    grid_cells: int = Field(default=25, ge=2, le=200)
     grid_half_width_m: Metres = 1.0
     jitter: bool = True
-    robots_per_scene: int = Field(4, ge=1, le=625)
+    robots_per_scene: int = Field(default=4, ge=1, le=625)
     robot_per_candidate: bool = False
     camera_height_m: Range = Range(low=0.8, high=1.5)
     base_height_m: Range = Range(low=0.5, high=1.0)
@@ -120,7 +120,7 @@ class CandidateParams(_Frozen):
 class VisibilityParams(_Frozen):
     """Rays of the visibility window (n x n, fitted to the target's bounding sphere)."""
 
-    window_px: int = Field(64, ge=8, le=512)
+    window_px: int = Field(default=64, ge=8, le=512)
 
 
 class HeuristicParams(_Frozen):
@@ -132,14 +132,14 @@ class HeuristicParams(_Frozen):
     """
 
     distance: Literal["planar", "planar-over-reach", "mount-over-reach"] = "planar"
-    a: float = Field(1.0, gt=0, le=10)
-    mu: float = Field(0.53, gt=0, le=10)
-    sigma_l: float = Field(0.195, gt=0, le=10)
-    sigma_r: float = Field(0.195, gt=0, le=10)
-    d_min: float = Field(0.14, ge=0, le=10)
-    d_max: float = Field(0.92, ge=0, le=10)
+    a: float = Field(default=1.0, gt=0, le=10)
+    mu: float = Field(default=0.53, gt=0, le=10)
+    sigma_l: float = Field(default=0.195, gt=0, le=10)
+    sigma_r: float = Field(default=0.195, gt=0, le=10)
+    d_min: float = Field(default=0.14, ge=0, le=10)
+    d_max: float = Field(default=0.92, ge=0, le=10)
     alpha: Fraction = 0.51
-    tau: float = Field(0.4546, ge=0, le=10)
+    tau: float = Field(default=0.4546, ge=0, le=10)
 
     @model_validator(mode="after")
     def _ordered(self) -> HeuristicParams:
@@ -152,7 +152,7 @@ class Specification(_Frozen):
     """Everything that decides what the samples of a run are."""
 
     label_source: str = "heuristic"
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = Field(default=0, ge=0, lt=2**63)
     split: Literal["train", "val", "test", "all"] = "all"
     houses: Source
     objects: Source

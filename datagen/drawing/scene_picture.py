@@ -32,9 +32,9 @@ def draw_scene_picture(
     title: str, recalled: RecalledScene, frame: Frame, record: Columns, samples: Columns, out: Path
 ) -> None:
     """Write the picture of a scene; `samples` are its candidates, one row each."""
-    figure = Figure(figsize=(18, 11.5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(19, 11), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 3)
+    axes = figure.subplots(2, 3, width_ratios=(1.3, 1, 1.12))
     figure.suptitle(title, fontsize=14)
     _draw_frame(axes[0, 0], frame)
     _draw_depth(figure, axes[1, 0], frame)
@@ -118,21 +118,23 @@ def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples
     counts = np.asarray(record["redraws"])
     redraws = ", ".join(f"{c} {n}" for c, n in zip(REDRAW_CAUSES, counts, strict=True) if n) or "none"
     clutter = ", ".join(m.name for m in recalled.models[1:])
+    target, height_m = recalled.models[0], float(np.asarray(record["T_world_support"])[2, 3])
+    speed_mm, depth_mm = (1000 * float(record[k]) for k in ("residual_speed_mps", "penetration_m"))
+    positive, both = int(label.sum()), int((label * clear).sum())
+    low, high = 100 * (rho < 0.04).mean(), 100 * (rho > 0.8).mean()
     lines = [
         f"house      {record['house_id']}",
         f"room       {record['room_type']} ({record['room_id']})",
-        f"support    {record['support_type']}, {float(np.asarray(record['T_world_support'])[2, 3]):.3f} m high",
-        f"target     {recalled.models[0].name}, {1000 * recalled.models[0].mass_kg:.0f} g",
+        f"support    {record['support_type']}, {height_m:.3f} m high",
+        f"target     {target.name}, {1000 * target.mass_kg:.0f} g",
         *_wrapped("clutter    ", clutter),
-        f"settled    {int(record['settle_steps'])} steps, rest speed {1000 * float(record['residual_speed_mps']):.2f} mm/s,"
-        f" penetration {1000 * float(record['penetration_m']):.2f} mm",
+        f"settled    {int(record['settle_steps'])} steps, then {speed_mm:.2f} mm/s, {depth_mm:.2f} mm deep",
         f"redraws    {redraws}",
         f"frame      sees {100 * float(record['target_visible_fraction']):.0f}% of the target",
         "",
         f"candidates {len(label)}, of them {int(clear.sum())} clear",
-        f"positive   {int(label.sum())} ({100 * label.mean():.0f}%), clear and positive {int((label * clear).sum())}",
-        f"rho        below 0.04: {100 * (rho < 0.04).mean():.0f}%   0.04-0.8: "
-        f"{100 * ((rho >= 0.04) & (rho <= 0.8)).mean():.0f}%   above 0.8: {100 * (rho > 0.8).mean():.0f}%",
+        f"positive   {positive} ({100 * label.mean():.0f}%), clear and positive {both}",
+        f"rho        below 0.04: {low:.0f}%   0.04-0.8: {100 - low - high:.0f}%   above 0.8: {high:.0f}%",
         *_robots(samples),
     ]
     axes.text(0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=10, transform=axes.transAxes)
@@ -150,8 +152,8 @@ def _wrapped(head: str, text: str, width: int = 62) -> list[str]:
 def _robots(samples: Columns) -> list[str]:
     robots, rows = np.unique(np.asarray(samples["robot_index"]), return_index=True)
     lines = [
-        f"robot {robot:<4} camera {float(samples['camera_height_m'][row]):.2f} m, "
-        f"mount {float(samples['base_height_m'][row]):.2f} m, reach {float(samples['arm_reach_m'][row]):.2f} m"
+        f"robot {robot:<4} camera {samples['camera_height_m'][row]:.2f} m, "
+        f"mount {samples['base_height_m'][row]:.2f} m, reach {samples['arm_reach_m'][row]:.2f} m"
         for robot, row in zip(robots[:6], rows[:6], strict=True)
     ]
     return lines + ([f"... and {len(robots) - 6} more robots"] if len(robots) > 6 else [])

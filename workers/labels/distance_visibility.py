@@ -6,8 +6,8 @@ import numpy as np
 
 from schemas.cost import StageClock
 from schemas.specification import Specification
-from workers.labels import heuristic as formula
 from workers.bases.candidates import Candidates, distances
+from workers.labels import heuristic as formula
 from workers.labels.source import Columns, LabelSource
 from workers.rendering.visibility import visible_pixels
 from workers.scenes.scene import Scene

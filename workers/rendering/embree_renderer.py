@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, U8
+from workers.geometry.mesh import F32, F64, U8
 from workers.rendering.frame import I16, Camera, Frame, Stage
 from workers.rendering.rays import (
     MISS,
@@ -25,7 +25,7 @@ from workers.rendering.rays import (
 )
 
 _BACKGROUND_RGB = (225, 232, 240)
-_AMBIENT, _LAMP, _HEAD = 0.40, 0.40, 0.25
+_AMBIENT, _LAMP, _HEAD = 0.50, 0.35, 0.30
 _LAMP_DIRECTION = np.array([0.35, 0.25, 0.90], np.float32) / np.float32(np.sqrt(0.35**2 + 0.25**2 + 0.9**2))
 
 
@@ -102,7 +102,7 @@ def _take(hits: Hits, rows: npt.NDArray[np.bool_]) -> Hits:
     return Hits(hits.parameter[rows], hits.face[rows], hits.barycentric[rows])
 
 
-def _towards_sphere(eye_m: F32, directions: F32, centre_m: F32, radius_m: float) -> npt.NDArray[np.int64]:
+def _towards_sphere(eye_m: F64, directions: F32, centre_m: F64, radius_m: float) -> npt.NDArray[np.int64]:
     """Rows whose ray passes within the sphere (a little more, for rounding)."""
     rel = (centre_m - eye_m).astype(np.float32)
     along = directions @ rel

@@ -16,7 +16,6 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from workers.geometry.mesh import F32, F64, I32, Mesh, concatenate
-from workers.geometry.transforms import inverse
 from workers.houses.house import House
 from workers.objects.model import ObjectModel
 
@@ -104,8 +103,7 @@ def first_hits(rays: RayMesh, origins_m: F32, directions: F32) -> Hits:
 
 def into_frame(T_world_body: F64, origins_m: F32, directions: F32) -> tuple[F32, F32]:
     """World rays (N, 3) as rays in a body's frame."""
-    T = inverse(T_world_body)
-    R = T[:3, :3].astype(np.float32)
+    R = T_world_body[:3, :3].astype(np.float32)
     # Moving by the body's position first keeps float32 exact where house coordinates are large.
-    local = (origins_m - T_world_body[:3, 3].astype(np.float32)) @ R.T
-    return np.ascontiguousarray(local), np.ascontiguousarray(directions @ R.T)
+    local = (origins_m - T_world_body[:3, 3].astype(np.float32)) @ R
+    return np.ascontiguousarray(local, np.float32), np.ascontiguousarray(directions @ R, np.float32)

@@ -45,15 +45,14 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
     sine = stage.radii_m[target] / distance_m
     half_width = sine / np.sqrt(1 - sine**2)  # of the window, at depth 1
     eye, x, y = _window_rays(stage.objects[target], T_world_target, eyes_m, axes, half_width, window)
-    axes32 = axes.astype(np.float32)
-    directions = x[:, None] * axes32[eye, :, 0] + y[:, None] * axes32[eye, :, 1] + axes32[eye, :, 2]
 
     # Alone, in the target's own frame.
+    local_axes = T_world_target[:3, :3].T @ axes
     local_eyes = ((eyes_m - T_world_target[:3, 3]) @ T_world_target[:3, :3]).astype(np.float32)
-    R = T_world_target[:3, :3].astype(np.float32)
-    parameter = nearest(stage.objects[target], local_eyes[eye], directions @ R)
-    hit = parameter < MISS
-    eye, directions, limits = eye[hit], directions[hit], parameter[hit] - np.float32(_SKIN_M)
+    parameter = nearest(stage.objects[target], local_eyes[eye], _directions(local_axes, eye, x, y))
+    hit = np.flatnonzero(parameter < MISS)
+    eye, limits = eye[hit], parameter[hit] - np.float32(_SKIN_M)
+    directions = _directions(axes, eye, x[hit], y[hit])
     alone = np.bincount(eye, minlength=n).astype(np.int32)
 
     # What is left of these rays after the house and each other object that may stand before it.
@@ -68,6 +67,18 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
             towards = directions[between] @ T[:3, :3].astype(np.float32)
             free[between] = ~occluded(stage.objects[k], local[eye[between]], towards, limits[between])
     return alone, np.bincount(eye[free], minlength=n).astype(np.int32)
+
+
+def _directions(axes: F64, eye: npt.NDArray[np.int64], x: F32, y: F32) -> F32:
+    """Rays (R, 3) at depth 1 through x, y (R,) of the cameras `eye` (R,); `axes` (n, 3, 3) are columns."""
+    right, down, forward = (np.ascontiguousarray(axes[:, :, k], np.float32) for k in range(3))
+    directions = right[eye]
+    directions *= x[:, None]
+    across = down[eye]
+    across *= y[:, None]
+    directions += across
+    directions += forward[eye]
+    return directions
 
 
 def _window_rays(

@@ -19,6 +19,7 @@ with warnings.catch_warnings():
     import sapien
     from sapien import physx
 
+_UNSCALED = [1.0, 1.0, 1.0]
 _LOOK_EVERY = 5  # steps between looks at the speeds: reading them costs as much as a step
 
 
@@ -72,9 +73,9 @@ def _add_static(scene: sapien.Scene, static_parts_m: Sequence[F32], material: ph
         # PhysX wants hulls near their own origin: cooking loses precision far from it.
         centre_m = part.mean(axis=0)
         shape = physx.PhysxCollisionShapeConvexMesh(
-            np.ascontiguousarray(part - centre_m, np.float32), np.ones(3, np.float32), material
+            np.ascontiguousarray(part - centre_m, np.float32), _UNSCALED, material
         )
-        shape.set_local_pose(sapien.Pose(centre_m))
+        shape.set_local_pose(sapien.Pose(centre_m.tolist()))
         body.attach(shape)
     entity = sapien.Entity()
     entity.add_component(body)
@@ -87,21 +88,23 @@ def _add_object(
     body = physx.PhysxRigidDynamicComponent()
     for part in model.convex_parts_m:
         body.attach(
-            physx.PhysxCollisionShapeConvexMesh(
-                np.ascontiguousarray(part, np.float32), np.ones(3, np.float32), material
-            )
+            physx.PhysxCollisionShapeConvexMesh(np.ascontiguousarray(part, np.float32), _UNSCALED, material)
         )
     # Scaling mass and inertia together keeps the mass distribution of the parts, which
     # overlap a little, at the object's own mass.
     scale = model.mass_kg / body.mass
-    inertia = body.inertia * scale
+    inertia = np.asarray(body.inertia, np.float32) * np.float32(scale)
     body.set_mass(model.mass_kg)
-    body.set_inertia(inertia)
+    body.set_inertia(inertia.tolist())
     entity = sapien.Entity()
     entity.add_component(body)
-    entity.set_pose(sapien.Pose(T_world_object[:3, 3], quaternion_wxyz(T_world_object[:3, :3])))
+    entity.set_pose(_sapien_pose(T_world_object))
     scene.add_entity(entity)
     return body
+
+
+def _sapien_pose(T: F64) -> sapien.Pose:
+    return sapien.Pose(T[:3, 3].tolist(), quaternion_wxyz(T[:3, :3]).tolist())
 
 
 def _pose_of(body: physx.PhysxRigidDynamicComponent) -> F64:
