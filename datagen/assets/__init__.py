@@ -1,0 +1,1 @@
+"""Houses and objects on disk: where they come from, what they must be, and getting them safely."""

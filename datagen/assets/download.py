@@ -1,0 +1,248 @@
+"""One download over HTTP: resumed, bounded, checked, and in place only when it is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import http.client
+import json
+import os
+import re
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import InputError
+
+_CHUNK_BYTES = 2**18
+_CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
+# Answers that a later try may better; other 4xx are final.
+_PASSING = {408, 425, 429, 500, 502, 503, 504}
+
+# (bytes here so far, total or None). Also called when a download starts over.
+Progress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How patient a download is. `pause` waits between tries."""
+
+    tries: int = 6  # in a row without a new byte
+    first_pause_s: float = 0.5
+    longest_pause_s: float = 30.0
+    timeout_s: float = 30.0
+    pause: Callable[[float], None] = field(default=time.sleep)
+
+
+class _Passing(Exception):
+    """A failure worth another try."""
+
+
+class _HttpOnly(urllib.request.HTTPRedirectHandler):
+    """Follows redirects to http(s) only, and never from https to http."""
+
+    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+        allowed = ("https",) if req.type == "https" else ("http", "https")
+        if urllib.parse.urlsplit(newurl).scheme not in allowed:
+            raise InputError(req.full_url, "", f"redirects to {newurl[:100]}", "Use another --mirror")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+_OPENER = urllib.request.build_opener(_HttpOnly)
+
+
+def download(
+    url: str,
+    target: Path,
+    *,
+    sha256: str | None,
+    size: int | None,
+    max_bytes: int,
+    progress: Progress,
+    policy: Policy | None = None,
+) -> str:
+    """Brings `url` to the file `target` and returns its sha256.
+
+    An earlier broken attempt (`<target>.part`) is continued by a range request, tied to the same
+    content by If-Range; where the server knows no ranges or the content changed, it starts over.
+    Bytes beyond `max_bytes` are refused, dropped connections and 5xx answers are tried again with
+    growing pauses, and only a whole file whose digest is `sha256` (where given) gets its name, by
+    an atomic rename. Raises InputError naming the address: final answers such as 404, too large,
+    wrong size or digest, no more tries.
+    """
+    policy = policy or Policy()
+    if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
+        raise InputError(url, "", "not an http or https address", "Give one with --mirror")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = _Part(target, url)
+    failures = 0
+    while True:
+        before = part.length
+        resumed = before > 0
+        try:
+            _transfer(url, part, size, max_bytes, sha256 is not None, progress, policy.timeout_s)
+        except _Passing as error:
+            failures = 0 if part.length > before else failures + 1
+            if failures >= policy.tries:
+                raise InputError(
+                    url,
+                    "",
+                    f"gave up after {failures} tries ({error})",
+                    "Run the command again to continue, or use --mirror",
+                ) from error
+            policy.pause(min(policy.longest_pause_s, policy.first_pause_s * 2**failures))
+            continue
+        digest = part.digest()
+        if (size is None or part.length == size) and (sha256 is None or digest == sha256):
+            part.finish()
+            return digest
+        got = part.length
+        part.discard()
+        # The two halves of a resumed file can come from two editions; a fresh one tells.
+        if not resumed:
+            wrong = (
+                f"{got:,} bytes, not {size:,}"
+                if size not in (None, got)
+                else f"sha256 {digest}, not {sha256}"
+            )
+            raise InputError(
+                url, "", f"not the expected file: {wrong}", "Use another --mirror, or report the change"
+            )
+
+
+class _Part:
+    """The unfinished file and what its content is tied to."""
+
+    def __init__(self, target: Path, url: str) -> None:
+        self._target, self._url = target, url
+        self.path = target.with_name(target.name + ".part")
+        self._note = target.with_name(target.name + ".part.json")
+        self.validator = ""
+        try:
+            note = json.loads(self._note.read_text("utf-8"))
+            if note["url"] == url and isinstance(note["validator"], str) and note["validator"].isprintable():
+                self.validator = note["validator"]
+            else:
+                self.discard()
+        except (OSError, ValueError, KeyError, TypeError):
+            self.discard()
+
+    @property
+    def length(self) -> int:
+        return self.path.stat().st_size if self.path.exists() else 0
+
+    def note(self, validator: str) -> None:
+        self.validator = validator
+        self._note.write_text(json.dumps({"url": self._url, "validator": validator}), "utf-8")
+
+    def digest(self) -> str:
+        with self.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def discard(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self._note.unlink(missing_ok=True)
+        self.validator = ""
+
+    def finish(self) -> None:
+        with self.path.open("rb") as file:
+            os.fsync(file.fileno())
+        self.path.replace(self._target)
+        self._note.unlink(missing_ok=True)
+
+
+def _transfer(
+    url: str,
+    part: _Part,
+    size: int | None,
+    max_bytes: int,
+    has_digest: bool,
+    progress: Progress,
+    timeout_s: float,
+) -> None:
+    """One request that appends to the part until the body ends. Raises _Passing or InputError."""
+    start = part.length
+    # Without a validator only a known digest can tell whether the halves belong together.
+    if start and not (part.validator or has_digest):
+        part.discard()
+        start = 0
+    if size is not None and start == size:
+        return
+    headers = {"User-Agent": "datagen", "Accept-Encoding": "identity"}
+    if start:
+        headers["Range"] = f"bytes={start}-"
+        if part.validator:
+            headers["If-Range"] = part.validator
+    try:
+        with _OPENER.open(urllib.request.Request(url, headers=headers), timeout=timeout_s) as answer:  # noqa: S310
+            if start and not _continues(answer, start):
+                part.discard()
+                start = 0
+            remaining = _content_length(answer)
+            total = None if remaining is None else start + remaining
+            if max(total or 0, size or 0) > max_bytes or (None not in (size, total) and total != size):
+                part.discard()
+                wanted = f"at most {max_bytes:,}" if size is None else f"{size:,}"
+                raise InputError(
+                    url, "", f"the file has {total or size:,} bytes, not {wanted}", "Use another --mirror"
+                )
+            if not start:
+                part.note(_validator(answer))
+            _append(answer, part, url, start, total if total is not None else size, max_bytes, progress)
+    except urllib.error.HTTPError as error:
+        error.close()
+        if error.code == 416:
+            part.discard()
+            raise _Passing("the server refused to continue") from error
+        if error.code in _PASSING:
+            raise _Passing(f"HTTP {error.code}") from error
+        raise InputError(
+            url,
+            "",
+            f"the server answers HTTP {error.code} {error.reason}",
+            "Use --mirror with a server that has it",
+        ) from error
+    except (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError) as error:
+        raise _Passing(str(getattr(error, "reason", "") or error) or type(error).__name__) from error
+
+
+def _continues(answer: Any, start: int) -> bool:
+    match = _CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+    return answer.status == 206 and match is not None and int(match[1]) == start
+
+
+def _content_length(answer: Any) -> int | None:
+    with contextlib.suppress(TypeError, ValueError):
+        return max(0, int(answer.headers.get("Content-Length")))
+    return None
+
+
+def _validator(answer: Any) -> str:
+    """A strong ETag or else the modification time: what If-Range accepts."""
+    etag = answer.headers.get("ETag", "")
+    return etag if etag and not etag.startswith("W/") else answer.headers.get("Last-Modified", "")
+
+
+def _append(
+    answer: Any, part: _Part, url: str, start: int, total: int | None, max_bytes: int, progress: Progress
+) -> None:
+    here = start
+    progress(here, total)
+    with part.path.open("ab" if start else "wb") as out:
+        while chunk := answer.read(_CHUNK_BYTES):
+            here += len(chunk)
+            if here > max_bytes:
+                out.close()
+                part.discard()
+                raise InputError(
+                    url, "", f"the server sends more than {max_bytes:,} bytes", "Use another --mirror"
+                )
+            out.write(chunk)
+            progress(here, total)
+    if total is not None and here < total:
+        raise _Passing(f"the connection broke at {here:,} of {total:,} bytes")

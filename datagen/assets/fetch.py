@@ -1,0 +1,133 @@
+"""Bringing assets of the catalogue into a folder, with a lock that says what they are."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from datagen.assets.catalogue import CATALOGUE, Asset
+from datagen.assets.download import Policy, Progress, download
+from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
+from datagen.assets.unpack import Limits, unpack
+from schemas.errors import InputError
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What became of one asset."""
+
+    name: str
+    sha256: str
+    size: int
+    trust: str  # "published" or "first-use"
+    from_cache: bool
+    files: int
+
+
+def fetch(
+    asset: Asset,
+    folder: Path,
+    *,
+    cache: Path,
+    mirror: str | None = None,
+    offline: bool = False,
+    progress: Progress = lambda here, total: None,
+    policy: Policy | None = None,
+) -> Fetched:
+    """Downloads one asset (or takes it from the cache), unpacks it and records it in the lock.
+
+    Where the publisher states no digest, the first download is trusted and its digest recorded;
+    from then on the asset must match it. `mirror` replaces everything before the file name.
+    Raises InputError: see `download` and `unpack`; with `offline`, where the cache lacks the file.
+    """
+    lock = (read_lock(folder) if folder.is_dir() else None) or Lock()
+    recorded = next((d.sha256 for d in lock.downloads if d.name == asset.name), None)
+    expected = asset.sha256 or recorded
+    url = f"{mirror.rstrip('/')}/{asset.file}" if mirror else asset.url
+    kept = cache / asset.file
+    digest = sha256_of(kept) if kept.is_file() else None
+    from_cache = digest is not None and expected in (None, digest)
+    if digest is None or not from_cache:
+        if offline:
+            problem = "not in the cache" if digest is None else f"sha256 {digest}, not {expected}"
+            raise InputError(kept, "", problem, f"Put the file of {url} there, or run without --offline")
+        digest = download(
+            url,
+            kept,
+            sha256=expected,
+            size=asset.size,
+            max_bytes=asset.max_bytes,
+            progress=progress,
+            policy=policy,
+        )
+    size = kept.stat().st_size
+    files = _install(asset, kept, folder)
+    trust = "published" if asset.sha256 else "first-use"
+    entry = LockedDownload(name=asset.name, url=asset.url, sha256=digest, size=size, trust=trust)
+    _record(folder, lock, entry, asset, files)
+    return Fetched(asset.name, digest, size, trust, from_cache, len(files))
+
+
+def fetch_all(
+    assets: list[Asset],
+    folder: Path,
+    fetch_one: Callable[[Asset], Fetched],
+    report: Callable[[Fetched], None],
+) -> list[Fetched]:
+    """Fetches in order after checking that the disk can hold what is known of the sizes."""
+    known = sum(asset.size or 0 for asset in assets)
+    place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
+    free = shutil.disk_usage(place).free
+    if known > free:
+        raise InputError(
+            folder,
+            "",
+            f"{known:,} bytes are needed and {free:,} are free",
+            "Free some space or use another disk",
+        )
+    done: list[Fetched] = []
+    for asset in assets:
+        done.append(fetch_one(asset))
+        report(done[-1])
+    return done
+
+
+def _install(asset: Asset, kept: Path, folder: Path) -> list[str]:
+    """Puts the download in its place; returns the files relative to `folder`."""
+    home = folder / asset.into
+    if asset.archive:
+        unpacked = unpack(kept, home, Limits(asset.max_unpacked_bytes))
+        return [(PurePosixPath(asset.into) / path).as_posix() for path in unpacked]
+    home.mkdir(parents=True, exist_ok=True)
+    temporary = home / f".{asset.file}.new"
+    shutil.copyfile(kept, temporary)
+    temporary.replace(home / asset.file)
+    return [(PurePosixPath(asset.into) / asset.file).as_posix()]
+
+
+def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: Asset, files: list[str]) -> None:
+    table = {old.path: old for old in lock.files}
+    for relative in files:
+        path = folder / relative
+        table[relative] = LockedFile(
+            path=relative,
+            sha256=sha256_of(path),
+            size=path.stat().st_size,
+            licence=asset.licence,
+            source=asset.url,
+        )
+    downloads = {old.name: old for old in lock.downloads} | {entry.name: entry}
+    write_lock(
+        folder,
+        Lock(
+            files=tuple(table[key] for key in sorted(table)),
+            downloads=tuple(downloads[key] for key in sorted(downloads)),
+        ),
+    )
+
+
+def groups() -> list[str]:
+    """Names that `fetch` takes: single assets and groups, without the members of groups."""
+    return sorted({name.split("/")[0] for name in CATALOGUE})

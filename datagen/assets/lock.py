@@ -1,0 +1,183 @@
+"""The lock file of an asset folder: what every file must be, and whence it came.
+
+`assets.lock.json` lies in the folder itself and lists each file's relative path, sha256, size,
+licence and source, and each download's address and digest. A download whose publisher states no
+digest is trusted on first use: its digest is recorded here, and later fetches must match it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from schemas.errors import InputError
+
+LOCK_NAME = "assets.lock.json"
+_MAX_LOCK_BYTES = 256 * 2**20
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Size = Annotated[int, Field(ge=0, le=2**50)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LockedFile(_Frozen):
+    """One file of the folder."""
+
+    path: str  # relative, with forward slashes
+    sha256: Digest
+    size: Size
+    licence: str = "unknown"
+    source: str = ""
+
+
+class LockedDownload(_Frozen):
+    """One fetched file or archive. `trust` says who vouched for the digest."""
+
+    name: str
+    url: str
+    sha256: Digest
+    size: Size
+    trust: Literal["published", "first-use"]
+
+
+class Lock(_Frozen):
+    """The content of a lock file."""
+
+    version: Literal[1] = 1
+    files: tuple[LockedFile, ...] = ()
+    downloads: tuple[LockedDownload, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What differs from the lock: relative paths, sorted."""
+
+    checked: int
+    missing: tuple[str, ...]
+    changed: tuple[str, ...]
+    unlisted: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether every listed file is there unchanged; unlisted files do no harm."""
+        return not self.missing and not self.changed
+
+
+def sha256_of(path: Path) -> str:
+    """The sha256 of a file's bytes, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_lock(folder: Path) -> Lock | None:
+    """The folder's lock, or None where there is none. Raises InputError for a broken one."""
+    path = folder / LOCK_NAME
+    if not path.is_file():
+        return None
+    if path.stat().st_size > _MAX_LOCK_BYTES:
+        raise InputError(path, "", "the lock file is absurdly large", "Write it anew: datagen assets lock")
+    try:
+        lock = Lock.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(step) for step in first["loc"])
+        raise InputError(
+            path, field, first["msg"], "Restore it or write it anew: datagen assets lock"
+        ) from error
+    for number, entry in enumerate(lock.files):
+        pure = PurePosixPath(entry.path)
+        if pure.is_absolute() or ".." in pure.parts or "\0" in entry.path or not entry.path:
+            raise InputError(
+                path,
+                f"files.{number}.path",
+                f"{entry.path[:80]!r} leaves the folder",
+                "Restore the lock file",
+            )
+    return lock
+
+
+def write_lock(folder: Path, lock: Lock) -> Path:
+    """Replaces the folder's lock file atomically."""
+    path = folder / LOCK_NAME
+    temporary = folder / f".{LOCK_NAME}.{os.getpid()}"
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            json.dump(lock.model_dump(), file, indent=1, sort_keys=True)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def lock(folder: Path, licence: str | None = None, source: str | None = None) -> Lock:
+    """Writes a lock of all files as they are now and returns it.
+
+    Licence and source of files known before are kept, unless given; downloads are kept too.
+    """
+    before = read_lock(_folder(folder)) or Lock()
+    known = {entry.path: entry for entry in before.files}
+    files: list[LockedFile] = []
+    for relative in _files(folder):
+        path = folder / relative
+        old = known.get(relative)
+        files.append(
+            LockedFile(
+                path=relative,
+                sha256=sha256_of(path),
+                size=path.stat().st_size,
+                licence=licence if licence is not None else old.licence if old else "unknown",
+                source=source if source is not None else old.source if old else "",
+            )
+        )
+    if not files:
+        raise InputError(folder, "", "there are no files to lock", "Name the folder of assets")
+    after = Lock(files=tuple(files), downloads=before.downloads)
+    write_lock(folder, after)
+    return after
+
+
+def verify(folder: Path) -> Verification:
+    """Compares every listed file's size and sha256 with the folder. Raises InputError without a lock."""
+    locked = read_lock(_folder(folder))
+    if locked is None:
+        raise InputError(folder, LOCK_NAME, "there is no lock file", "Write one: datagen assets lock DIR")
+    missing: list[str] = []
+    changed: list[str] = []
+    for entry in locked.files:
+        path = folder / entry.path
+        if not path.is_file():
+            missing.append(entry.path)
+        elif path.stat().st_size != entry.size or sha256_of(path) != entry.sha256:
+            changed.append(entry.path)
+    listed = {entry.path for entry in locked.files}
+    unlisted = [path for path in _files(folder) if path not in listed]
+    return Verification(len(locked.files), tuple(sorted(missing)), tuple(sorted(changed)), tuple(unlisted))
+
+
+def _folder(folder: Path) -> Path:
+    if not folder.is_dir():
+        raise InputError(folder, "", "there is no such folder", "Name the folder of assets")
+    return folder
+
+
+def _files(folder: Path) -> list[str]:
+    """All files below a folder, relative and sorted; hidden ones and the lock itself left out."""
+    found: list[str] = []
+    for root, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        base = Path(root).relative_to(folder)
+        found += [
+            (base / name).as_posix() for name in names if not name.startswith(".") and name != LOCK_NAME
+        ]
+    return sorted(found)

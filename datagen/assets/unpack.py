@@ -1,0 +1,174 @@
+"""Unpacking archives that may be hostile: nothing lands outside the folder, nothing without end."""
+
+from __future__ import annotations
+
+import gzip
+import stat
+import tarfile
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from schemas.errors import InputError
+
+_CHUNK_BYTES = 2**20
+# tarfile reads a header's extension in one piece, so a huge piece is a header that lies.
+_LARGEST_READ = 16 * 2**20
+_ADVICE = "Do not use this archive; fetch it from its publisher"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an archive may grow to."""
+
+    total_bytes: int
+    files: int = 200_000
+
+
+@dataclass(frozen=True)
+class _Member:
+    name: str
+    size: int
+    stream: IO[bytes]
+
+
+def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
+    """Unpacks a zip, tar or gzipped tar into `folder`; returns the files, relative, sorted.
+
+    Everything is unpacked beside its place and moved there when the whole archive was good, so a
+    refused archive leaves nothing behind; existing files of the same names are replaced. Only
+    plain files and folders are allowed: absolute names, `..`, links, devices, repeated names and
+    more than `limits` raise InputError naming the archive and the member.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".unpack-", dir=folder) as staging_name:
+        staging = Path(staging_name)
+        names: dict[str, PurePosixPath] = {}
+        total = 0
+        try:
+            for member in _members(archive, limits):
+                relative = _safe_name(archive, member.name)
+                # Names that differ in case alone are one file on some systems.
+                if names.setdefault(str(relative).casefold(), relative) is not relative:
+                    raise InputError(archive, str(relative), "the name occurs twice in the archive", _ADVICE)
+                if len(names) > limits.files:
+                    raise InputError(archive, "", f"more than {limits.files:,} files", _ADVICE)
+                total += _copy(archive, member, staging / relative, limits.total_bytes - total)
+        except InputError:
+            raise
+        except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError,
+                gzip.BadGzipFile, ValueError) as error:  # fmt: skip
+            raise InputError(
+                archive,
+                "",
+                f"the archive is damaged ({error})",
+                "Remove it from the cache and fetch it again",
+            ) from error
+        files = sorted(names.values())
+        for relative in files:
+            target = folder / relative
+            _refuse_links(archive, folder, relative)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (staging / relative).replace(target)
+    return files
+
+
+def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
+    if zipfile.is_zipfile(archive):
+        yield from _zip_members(archive)
+        return
+    with archive.open("rb") as raw:
+        packed = raw.read(2) == b"\x1f\x8b"
+        raw.seek(0)
+        plain: Any = gzip.GzipFile(fileobj=raw) if packed else raw
+        careful: Any = _Careful(archive, plain)
+        with tarfile.open(fileobj=careful, mode="r:") as tar:
+            for count, info in enumerate(tar):
+                if count > 2 * limits.files:
+                    raise InputError(archive, "", f"more than {2 * limits.files:,} entries", _ADVICE)
+                if info.isdir():
+                    _safe_name(archive, info.name)
+                    continue
+                if not info.isreg() or info.issparse():
+                    raise InputError(archive, info.name, "a link, device or special file", _ADVICE)
+                if info.size > limits.total_bytes:
+                    raise InputError(archive, info.name, f"claims {info.size:,} bytes", _ADVICE)
+                stream = tar.extractfile(info)
+                assert stream is not None
+                yield _Member(info.name, info.size, stream)
+
+
+def _zip_members(archive: Path) -> Iterator[_Member]:
+    with zipfile.ZipFile(archive) as packed:
+        for info in packed.infolist():
+            kind = stat.S_IFMT(info.external_attr >> 16)
+            if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+                raise InputError(archive, info.filename, "a link, device or special file", _ADVICE)
+            if info.is_dir():
+                _safe_name(archive, info.filename)
+                continue
+            with packed.open(info) as stream:
+                yield _Member(info.filename, info.file_size, stream)
+
+
+def _safe_name(archive: Path, name: str) -> PurePosixPath:
+    path = PurePosixPath(name)
+    hostile = (
+        not name
+        or path.is_absolute()
+        or ".." in path.parts
+        or "\\" in name
+        or ":" in name
+        or any(ord(c) < 32 for c in name)
+        or len(name) > 1000
+    )
+    if hostile:
+        raise InputError(archive, repr(name[:80]), "the name would leave the folder", _ADVICE)
+    return path
+
+
+def _copy(archive: Path, member: _Member, target: Path, room: int) -> int:
+    """Copies at most `room` bytes, whatever size the archive claims; returns how many there were."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    copied = 0
+    with target.open("xb") as out:
+        while chunk := member.stream.read(_CHUNK_BYTES):
+            copied += len(chunk)
+            if copied > room:
+                raise InputError(archive, member.name, "the archive unpacks to more than is allowed", _ADVICE)
+            out.write(chunk)
+    if copied != member.size:
+        raise InputError(archive, member.name, f"{copied:,} of {member.size:,} bytes are there", _ADVICE)
+    return copied
+
+
+def _refuse_links(archive: Path, folder: Path, relative: PurePosixPath) -> None:
+    """A link that already stands in the folder must not carry a file out of it."""
+    step = folder
+    for part in relative.parts:
+        step = step / part
+        if step.is_symlink():
+            raise InputError(archive, str(relative), f"{step} is a link", "Remove it or use an empty folder")
+
+
+class _Careful:
+    """A readable, seekable stream that refuses huge single reads."""
+
+    def __init__(self, archive: Path, stream: Any) -> None:
+        self._archive = archive
+        self._stream = stream
+
+    def read(self, size: int = -1) -> bytes:
+        if size < 0 or size > _LARGEST_READ:
+            raise InputError(self._archive, "", "a header of absurd size", _ADVICE)
+        return self._stream.read(size)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._stream.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._stream.tell()
