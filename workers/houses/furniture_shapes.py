@@ -11,6 +11,8 @@ _CUSHION_PILLOW: Rgb = (232, 228, 220)
 _STEEL: Rgb = (176, 178, 182)
 _DARK: Rgb = (44, 44, 48)
 _WHITE: Rgb = (236, 236, 234)
+# Height of a sofa's seat where nothing was seen to rest on it, as a share of the whole.
+SOFA_SEAT_SHARE = 0.46
 
 
 def _halves(asset: Asset) -> tuple[float, float, float]:
@@ -54,7 +56,6 @@ def counter(asset: Asset, rgb: Rgb) -> list[Solid]:
     top = top_height_m(asset)
     cupboard, worktop = rgb, shade((176, 172, 166), 0.8 + 0.4 * hash_bytes(asset.asset_id)[3] / 255)
     solids: list[Solid] = []
-    _, depth, _ = asset.size_m
     for k, r in enumerate(top_rectangles(asset)):
         # The toe space is at the side that faces the room: +y for the back run, inwards for wings.
         front = (
@@ -201,7 +202,7 @@ def seat_height_m(asset: Asset, share: float) -> float:
 def sofa(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Seat, back and arms; also for armchairs."""
     x, y, height = _halves(asset)
-    seat = seat_height_m(asset, 0.46)
+    seat = seat_height_m(asset, SOFA_SEAT_SHARE)
     arm = min(0.2, 0.22 * x)
     back = min(0.24, 0.3 * 2 * y)
     arm_top = min(height, seat + 0.5 * (height - seat))
@@ -339,3 +340,30 @@ def washing_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
         box((-x, x), (y - 0.03, y - 0.015), (0.85 * height, height), shade(rgb, 0.8)),
         ball((0.0, y - 0.03, 0.45 * height), (radius, 0.03, radius), (70, 78, 88)),
     ]
+
+
+def stove(asset: Asset, rgb: Rgb) -> list[Solid]:
+    """An oven with a glass door below four plates."""
+    x, y, height = _halves(asset)
+    radii = (0.28 * x, 0.28 * y)
+    plates = [
+        frustum((sx * 0.45 * x, sy * 0.4 * y), (height - 0.012, height), radii, radii, _DARK)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    return [
+        box((-x, x), (-y, y - 0.02), (0.0, height - 0.012), rgb),
+        box((-0.85 * x, 0.85 * x), (y - 0.02, y - 0.008), (0.15 * height, 0.7 * height), _DARK),
+        box((-0.85 * x, 0.85 * x), (y - 0.02, y), (0.74 * height, 0.77 * height), _STEEL),
+        *plates,
+    ]
+
+
+def wall_cabinet(asset: Asset, rgb: Rgb) -> list[Solid]:
+    """A hanging cupboard with two doors."""
+    x, y, height = _halves(asset)
+    doors = [
+        box((side, side + x - 0.01), (y - 0.02, y - 0.004), (0.01, height - 0.01), shade(rgb, 1.06))
+        for side in (-x + 0.005, 0.005)
+    ]
+    return [box((-x, x), (-y, y - 0.02), (0.0, height), rgb), *doors]

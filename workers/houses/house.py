@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-
 from workers.geometry.mesh import F32, F64, Mesh
 
 BodyKind = Literal["wall", "furniture", "small"]
@@ -76,8 +75,15 @@ class House:
 class HouseSource(Protocol):
     """An ordered collection of houses. Opening one is cheap; loading one takes milliseconds."""
 
-    kind: str
-    digest: str  # of the content, not of the path
+    @property
+    def kind(self) -> str:
+        """The registry name."""
+        ...
+
+    @property
+    def digest(self) -> str:
+        """Of the content, not of the path."""
+        ...
 
     def house_ids(self) -> list[str]:
         """All ids, in an order that the content alone decides."""

@@ -82,7 +82,7 @@ def _corner(asset: Asset) -> tuple[float | None, float, bool]:
         if shape in (["L"], ["C"]) and min(width, depth) > COUNTER_DEPTH_M + 0.1:
             return COUNTER_DEPTH_M, min(COUNTER_DEPTH_M, width / 2), shape == ["C"]
     for prefix, (run, wing) in _CORNER_DESKS.items():
-        if asset.asset_id.startswith(prefix) and asset.object_type == "Desk":
-            if run < depth and wing < width:
-                return run, wing, False
+        is_one = asset.object_type == "Desk" and asset.asset_id.startswith(prefix)
+        if is_one and run < depth and wing < width:
+            return run, wing, False
     return None, 0.0, False

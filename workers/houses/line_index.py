@@ -12,6 +12,7 @@ import contextlib
 import gzip
 import hashlib
 import io
+import itertools
 import mmap
 import os
 import re
@@ -98,11 +99,10 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     if path.suffix == ".json":
         yield from _documents(path)
         return
-    opened = gzip.open(path, "rb") if path.suffix == ".gz" else open(path, "rb")
     total = 0
-    with opened as stream:
-        for number in range(1, 1 << 62):
-            line = cast(IO[bytes], stream).readline(MAX_LINE_BYTES + 1)
+    with path.open("rb") as file, _unpacked(path, file) as stream:
+        for number in itertools.count(1):
+            line = stream.readline(MAX_LINE_BYTES + 1)
             if not line:
                 return
             total += len(line)
@@ -113,9 +113,13 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
                 yield number, line
 
 
+def _unpacked(path: Path, file: IO[bytes]) -> IO[bytes]:
+    return cast(IO[bytes], gzip.GzipFile(fileobj=file, mode="rb")) if path.suffix == ".gz" else file
+
+
 def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
     """A .json file is one house, or a list of houses, each of which counts as a line."""
-    with open(path, "rb") as stream:
+    with path.open("rb") as stream:
         text = stream.read(MAX_LINE_BYTES * 4 + 1)
     if len(text) > MAX_LINE_BYTES * 4:
         raise InputError(path, "", "a JSON file of more than 64 MiB", "Store one house a line (.jsonl).")
@@ -132,7 +136,7 @@ def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _file_digest(path: Path) -> str:
-    with open(path, "rb") as stream:
+    with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -197,7 +201,7 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
         size = int(arrays["size"][0])
         if data_path.stat().st_size != size:
             return None
-        with open(data_path, "rb") as stream:
+        with data_path.open("rb") as stream:
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         return _index(path, data, arrays)
     except (OSError, ValueError, KeyError, IndexError, EOFError, zlib.error):
@@ -256,7 +260,7 @@ class _Scratch:
             return False
         try:
             self._stream.close()
-            os.replace(self._path, final)
+            self._path.replace(final)
         except OSError:
             return False
         return True

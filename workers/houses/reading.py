@@ -99,5 +99,11 @@ def parse_json(text: bytes, place: str) -> Node:
 def _kind(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
-    names = {dict: "an object", list: "a list", str: "a text", bool: "a truth value", int: "a number"}
+    names: dict[type, str] = {
+        dict: "an object",
+        list: "a list",
+        str: "a text",
+        bool: "a truth value",
+        int: "a number",
+    }
     return "null" if value is None else names.get(type(value), "a number")

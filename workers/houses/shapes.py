@@ -92,6 +92,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "SprayBottle": (s.dispenser, _PLASTIC),
     "Statue": (s.statue, _CLAY),
     "Stool": (f.stool, _WOOD),
+    "Stove": (f.stove, _METAL[:2] + _ENAMEL),
     "TVStand": (f.tv_stand, _WOOD),
     "Table": (f.table, _WOOD),
     "TeddyBear": (s.teddy, ((150, 106, 66),)),
@@ -102,6 +103,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "ToiletPaper": (s.column, _ENAMEL),
     "Tomato": (s.pebble, ((200, 52, 38),)),
     "Vase": (s.vase, _CLAY),
+    "WallCabinet": (f.wall_cabinet, _WOOD),
     "WashingMachine": (f.washing_machine, _ENAMEL),
     "WineBottle": (s.bottle, _GLASS),
 }

@@ -1,0 +1,311 @@
+"""AI2-THOR scenes as the habitat conversion lays them out on disk.
+
+ROOT/ai2thor-hab/configs/scenes/SET/**/NAME.scene_instance.json   stage and object instances
+ROOT/ai2thor-hab/assets/stages/**/NAME.glb                        walls and floors
+ROOT/ai2thorhab-uncompressed/assets/objects/NAME.glb              furniture and things
+ROOT/ai2thorhab-uncompressed/configs/objects/NAME.object_config.json   {semantic_id}
+ROOT/ai2thor-hab/configs/object_semantic_id_mapping.json          {object type: semantic id}
+
+Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations are quaternions
+(w, x, y, z). Stages of the ProcTHOR set are stored turned by 90 degrees about the vertical.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.geometry.mesh import F32, F64, Mesh
+from workers.houses.floors import MAX_CORNERS, clean_polygon
+from workers.houses.glb import read_glb
+from workers.houses.house import Body, House, Room, Surface
+from workers.houses.layout import CARRYING_TYPES
+from workers.houses.loader import room_ids_at
+from workers.houses.mesh_geometry import convex_parts, flat_tops, normals_and_areas, outlines, slab_parts
+from workers.houses.reading import EXTENT_M, Node, parse_json
+
+_SUFFIX = ".scene_instance.json"
+_SCENES = Path("ai2thor-hab/configs/scenes")
+_OBJECTS = Path("ai2thorhab-uncompressed/assets")
+_CONFIGS = Path("ai2thorhab-uncompressed/configs")
+_MAX_SCENES = 200_000
+_MAX_SCENE_BYTES = 16 << 20
+_MAX_OBJECTS = 5000
+_KEPT_MESHES = 512
+_SURFACE_HEIGHTS_M = (0.25, 1.5)
+_WALL_TOP_M = 2.2  # parts above it meet no robot
+_SMALL_M = 0.35
+_MEND = "Download the scenes again."
+
+# The stage as stored in the ProcTHOR set, and every file's frame, to the world.
+_Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+_PROCTHOR_STAGE = np.array([[0, 0, -1.0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0], [0, 0, 0, 1.0]])
+
+# A room is called after the first of these that stands in it.
+_ROOM_BY_TYPE = (
+    ("Toilet", "Bathroom"), ("ShowerDoor", "Bathroom"), ("Bed", "Bedroom"), ("Fridge", "Kitchen"),
+    ("CounterTop", "Kitchen"), ("Sofa", "LivingRoom"), ("Television", "LivingRoom"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Template:
+    """A mesh of the download, brought to z up, with what is derived from it once."""
+
+    mesh: Mesh
+    parts_m: tuple[F32, ...]
+    digest: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Ai2thorHouses:
+    """Scenes below one root. The newest meshes are kept, as houses share their furniture."""
+
+    root: Path
+    digest: str
+    scenes: dict[str, Path]
+    types: dict[int, str]
+    kind: str = "ai2thor"
+    _templates: OrderedDict[Path, _Template] = field(default_factory=OrderedDict)
+
+    def house_ids(self) -> list[str]:
+        """Ids, sorted: the scene's path below configs/scenes without its ending."""
+        return list(self.scenes)
+
+    def load(self, house_id: str) -> House:
+        """The house. Raises InputError that names the file and the field."""
+        if house_id not in self.scenes:
+            raise InputError(self.root, "", f"no house {house_id!r}", "Choose an id that it holds.")
+        path = self.scenes[house_id]
+        text = _read(path, _MAX_SCENE_BYTES)
+        scene = parse_json(text, str(path))
+        digest = hashlib.sha256(text)
+        stage, is_stage_turned = self._stage(scene, house_id)
+        digest.update(stage.digest)
+        mesh = stage.mesh.transformed(_stage_pose(is_stage_turned))
+        skipped: Counter[str] = Counter()
+        placed: list[tuple[Body, F64, F64, Mesh]] = []
+        for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
+            name = _template_name(entry)
+            file = self.root / _OBJECTS / f"{name}.glb"
+            if not file.is_file():
+                skipped["missing mesh"] += 1
+                continue
+            template = self._template(file)
+            digest.update(template.digest)
+            T_world = _pose(entry)
+            placed.append(self._placed(number, name, template, T_world))
+        bodies, rooms = _walls_and_rooms(mesh, [(b, xy) for b, xy, _, _ in placed])
+        owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
+        surfaces: list[Surface] = []
+        for (body, _, T, local), owner in zip(placed, owners, strict=True):
+            bodies.append(_with_room(body, owner))
+            if owner and body.object_type in CARRYING_TYPES:
+                surfaces.extend(_surfaces(body, owner, T, local))
+        return House(
+            house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), dict(skipped)
+        )
+
+    def _stage(self, scene: Node, house_id: str) -> tuple[_Template, bool]:
+        name = _template_name(scene.get("stage_instance"))
+        file = self.root / "ai2thor-hab/assets" / f"{name}.glb"
+        return self._template(file), house_id.startswith("ProcTHOR/")
+
+    def _template(self, file: Path) -> _Template:
+        if file in self._templates:
+            self._templates.move_to_end(file)
+            return self._templates[file]
+        mesh = read_glb(file)
+        mesh = mesh.transformed(_Y_UP_TO_WORLD)
+        with file.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").digest()
+        is_stage = "stages" in file.parts
+        template = _Template(mesh, () if is_stage else convex_parts(mesh), digest)
+        self._templates[file] = template
+        if len(self._templates) > _KEPT_MESHES:
+            self._templates.popitem(last=False)
+        return template
+
+    def _placed(self, number: int, name: str, template: _Template, T: F64) -> tuple[Body, F64, F64, Mesh]:
+        """The body, the point that decides its room, its pose and its mesh in its own frame."""
+        mesh = template.mesh.transformed(T)
+        parts = tuple((p @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for p in template.parts_m)
+        size_m = np.ptp(mesh.vertices_m, axis=0)
+        object_type = self._type_of(name)
+        is_small = bool(size_m.max() < _SMALL_M or (mesh.vertices_m[:, 2].min() > 0.2 and size_m.max() < 0.6))
+        asset_id = PurePosixPath(name).name
+        kind = "small" if is_small else "furniture"
+        body = Body(f"{number}|{asset_id}", kind, object_type, asset_id, "", mesh, parts)
+        middle = (mesh.vertices_m.min(0) + mesh.vertices_m.max(0))[:2] / 2
+        return body, middle.astype(np.float64), T, template.mesh
+
+    def _type_of(self, name: str) -> str:
+        """The object type by the semantic id of the template's configuration, else by its name."""
+        config = self.root / _CONFIGS / f"{name}.object_config.json"
+        if config.is_file():
+            found = parse_json(_read(config, 1 << 20), str(config)).find("semantic_id")
+            if found is not None:
+                known = self.types.get(int(found.number(-1, 1e9)))
+                if known is not None:
+                    return known
+        letters = "".join(c for c in PurePosixPath(name).name if c.isalpha()).lower()
+        known_types = sorted(CARRYING_TYPES, key=lambda t: -len(t))
+        return next((t for t in known_types if t.lower() in letters), "Object")
+
+
+def open_ai2thor(folder: str) -> Ai2thorHouses:
+    """The scenes below a download folder (the one that holds ai2thor-hab, or one above it).
+
+    Hashing every mesh would read many gigabytes, so the source's digest covers the names and
+    sizes of all scenes and meshes; each house's own digest covers the bytes of all its files.
+    """
+    base = Path(folder)
+    mend = "Name it as ai2thor:DIR, where DIR holds ai2thor-hab/ and ai2thorhab-uncompressed/."
+    roots = [base, base / "ai2thor", base / "scene_datasets/ai2thor", base / "data/scene_datasets/ai2thor"]
+    root = next((r for r in roots if folder and (r / _SCENES).is_dir()), None)
+    if root is None:
+        raise InputError(folder or "ai2thor", "", "no ai2thor-hab/configs/scenes folder in it", mend)
+    top = root / _SCENES
+    scenes = {
+        p.relative_to(top).as_posix().removesuffix(_SUFFIX): p for p in sorted(top.rglob(f"*{_SUFFIX}"))
+    }
+    if not scenes or len(scenes) > _MAX_SCENES:
+        raise InputError(top, "", f"{len(scenes)} scenes where 1 to {_MAX_SCENES} belong", mend)
+    listing = [[i, scenes[i].stat().st_size] for i in sorted(scenes)]
+    meshes = sorted(
+        p for part in (_OBJECTS, Path("ai2thor-hab/assets")) for p in (root / part).rglob("*.glb")
+    )
+    listing += [[p.relative_to(root).as_posix(), p.stat().st_size] for p in meshes]
+    ordered = {i: scenes[i] for i in sorted(scenes)}
+    return Ai2thorHouses(root, digest_of(listing), ordered, _types(root))
+
+
+def _types(root: Path) -> dict[int, str]:
+    path = root / "ai2thor-hab/configs/object_semantic_id_mapping.json"
+    if not path.is_file():
+        return {}
+    node = parse_json(_read(path, 1 << 20), str(path))
+    members = cast(dict[str, Any], node.value) if isinstance(node.value, dict) else {}
+    return {int(Node(str(path), f"$.{k}", v).number(-1, 1e9)): k for k, v in members.items()}
+
+
+def _read(path: Path, limit: int) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(limit + 1)
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
+    if len(text) > limit:
+        raise InputError(path, "", f"larger than {limit >> 20} MiB", _MEND)
+    return text
+
+
+def _template_name(entry: Node) -> str:
+    """A template's path below the assets folder; it may not lead out of it."""
+    node = entry.get("template_name")
+    name = node.text()
+    pieces = PurePosixPath(name).parts
+    if not pieces or name.startswith("/") or ".." in pieces or "\\" in name or "\0" in name:
+        raise node.error(f"{name!r} is not a path below the assets folder")
+    return name
+
+
+def _pose(entry: Node) -> F64:
+    """`T_world_object` of an instance; object meshes are already z up, so both sides are turned."""
+    x, y, z = _numbers(entry.get("translation"), 3, EXTENT_M)
+    found = entry.find("rotation")
+    q = np.array([1.0, 0, 0, 0] if found is None else _numbers(found, 4, 2.0))
+    if not 0.5 < np.linalg.norm(q) < 2.0:
+        raise entry.get("rotation").error("not a unit quaternion")
+    w, i, j, k = q / np.linalg.norm(q)
+    rotation = np.array(
+        [
+            [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
+            [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
+            [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
+        ]
+    )
+    scale = entry.find("uniform_scale")
+    stretched = entry.find("non_uniform_scale")
+    factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
+    if stretched is not None:
+        factors = factors * [n.number(1e-3, 1e3) for n in stretched.items(3)]
+    T = np.eye(4)
+    T[:3, :3] = rotation * factors
+    T[:3, 3] = (x, y, z)
+    return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
+
+
+def _numbers(node: Node, count: int, limit: float) -> list[float]:
+    values = [n.number(-limit, limit) for n in node.items(count)]
+    if len(values) != count:
+        raise node.error(f"{len(values)} numbers where {count} belong")
+    return values
+
+
+def _stage_pose(is_turned: bool) -> F64:
+    """Pose of a z-up stage mesh: ProcTHOR stages are turned back by 90 degrees about the vertical."""
+    turn = _PROCTHOR_STAGE if is_turned else np.eye(4)
+    return _Y_UP_TO_WORLD @ turn @ np.linalg.inv(_Y_UP_TO_WORLD)
+
+
+def _walls_and_rooms(stage: Mesh, things: list[tuple[Body, F64]]) -> tuple[list[Body], list[Room]]:
+    """The stage without its ceiling as a body, and a room for every patch of floor."""
+    normals, _ = normals_and_areas(stage)
+    corner_z = stage.vertices_m[stage.faces][:, :, 2]
+    ceiling_m = float(stage.vertices_m[:, 2].max())
+    is_floor = (normals[:, 2] > 0.97) & (np.abs(corner_z).max(1) < 0.05)
+    is_ceiling = (np.abs(normals[:, 2]) > 0.9) & (corner_z.min(1) > max(1.8, ceiling_m - 0.5))
+    polygons: list[F64] = []
+    for outline in outlines(stage, is_floor):
+        polygon = clean_polygon(outline)
+        if not isinstance(polygon, str) and len(polygon) <= MAX_CORNERS:
+            polygons.append(polygon)
+    if not polygons:  # no floor of its own: the ground below the walls
+        low, high = stage.vertices_m.min(0)[:2], stage.vertices_m.max(0)[:2]
+        polygons = [np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)]
+    plain = [Room(f"room|{k}", "Room", p, ceiling_m) for k, p in enumerate(polygons)]
+    owners = room_ids_at(np.array([xy for _, xy in things]).reshape(-1, 2), plain)
+    within: dict[str, set[str]] = {r.room_id: set() for r in plain}
+    for (body, _), owner in zip(things, owners, strict=True):
+        if owner:
+            within[owner].add(body.object_type)
+    rooms: list[Room] = []
+    for room in plain:
+        kind = next((name for t, name in _ROOM_BY_TYPE if t in within[room.room_id]), "Room")
+        rooms.append(Room(room.room_id, kind, room.polygon_m, room.ceiling_m))
+    kept = ~is_ceiling
+    shown = Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
+    parts = slab_parts(shown, 0.02, _WALL_TOP_M)
+    return [Body("stage", "wall", "Wall", "", "", shown, parts)], rooms
+
+
+def _with_room(body: Body, room_id: str) -> Body:
+    return Body(
+        body.body_id, body.kind, body.object_type, body.asset_id, room_id, body.visual, body.convex_parts_m
+    )
+
+
+def _surfaces(body: Body, room_id: str, T: F64, local: Mesh) -> list[Surface]:
+    """Flat tops of an upright, unstretched body."""
+    if T[2, 2] < 0.999 or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
+        return []
+    out: list[Surface] = []
+    base_m = float(T[2, 3])
+    low, high = (h - base_m for h in _SURFACE_HEIGHTS_M)
+    for k, (height, rectangle) in enumerate(flat_tops(local, low, high)):
+        T_surface = T.copy()
+        T_surface[:3, 3] = T[:3, :3] @ (*rectangle.centre_m, height) + T[:3, 3]
+        out.append(
+            Surface(
+                f"{body.body_id}/{k}", body.body_id, body.object_type, room_id, T_surface, rectangle.size_m
+            )
+        )
+    return out

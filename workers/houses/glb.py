@@ -1,0 +1,116 @@
+"""Meshes from binary glTF files, within limits, with textures reduced to a colour a face."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F64, U8, Mesh
+
+MAX_FILE_BYTES = 256 << 20
+MAX_FACES = 500_000
+_MAX_COUNT = 50_000_000
+_MAX_TEXTURE_PX = 64_000_000
+_PLAIN = (180, 178, 174)
+_MEND = "Download the asset again, or remove the scenes that use it."
+# What a damaged file makes the reader stumble over.
+_DAMAGE = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, struct.error, RecursionError,
+    ZeroDivisionError, OverflowError, Image.DecompressionBombError,
+)  # fmt: skip
+
+
+def read_glb(path: Path) -> Mesh:
+    """All triangles of the file in its own frame (glTF: y up), vertices merged where they coincide.
+
+    Raises InputError for files that are missing, damaged, empty or beyond the limits.
+    """
+    _check_header(path)
+    try:
+        scene = cast(Any, trimesh.load_scene(str(path), file_type="glb", skip_materials=False))
+        pieces = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
+        count = sum(len(m.faces) for m in pieces)
+        if 0 < count <= MAX_FACES:
+            return _merged(pieces)
+    except _DAMAGE as error:
+        raise InputError(path, "", f"a damaged glTF file ({type(error).__name__})", _MEND) from None
+    problem = "no triangles" if count == 0 else f"{count} triangles, more than {MAX_FACES}"
+    raise InputError(path, "", problem, _MEND)
+
+
+def _check_header(path: Path) -> None:
+    """Refuse by size and by the counts that the file itself states, before anything is unpacked."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            head = stream.read(20)
+            if size > MAX_FILE_BYTES:
+                raise InputError(path, "", f"more than {MAX_FILE_BYTES >> 20} MiB", _MEND)
+            if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
+                raise InputError(path, "", "not a binary glTF file", _MEND)
+            length = int.from_bytes(head[12:16], "little")
+            if length > size:
+                raise InputError(path, "", "the file ends too early", _MEND)
+            document = json.loads(stream.read(length))
+            counts = [int(a["count"]) for a in document.get("accessors", [])]
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})", _MEND) from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(path, "", "its description is not valid glTF", _MEND) from None
+    if counts and (max(counts) > _MAX_COUNT or min(counts) < 0 or sum(counts) > 4 * _MAX_COUNT):
+        raise InputError(path, "accessors", "absurd counts of vertices or indices", _MEND)
+
+
+def _merged(pieces: list[Any]) -> Mesh:
+    vertices: list[F64] = []
+    faces: list[Any] = []
+    colours: list[U8] = []
+    offset = 0
+    for piece in pieces:
+        vertices.append(np.asarray(piece.vertices, np.float64))
+        faces.append(np.asarray(piece.faces, np.int64) + offset)
+        colours.append(_face_rgb(piece))
+        offset += len(piece.vertices)
+    points = np.concatenate(vertices)
+    if not np.isfinite(points).all() or np.abs(points).max() > 1000.0:
+        raise ValueError("coordinates that are not finite or beyond 1000 m")
+    keys, inverse = np.unique(np.round(points / 1e-5).astype(np.int64), axis=0, return_inverse=True)
+    indices = inverse.reshape(-1)[np.concatenate(faces)]
+    keep = (
+        (indices[:, 0] != indices[:, 1]) & (indices[:, 1] != indices[:, 2]) & (indices[:, 0] != indices[:, 2])
+    )
+    return Mesh(
+        (keys * 1e-5).astype(np.float32), indices[keep].astype(np.int32), np.concatenate(colours)[keep]
+    )
+
+
+def _face_rgb(piece: Any) -> U8:
+    """One colour a face: its vertex colours, the texture at its middle, or the material's factor."""
+    count = len(piece.faces)
+    visual = cast(Any, piece.visual)
+    if visual.kind == "vertex" or visual.kind == "face":
+        return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
+    material = getattr(visual, "material", None)
+    factor = getattr(material, "baseColorFactor", None)
+    rgb = np.array(_PLAIN if factor is None else np.asarray(factor)[:3], np.float64)
+    if factor is not None and np.asarray(factor).dtype.kind == "f":
+        rgb = rgb * 255
+    image = getattr(material, "baseColorTexture", None)
+    uv = getattr(visual, "uv", None)
+    if image is None or uv is None or len(uv) != len(piece.vertices):
+        return np.tile(np.clip(rgb, 0, 255).astype(np.uint8), (count, 1))
+    if image.width * image.height > _MAX_TEXTURE_PX:
+        raise ValueError("a texture of more than 64 million pixels")
+    pixels = np.asarray(image.convert("RGB"))
+    middle = np.asarray(uv, np.float64)[piece.faces].mean(1) % 1.0
+    rows = np.clip(((1.0 - middle[:, 1]) * image.height).astype(int), 0, image.height - 1)
+    columns = np.clip((middle[:, 0] * image.width).astype(int), 0, image.width - 1)
+    tint = 1.0 if factor is None else np.clip(rgb, 0, 255) / 255
+    return (pixels[rows, columns] * tint).astype(np.uint8)
