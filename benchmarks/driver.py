@@ -104,7 +104,7 @@ def main() -> None:
     print(f"{'  growth of peak memory':34} {'':>9}        {grown_mib:9.1f} MiB")
     print(f"{'ledger entry, durable':34} {options.ledger:>9}        {ledger(options.ledger):9.3f} ms")
     print(
-        f"{'empty shards through Ray, 2 slots':34} {options.ray:>9}        {through_ray(options.ray):9.0f} per s"
+        f"{'empty shards by Ray, 2 slots':34} {options.ray:>9}        {through_ray(options.ray):9.0f} per s"
     )
 
 
