@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from cluster.attempt import run_attempt
-from cluster.guard import Meter
+from cluster.guard import Meter, guarded
 from cluster.task import JobCannotGoOn, ShardTask
+from schemas.run import Run, shard_folder
 from schemas.run_records import Layout
+from schemas.specification import CandidateParams, ObservationParams, SceneParams, Source, Specification
 from tests.made_runs import make_run, small_spec
+from workers.houses import open_houses
+from workers.objects import open_objects
 
 
 def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> None:
@@ -23,3 +29,58 @@ def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> N
     other = ShardTask(run.storage.url, small_spec(seed=9), layout, 0, "a", "builtin", "builtin", 60)
     with pytest.raises(JobCannotGoOn, match="another specification"):
         run_attempt(other, Meter())
+
+
+@pytest.fixture(scope="module")
+def spec() -> Specification:
+    """Two clutter objects and few points on the built-in world: small, but the whole path."""
+    houses, objects = open_houses("builtin"), open_objects("builtin")
+    return Specification(
+        houses=Source(kind=houses.kind, digest=houses.digest),
+        objects=Source(kind=objects.kind, digest=objects.digest),
+        scene=SceneParams(n_clutter=2),
+        observation=ObservationParams(n_points=256),
+        candidates=CandidateParams(per_scene=5),
+    )
+
+
+def task_on(run: Run, attempt: str, shard: int = 0) -> ShardTask:
+    return ShardTask(
+        run.storage.url, run.manifest.spec, run.layout, shard, attempt, "builtin", "builtin", deadline_s=300
+    )
+
+
+def test_an_attempt_commits_and_a_second_one_is_superseded(spec: Specification, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+    first, second = (guarded(run_attempt, task_on(run, name), deadline=False) for name in ("first", "second"))
+    assert (first.outcome, second.outcome) == ("committed", "superseded"), first.stack + second.stack
+    commit = run.commit_of(0)
+    assert commit.attempt == "first" and commit.cost == first.cost and commit.positives == first.positives
+    assert commit.samples == first.labels == 10 and commit.cost.stage_wall_s["write"] > 0
+    assert commit.cost.written_bytes == sum(f.size for f in commit.files) > 0
+    run.check_digests(commit)
+    # The same shard made twice is the same bytes.
+    digests = {}
+    for name in ("first", "second"):
+        keys = [f.key for f in run.storage.list(shard_folder(0, name))]
+        digests[name] = {key.rsplit(name, 1)[1]: run.storage.get(key, 10**8) for key in keys}
+    assert digests["first"] == digests["second"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk to fill")
+def test_a_full_disk_ends_the_job_and_commits_nothing(spec: Specification, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("mounting a small disk is not allowed here")
+    try:
+        run = make_run(disk / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+        report = guarded(run_attempt, task_on(run, "a"), deadline=False)
+        assert report.ends_job and "No space left on device" in report.cause
+        assert "Free disk space" in report.cause and "\n" not in report.cause
+        assert run.committed() == set()
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
