@@ -42,13 +42,17 @@ class RunBooks:
 def close_lost_attempts(run: Run) -> int:
     """Close in the ledger what a former driver left open; return how many attempts that were.
 
-    An attempt that began and never ended belonged to a driver that was killed. If it reached its
-    commit all the same, it is closed as committed, at the commit's cost; otherwise it is lost, at
-    a cost that nobody knows.
+    Call it when a job has ended. An attempt that began and never ended belonged to a driver that
+    was killed; its worker may outlive the driver by moments and still reach its commit. So an
+    attempt is judged only once its shard is decided: the one that won is closed as committed, at
+    the commit's cost, others as lost, at a cost that nobody knows. Where the shard is still open
+    they stay open, for the job that resumes.
     """
-    books, lost = RunBooks(run), run.unfinished_attempts()
-    for start in lost:
+    books, quarantined, closed = RunBooks(run), run.quarantined(), 0
+    for start in run.unfinished_attempts():
         commit = books.commit_of(start.shard)
+        if commit is None and start.shard not in quarantined:
+            continue
         if commit is not None and commit.attempt == start.attempt:
             entry = LedgerEntry(
                 attempt=start.attempt,
@@ -69,4 +73,5 @@ def close_lost_attempts(run: Run) -> int:
                 ended=utc_now(),
             )
         books.close(entry)
-    return len(lost)
+        closed += 1
+    return closed

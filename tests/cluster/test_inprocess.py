@@ -79,14 +79,22 @@ def test_a_shard_that_another_driver_committed_is_superseded(tmp_path: Path) -> 
     assert run.commit_of(2).attempt == "of-another-driver"
 
 
-def test_attempts_of_a_killed_driver_are_closed_once(tmp_path: Path) -> None:
+def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=())
-    run.start_attempt("lost-one", 0)
-    run.start_attempt("won-one", 1)
+    for attempt, shard in (("lost-one", 0), ("won-one", 1), ("orphan", 2)):
+        run.start_attempt(attempt, shard)
+    run.commit(write(run, 0, "by-the-next-driver"))
     run.commit(write(run, 1, "won-one"))
+    # Nobody knows yet whether the orphan will reach its commit.
     assert close_lost_attempts(run) == 2 and close_lost_attempts(run) == 0
-    assert {e.attempt: e.outcome for e in run.ledger()} == {"lost-one": "lost", "won-one": "committed"}
-    assert run.missing() == [0, 2, 3, 4]
+    assert [start.attempt for start in run.unfinished_attempts()] == ["orphan"]
+    run.commit(write(run, 2, "orphan"))
+    assert close_lost_attempts(run) == 1
+    ended = {e.attempt: e for e in run.ledger()}
+    assert {name: e.outcome for name, e in ended.items()} == {
+        "lost-one": "lost", "won-one": "committed", "orphan": "committed",
+    }  # fmt: skip
+    assert ended["orphan"].cost == run.commit_of(2).cost and ended["lost-one"].cost is None
 
 
 def test_the_second_interrupt_breaks_into_the_running_shard(tmp_path: Path) -> None:

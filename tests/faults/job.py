@@ -49,7 +49,7 @@ def main() -> int:
     """Run the missing shards; print the summary as JSON."""
     place, seconds = sys.argv[1], float(sys.argv[2])
     run, settings = Run.open(place), RaySettings(workers=2)
-    closed, missing = close_lost_attempts(run), run.missing()
+    missing = run.missing()
     with (
         tempfile.TemporaryDirectory() as notes,
         ray_cluster(settings) as ray,
@@ -62,7 +62,7 @@ def main() -> int:
 
         executor = RayExecutor(make_rows, settings, ray)
         summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
-    said = {"end": summary.end, "closed": closed, "outcomes": summary.tally.outcomes}
+    said = {"end": summary.end, "closed": close_lost_attempts(run), "outcomes": summary.tally.outcomes}
     print(json.dumps(said))
     return summary.exit_code
 
