@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from schemas.errors import InputError
+from schemas.errors import InputError, choices
+from schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
 
@@ -238,3 +239,10 @@ _SIZES = {
 SCHEMAS: dict[str, RecordSchema] = {
     "heuristic": RecordSchema("heuristic", 1, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
 }
+
+
+def sized_schema(name: str, spec: Specification) -> RecordSchema:
+    """The named schema with the specification's axis lengths. InputError for an unknown name."""
+    if name not in SCHEMAS:
+        raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
+    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)

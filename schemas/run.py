@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from schemas.errors import InputError
-from schemas.fields import RecordSchema
+from schemas.fields import RecordSchema, sized_schema
 from schemas.record_files import different_fields, encode_record, now, read_record
 from schemas.run_records import (
     FORMAT_VERSION,
@@ -25,7 +25,6 @@ from schemas.run_records import (
     Plan,
     QuarantineRecord,
 )
-from schemas.shard_files import sized_schema
 from schemas.storage import Storage, open_storage
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")

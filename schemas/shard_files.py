@@ -23,9 +23,8 @@ from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from schemas.errors import InputError
-from schemas.fields import REDRAW_CAUSES, SCHEMAS, Field, RecordSchema, Table
+from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
 from schemas.run_records import Layout
-from schemas.specification import Specification
 
 Array = npt.NDArray[Any]
 
@@ -33,23 +32,6 @@ ZSTD_LEVEL = 3
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
 MAX_TEXT_BYTES = 4096  # one name; a longer one is not a name
 TABLES: tuple[Table, Table] = ("scene", "sample")
-
-
-def schema_for(spec: Specification) -> RecordSchema:
-    """The record schema of a specification's label source, with the specification's axis lengths."""
-    return sized_schema(spec.label_source, spec)
-
-
-def sized_schema(name: str, spec: Specification) -> RecordSchema:
-    """The named schema with the specification's axis lengths. InputError for an unknown name."""
-    if name not in SCHEMAS:
-        raise InputError(
-            "specification",
-            "label_source",
-            f"no record schema called {name!r}",
-            "Choose one of: " + ", ".join(sorted(SCHEMAS)),
-        )
-    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)
 
 
 def rows_per_shard(layout: Layout, table: Table) -> int:

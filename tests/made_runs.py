@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from schemas.fields import Field, RecordSchema
+from schemas.fields import Field, RecordSchema, sized_schema
 from schemas.record_files import now
 from schemas.run import Run
 from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, Manifest
-from schemas.shard_files import encode_shard, schema_for
+from schemas.shard_files import encode_shard
 from schemas.specification import ObservationParams, SceneParams, Source, Specification
 from schemas.storage import open_storage
 
@@ -31,7 +31,7 @@ def small_spec(seed: int = 0, n_points: int = 64, **changes: Any) -> Specificati
 
 
 def manifest_of(spec: Specification, layout: Layout) -> Manifest:
-    schema = schema_for(spec)
+    schema = sized_schema("heuristic", spec)
     return Manifest(
         spec=spec,
         spec_hash=spec.hash(),

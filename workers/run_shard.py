@@ -19,7 +19,7 @@ import numpy as np
 
 from schemas.cost import StageClock
 from schemas.errors import InputError, choices
-from schemas.fields import REDRAW_CAUSES, SCHEMAS, RecordSchema
+from schemas.fields import REDRAW_CAUSES, sized_schema
 from schemas.identity import Stream, generator, sample_ids
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates, draw_candidates
@@ -49,7 +49,8 @@ def run_shard(spec: Specification, world: World, scene_indices: Sequence[int]) -
 
     The same specification and index give the same bytes, whatever else is in the shard.
     """
-    source, schema, spec_hash = label_source_of(spec), schema_of(spec), spec.hash()
+    source, spec_hash = label_source_of(spec), spec.hash()
+    schema = sized_schema(source.schema, spec)
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[dict[str, Any]] = []
     sample_blocks: list[Columns] = []
@@ -77,12 +78,6 @@ def label_source_of(spec: Specification) -> LabelSource:
             "specification", "label_source", f"no source {spec.label_source!r}", choices(LABEL_SOURCES)
         )
     return LABEL_SOURCES[spec.label_source]
-
-
-def schema_of(spec: Specification) -> RecordSchema:
-    """The record schema of a specification's store, with its axis lengths."""
-    schema = SCHEMAS[label_source_of(spec).schema]
-    return schema.sized(object=spec.scene.n_clutter + 1, point=spec.observation.n_points)
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

@@ -9,13 +9,13 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from schemas.errors import InputError
-from schemas.fields import SCHEMAS, Field
+from schemas.fields import SCHEMAS, Field, sized_schema
 from schemas.run_records import Layout
-from schemas.shard_files import MAX_CHUNK_BYTES, chunk_rows, encode_shard, group_metadata, schema_for
+from schemas.shard_files import MAX_CHUNK_BYTES, chunk_rows, encode_shard, group_metadata
 from tests.made_runs import small_spec, tables_of
 
 LAYOUT = Layout(scenes_per_shard=3, candidates_per_scene=4)
-SCHEMA = schema_for(small_spec())
+SCHEMA = sized_schema("heuristic", small_spec())
 HASH = "a" * 64
 make_buffer = default_buffer_prototype().buffer.from_bytes
 
