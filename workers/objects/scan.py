@@ -142,7 +142,7 @@ def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:
 
 def _from_cache(path: Path) -> Scan | None:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             cuts = data["part_cuts"]
             size = data["size_m"]
             return Scan(

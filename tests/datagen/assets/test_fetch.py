@@ -1,0 +1,266 @@
+"""Downloads, the cache and the lock, against a server that breaks connections and lies."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datagen.assets.catalogue import CATALOGUE, Asset, select
+from datagen.assets.download import Policy, download
+from datagen.assets.fetch import fetch
+from datagen.assets.lock import read_lock, verify
+from schemas.errors import InputError
+from tests.datagen.assets.flaky_server import Site, serve
+
+BODY = np.random.default_rng(0).bytes(700_000)
+DIGEST = hashlib.sha256(BODY).hexdigest()
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    with serve() as running:
+        running.files["/a.bin"] = BODY
+        yield running
+
+
+def _get(site: Site, target: Path, *, sha256: str | None = DIGEST, size: int | None = None, tries: int = 4,
+         max_bytes: int = 10**6) -> str:  # fmt: skip
+    policy = Policy(tries=tries, pause=lambda seconds: None, timeout_s=5)
+    return download(
+        f"{site.url}/a.bin", target, sha256=sha256, size=size, max_bytes=max_bytes,
+        progress=lambda here, total: None, policy=policy,
+    )  # fmt: skip
+
+
+def test_broken_connections_are_continued_not_repeated(site: Site, tmp_path: Path) -> None:
+    site.cut_after = [100_000, 200_000, 50_000]
+    assert _get(site, tmp_path / "a", sha256=None) == DIGEST
+    assert (tmp_path / "a").read_bytes() == BODY
+    assert [r[1] for r in site.requests] == [None, "bytes=100000-", "bytes=300000-", "bytes=350000-"]
+    assert all(r[2] for r in site.requests[1:]), "a continued download must name the content it continues"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
+
+
+def test_a_later_run_continues_where_an_earlier_one_gave_up(site: Site, tmp_path: Path) -> None:
+    site.cut_after = [100_000]
+    site.statuses = []
+    with pytest.raises(InputError, match="gave up"):
+        _get_with_dead_server_after_first_cut(site, tmp_path)
+    assert not (tmp_path / "a").exists()
+    assert _get(site, tmp_path / "a") == DIGEST
+    assert site.requests[-1][1] == "bytes=100000-"
+
+
+def _get_with_dead_server_after_first_cut(site: Site, tmp_path: Path) -> None:
+    def pause(seconds: float) -> None:
+        site.statuses = [503]
+
+    download(
+        f"{site.url}/a.bin", tmp_path / "a", sha256=DIGEST, size=None, max_bytes=10**6,
+        progress=lambda here, total: None, policy=Policy(tries=2, pause=pause),
+    )  # fmt: skip
+
+
+def test_a_server_without_ranges_starts_over(site: Site, tmp_path: Path) -> None:
+    site.ranges = False
+    site.cut_after = [100_000]
+    assert _get(site, tmp_path / "a") == DIGEST
+    assert (tmp_path / "a").read_bytes() == BODY
+
+
+def test_without_validator_or_digest_nothing_is_continued(site: Site, tmp_path: Path) -> None:
+    site.etag = False
+    site.cut_after = [100_000]
+    assert _get(site, tmp_path / "a", sha256=None) == DIGEST
+    assert [r[1] for r in site.requests] == [None, None]
+
+
+def test_changed_content_is_not_glued_to_the_old_half(site: Site, tmp_path: Path) -> None:
+    site.cut_after = [100_000]
+
+    def pause(seconds: float) -> None:
+        site.files["/a.bin"] = BODY[::-1]
+
+    digest = download(
+        f"{site.url}/a.bin", tmp_path / "a", sha256=None, size=None, max_bytes=10**6,
+        progress=lambda here, total: None, policy=Policy(pause=pause),
+    )  # fmt: skip
+    assert digest == hashlib.sha256(BODY[::-1]).hexdigest()
+
+
+def test_a_spoilt_half_is_found_and_fetched_anew(site: Site, tmp_path: Path) -> None:
+    site.cut_after = [100_000]
+    with pytest.raises(InputError):
+        _get_with_dead_server_after_first_cut(site, tmp_path)
+    (tmp_path / "a.part").write_bytes(bytes(100_000))
+    site.statuses = []
+    assert _get(site, tmp_path / "a") == DIGEST
+    assert (tmp_path / "a").read_bytes() == BODY
+
+
+def test_passing_errors_are_tried_again_with_growing_pauses(site: Site, tmp_path: Path) -> None:
+    site.statuses = [503, 500, 429]
+    pauses: list[float] = []
+    policy = Policy(tries=6, first_pause_s=1.0, longest_pause_s=5.0, pause=pauses.append)
+    download(
+        f"{site.url}/a.bin", tmp_path / "a", sha256=DIGEST, size=None, max_bytes=10**6,
+        progress=lambda here, total: None, policy=policy,
+    )  # fmt: skip
+    assert pauses == [2.0, 4.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    "case", ["wrong digest", "wrong size", "too large", "too large, length hidden", "404"]
+)
+def test_what_is_wrong_is_refused_and_leaves_nothing(site: Site, tmp_path: Path, case: str) -> None:
+    options: dict[str, object] = {}
+    if case == "wrong digest":
+        options["sha256"] = "0" * 64
+    elif case == "wrong size":
+        options["size"] = len(BODY) + 1
+    elif case.startswith("too large"):
+        options["max_bytes"] = 1000
+        site.hide_length = "hidden" in case
+    else:
+        site.files.clear()
+    with pytest.raises(InputError) as caught:
+        _get(site, tmp_path / "a", **options)  # type: ignore[arg-type]
+    assert site.url in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_redirects_leave_http_nowhere_else(site: Site, tmp_path: Path) -> None:
+    site.redirect_to = "file:///etc/hostname"
+    with pytest.raises(InputError, match=r"(?i)redirect"):
+        _get(site, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("url", ["file:///etc/hostname", "ftp://127.0.0.1/a", "a.bin"])
+def test_only_http_addresses(url: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="address"):
+        download(url, tmp_path / "a", sha256=None, size=None, max_bytes=9, progress=lambda here, total: None)
+
+
+@settings(max_examples=25, deadline=None)
+@given(cuts=st.lists(st.integers(0, 60_000), max_size=8), ranges=st.booleans(), etag=st.booleans())
+def test_whatever_breaks_the_bytes_are_right(
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int], ranges: bool, etag: bool
+) -> None:
+    with serve() as site:
+        site.files["/a.bin"], site.cut_after, site.ranges, site.etag = BODY[:60_000], cuts, ranges, etag
+        target = tmp_path_factory.mktemp("d") / "a"
+        _get(site, target, sha256=None, tries=20)
+        assert target.read_bytes() == BODY[:60_000]
+
+
+def _zip(files: dict[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as packed:
+        for name, data in files.items():
+            packed.writestr(name, data)
+    return out.getvalue()
+
+
+def _asset(**changes: object) -> Asset:
+    values: dict[str, object] = {"name": "toy", "file": "toy.zip", "url": "http://127.0.0.1:9/toy.zip"}
+    values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy", "archive": True}
+    return Asset(**(values | changes))  # type: ignore[arg-type]
+
+
+def test_first_use_is_recorded_and_then_held_to(site: Site, tmp_path: Path) -> None:
+    site.files["/toy.zip"] = _zip({"a/b.txt": b"hello", "c.txt": b"there"})
+    quick = Policy(pause=lambda seconds: None)
+    done = fetch(_asset(), tmp_path / "out", cache=tmp_path / "c1", mirror=site.url, policy=quick)
+    assert (done.trust, done.files, done.from_cache) == ("first-use", 2, False)
+    assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"
+    assert verify(tmp_path / "out").good
+    lock = read_lock(tmp_path / "out")
+    assert lock is not None
+    assert {f.path: f.licence for f in lock.files} == {"toy/a/b.txt": "CC0-1.0", "toy/c.txt": "CC0-1.0"}
+
+    site.files["/toy.zip"] = _zip({"a/b.txt": b"changed"})
+    with pytest.raises(InputError, match="not the expected file"):
+        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c2", mirror=site.url, policy=quick)
+    assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"
+
+
+def test_offline_uses_the_cache_alone(site: Site, tmp_path: Path) -> None:
+    site.files["/toy.zip"] = _zip({"a.txt": b"hello"})
+    with pytest.raises(InputError, match="not in the cache"):
+        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", offline=True)
+    fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
+    n_requests = len(site.requests)
+    again = fetch(_asset(), tmp_path / "other", cache=tmp_path / "c", offline=True)
+    assert again.from_cache and len(site.requests) == n_requests
+    (tmp_path / "c/toy.zip").write_bytes(b"spoilt")
+    with pytest.raises(InputError, match="sha256"):
+        fetch(_asset(), tmp_path / "out", cache=tmp_path / "c", offline=True)
+
+
+def test_a_spoilt_cache_is_fetched_again(site: Site, tmp_path: Path) -> None:
+    body = site.files["/toy.zip"] = _zip({"a.txt": b"hello"})
+    asset = _asset(sha256=hashlib.sha256(body).hexdigest(), size=len(body))
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c/toy.zip").write_bytes(b"spoilt")
+    done = fetch(asset, tmp_path / "out", cache=tmp_path / "c", mirror=site.url)
+    assert (done.trust, done.from_cache) == ("published", False)
+    assert (tmp_path / "c/toy.zip").read_bytes() == body
+
+
+def test_the_catalogue_is_whole() -> None:
+    assert len({asset.file for asset in CATALOGUE.values()}) == len(CATALOGUE)
+    for asset in CATALOGUE.values():
+        assert asset.url.startswith("https://")
+        assert asset.licence and asset.about
+        assert asset.sha256 is None or len(bytes.fromhex(asset.sha256)) == 32
+        assert asset.size is None or 0 < asset.size <= asset.max_bytes
+    chosen = [asset.name for asset in select(["procthor-10k/val", "procthor-10k", "ycb"])]
+    assert chosen[0] == "ycb" and len(chosen) == len(set(chosen)) == 5
+    assert len(select(["ycb-scans"])) > 60
+    with pytest.raises(KeyError):
+        select(["yc"])
+
+
+def test_the_command_line(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                          capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    from datagen.cli import run
+
+    asset = CATALOGUE["procthor-10k/asset-sizes"]
+    site.files[f"/{asset.file}"] = b"{}"
+    arguments = ["--out", str(tmp_path / "out"), "--cache", str(tmp_path / "c"), "--mirror", site.url]
+    assert run(["assets", "fetch", asset.name, *arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["fetched"][0]["trust"] == "first-use"
+    assert (tmp_path / "out/procthor/asset-database.json").read_bytes() == b"{}"
+    assert run(["assets", "verify", str(tmp_path / "out")]) == 0
+    assert run(["assets", "list", str(tmp_path / "out")]) == 0
+    assert "Apache-2.0" in capsys.readouterr().out
+    assert run(["assets", "list"]) == 0
+    assert "procthor-10k/train" in capsys.readouterr().out
+
+    (tmp_path / "out/procthor/asset-database.json").write_bytes(b"[]")
+    assert run(["assets", "verify", str(tmp_path / "out"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["changed"] == ["procthor/asset-database.json"]
+    assert run(["assets", "verify", str(tmp_path / "out")]) == 2
+    assert "asset-database.json" in capsys.readouterr().err
+    assert run(["assets", "lock", str(tmp_path / "out")]) == 0
+    assert run(["assets", "verify", str(tmp_path / "out")]) == 0
+    for wrong in (
+        ["fetch"],
+        ["fetch", "nothing"],
+        ["verify", str(tmp_path / "no")],
+        ["lock", str(tmp_path / "no")],
+    ):
+        capsys.readouterr()
+        assert run(["assets", *wrong]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,0 +1,131 @@
+"""The OBJ reader against meshes written from known arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.errors import InputError
+from workers.objects import obj_file
+from workers.objects.obj_file import read_obj
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    """Any mixture of corner styles, polygons, negative indices, groups, comments and block sizes."""
+    path = tmp_path_factory.mktemp("obj") / "mesh.obj"
+    number = st.floats(-1, 1, allow_nan=False).map(lambda x: round(x, 6))
+    vertices = data.draw(st.lists(st.tuples(number, number, number), min_size=3, max_size=12))
+    uv = data.draw(st.lists(st.tuples(number, number), min_size=1, max_size=6))
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"vt {u} {v}" for u, v in uv]
+    lines.insert(data.draw(st.integers(0, len(lines))), "# a comment")
+    expected: list[tuple[int, int, int]] = []
+    expected_uv: list[tuple[int, int, int]] = []
+    groups: list[int] = []
+    for _ in range(data.draw(st.integers(1, 8))):
+        if data.draw(st.booleans()):
+            lines.append("o part")
+            groups.append(len(expected))
+        style = data.draw(st.sampled_from(["v", "v/t", "v//n", "v/t/n"]))
+        count = data.draw(st.integers(3, 5))
+        v = data.draw(st.lists(st.integers(0, len(vertices) - 1), min_size=count, max_size=count))
+        t = data.draw(st.lists(st.integers(0, len(uv) - 1), min_size=count, max_size=count))
+        negative = data.draw(st.booleans())
+        corners: list[str] = []
+        for a, b in zip(v, t, strict=True):
+            va, tb = (a - len(vertices), b - len(uv)) if negative else (a + 1, b + 1)
+            corners.append(style.replace("v", str(va)).replace("t", str(tb)).replace("n", "7"))
+        lines.append(data.draw(st.sampled_from(["f ", "f  ", " f "])) + "  ".join(corners))
+        for k in range(1, count - 1):
+            expected.append((v[0], v[k], v[k + 1]))
+            expected_uv.append((t[0], t[k], t[k + 1]) if "t" in style else (-1, -1, -1))
+    end = data.draw(st.sampled_from(["\n", "\r\n"]))
+    path.write_bytes((end.join(lines) + data.draw(st.sampled_from(["", end]))).encode())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(obj_file, "BLOCK_BYTES", data.draw(st.integers(70, 400)))
+        mesh = read_obj(path)
+    np.testing.assert_array_equal(mesh.faces, expected)
+    np.testing.assert_array_equal(mesh.uv_faces, expected_uv)
+    np.testing.assert_allclose(mesh.vertices, vertices)
+    np.testing.assert_allclose(mesh.uv, uv)
+    assert mesh.group_starts.tolist() == groups
+    assert sum(len(g) for g in mesh.group_faces()) == len(expected)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    text=st.one_of(
+        st.binary(max_size=200), st.text("vftog 0123456789/-.nane\t\n\\", max_size=200).map(str.encode)
+    )
+)
+def test_any_bytes_are_read_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, text: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("obj") / "mesh.obj"
+    path.write_bytes(b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + text)
+    try:
+        mesh = read_obj(path)
+    except InputError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
+        assert np.isfinite(mesh.vertices).all()
+
+
+HEAD = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
+BAD = {
+    "empty": ("", "no faces"),
+    "no faces": (HEAD, "no faces"),
+    "NaN": ("v 0 nan 0\nf 1 1 1\n", "line 1"),
+    "infinite": (HEAD + "v 0 0 1e999\nf 1 2 3\n", "line 5"),
+    "words for numbers": (HEAD + "v a b c\nf 1 2 3\n", "line 5"),
+    "two numbers": (HEAD + "v 1 2\nf 1 2 3\n", "line 5"),
+    "two corners": (HEAD + "f 1 2\n", "line 5"),
+    "index 0": (HEAD + "f 0 1 2\n", "line 5"),
+    "index too large": (HEAD + "f 1 2 3\nf 1 2 4\n", "face 2"),
+    "negative too far": (HEAD + "f -1 -2 -4\n", "line 5"),
+    "texture index too large": (HEAD + "f 1/1 2/1 3/2\n", "face 1"),
+    "texture index 0": (HEAD + "f 1/0 2/1 3/1\n", "line 5"),
+    "mixed corners": (HEAD + "f 1/1 2 3/1\n", "line 5"),
+    "split corners": (HEAD + "f 1/1 /2 3/1 1\n", "line 5"),
+    "fractions": (HEAD + "f 1.5 2 3\n", "line 5"),
+    "huge index": (HEAD + "f 1 2 99999999999999999999999\n", "line 5"),
+    "texture NaN": (HEAD + "vt nan 0\nf 1/1 2/1 3/1\n", "line 5"),
+    "binary": ("\x00\x01\x02" * 50, "no faces"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_meshes_name_the_line(case: str, tmp_path: Path) -> None:
+    text, where = BAD[case]
+    path = tmp_path / "mesh.obj"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_obj(path)
+    assert where in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_limits_stop_the_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "mesh.obj"
+    path.write_text(HEAD + "f 1 2 3\n" * 1000)
+    monkeypatch.setattr(obj_file, "BLOCK_BYTES", 100)
+    assert len(read_obj(path).faces) == 1000
+    monkeypatch.setattr(obj_file, "MAX_FACES", 999)
+    with pytest.raises(InputError, match="more than 999 faces"):
+        read_obj(path)
+    monkeypatch.setattr(obj_file, "MAX_FILE_BYTES", 1000)
+    with pytest.raises(InputError, match="bytes"):
+        read_obj(path)
+    path.write_text("x" * 300)
+    with pytest.raises(InputError, match="too long"):
+        read_obj(path)
+    monkeypatch.undo()
+    for missing in (tmp_path / "none.obj", tmp_path):
+        with pytest.raises(InputError, match="cannot be read"):
+            read_obj(missing)
