@@ -15,15 +15,15 @@ from PIL import Image
 from schemas.errors import InputError
 from workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
 from workers.geometry.transforms import inverse, look_at, quaternion_wxyz
+from workers.rendering.face_texture import face_normals, face_texture
 from workers.rendering.frame import I16, Camera, Frame, Stage
 
 # Depth range; what is nearer or farther is not drawn.
 _NEAR_M, _FAR_M = 0.02, 60.0
 # Bullet silently drops what exceeds 131,072 vertices of one mesh.
 _MAX_FACES = 40_000
-_PALETTE_WIDTH = 256
 _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
-_AMBIENT, _DIFFUSE = 0.55, 0.45
+_AMBIENT, _DIFFUSE = 0.7, 0.3
 
 
 def render_pybullet(stage: Stage, camera: Camera) -> Frame:
@@ -105,14 +105,13 @@ class _Drawing:
 
     def add(self, mesh: Mesh, T_world_mesh: F64, label: int) -> None:
         """Draw a mesh at a pose (4, 4); its pixels report `label`."""
-        uv, image = _texture_of(mesh)
+        uv, image = face_texture(mesh)
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
             file = Path(folder) / "texture.png"
             Image.fromarray(image).save(file)
             texture = pybullet.loadTexture(str(file), physicsClientId=self._world)
         corners = mesh.vertices_m[mesh.faces]  # (F, 3, 3)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        normals = face_normals(corners)
         w, x, y, z = quaternion_wxyz(T_world_mesh[:3, :3]).tolist()
         for start in range(0, len(mesh.faces), _MAX_FACES):
             chunk = slice(start, start + _MAX_FACES)
@@ -193,21 +192,3 @@ def _projection_matrix(camera: Camera) -> list[float]:
     P[3, 2] = -1.0
     columns: list[float] = P.T.ravel().tolist()
     return columns
-
-
-def _texture_of(mesh: Mesh) -> tuple[F32, U8]:
-    """Texture coordinates (F, 3, 2) of the faces' corners and the image (H, W, 3) they point into.
-
-    TinyRenderer has one colour for a mesh. Flat face colours become texels of a palette, all three
-    corners of a face in the middle of the same one.
-    """
-    if mesh.texture is not None:
-        return mesh.texture.uv[mesh.faces], mesh.texture.image
-    colours, index = np.unique(mesh.face_rgb, axis=0, return_inverse=True)
-    height = -(-len(colours) // _PALETTE_WIDTH)
-    image = np.zeros((height * _PALETTE_WIDTH, 3), np.uint8)
-    image[: len(colours)] = colours
-    row, column = np.divmod(index.ravel(), _PALETTE_WIDTH)
-    # v runs upward from the image's last row.
-    uv = np.stack([(column + 0.5) / _PALETTE_WIDTH, 1 - (row + 0.5) / height], axis=1).astype(np.float32)
-    return np.repeat(uv[:, None], 3, axis=1), image.reshape(height, _PALETTE_WIDTH, 3)
