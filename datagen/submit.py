@@ -145,11 +145,11 @@ def manifest_of(spec: Specification, n: int, sources: dict[str, str]) -> Manifes
 
 def run_job(run: Run, settings: JobSettings) -> JobSummary:
     """Make every missing shard of the run, here or on a Ray cluster."""
-    close_lost_attempts(run)
     missing = run.missing()
     layout, spec = run.layout, run.manifest.spec
     done = len(run.planned()) - len(missing)
     if not missing:
+        close_lost_attempts(run)
         return JobSummary("complete", "", Tally(0), 0.0)
     stop = StopRequest()
     with ExitStack() as stack:
@@ -175,7 +175,10 @@ def run_job(run: Run, settings: JobSettings) -> JobSummary:
         display = stack.enter_context(
             progress(layout.samples_per_shard, len(missing), done, True if settings.json else None)
         )
-        return drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
+        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
+    # What a killed driver left open is closed last: its workers may outlive it and still commit.
+    close_lost_attempts(run)
+    return summary
 
 
 def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[ShardTask]:
