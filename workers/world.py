@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -23,11 +24,19 @@ _HOUSES_KEPT = 16
 
 @dataclass(frozen=True, eq=False)
 class PreparedHouse:
-    """A house with what is derived from it once."""
+    """A house with what is derived from it once, when first asked: many a try ends before."""
 
     house: House
-    rays: RayMesh
-    obstacles: Obstacles
+
+    @cached_property
+    def rays(self) -> RayMesh:
+        """The hierarchy over the whole house."""
+        return house_rays(self.house)
+
+    @cached_property
+    def obstacles(self) -> Obstacles:
+        """The floor plan that bases must keep clear of."""
+        return obstacles_of(self.house)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +64,7 @@ class World:
         if house_id in self._houses:
             self._houses.move_to_end(house_id)
             return self._houses[house_id]
-        house = self.houses.load(house_id)
-        prepared = PreparedHouse(house, house_rays(house), obstacles_of(house))
+        prepared = PreparedHouse(self.houses.load(house_id))
         self._houses[house_id] = prepared
         if len(self._houses) > _HOUSES_KEPT:
             self._houses.popitem(last=False)

@@ -12,8 +12,8 @@ from workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.
 _SKIN_M = 5e-4
-# Rays in flight at once; bounds memory at about 100 MB.
-_MAX_RAYS = 1 << 18
+# Rays in flight at once; bounds memory at about 50 MB. Twice as many no longer fit the cache.
+_MAX_RAYS = 1 << 17
 
 I32 = npt.NDArray[np.int32]
 
@@ -71,13 +71,17 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
 
 def _directions(axes: F64, eye: npt.NDArray[np.int64], x: F32, y: F32) -> F32:
     """Rays (R, 3) at depth 1 through x, y (R,) of the cameras `eye` (R,); `axes` (n, 3, 3) are columns."""
-    right, down, forward = (np.ascontiguousarray(axes[:, :, k], np.float32) for k in range(3))
-    directions = right[eye]
-    directions *= x[:, None]
-    across = down[eye]
-    across *= y[:, None]
-    directions += across
-    directions += forward[eye]
+    axes32 = axes.astype(np.float32)
+    directions = np.empty((len(eye), 3), np.float32)
+    for row in range(3):  # gathering single numbers is several times faster than gathering triples
+        right, down, forward = axes32[:, row].T
+        component = right.take(eye)
+        component *= x
+        across = down.take(eye)
+        across *= y
+        component += across
+        component += forward.take(eye)
+        directions[:, row] = component
     return directions
 
 

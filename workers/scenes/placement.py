@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from schemas.specification import SceneParams
 from workers.geometry.mesh import F32, F64
@@ -67,6 +68,8 @@ def drop_poses(
     """
     half = np.array(surface.size_m) / 2 - params.edge_margin_m
     placed: list[F64] = [np.asarray(p) for p in taken]
+    low = np.array([p.min(0) for p in placed]).reshape(-1, 2)
+    high = np.array([p.max(0) for p in placed]).reshape(-1, 2)
     poses = np.empty((len(models), 4, 4))
     target_xy = np.zeros(2)
     for k, model in enumerate(models):
@@ -82,13 +85,14 @@ def drop_poses(
                 xy = rng.uniform(-half, half)
             outline = _outline(model, xy, yaw)
             on_surface = (np.abs(outline) <= half).all()
-            if on_surface and not any(_overlap(outline, other) for other in placed):
+            if on_surface and not any(_overlap(outline, placed[i]) for i in _boxes_meet(outline, low, high)):
                 break
         else:
             raise Redraw("no_placement")
         if k == 0:
             target_xy = xy
         placed.append(outline)
+        low, high = np.vstack([low, outline.min(0)]), np.vstack([high, outline.max(0)])
         height_m = model.size_m[2] / 2 + params.drop_height_m
         poses[k] = surface.T_world_surface @ yaw_pose(xy[0], xy[1], height_m, yaw)
     return poses
@@ -102,10 +106,13 @@ def _outline(model: ObjectModel, xy: F64, yaw: float) -> F64:
     return corners @ np.array([[c, s], [-s, c]]) + xy
 
 
+def _boxes_meet(outline: F64, low: F64, high: F64) -> npt.NDArray[np.intp]:
+    """Rows of the bounding boxes from `low` to `high`, each (P, 2), that meet the outline's own."""
+    return np.flatnonzero(((outline.max(0) >= low) & (outline.min(0) <= high)).all(1))
+
+
 def _overlap(a: F64, b: F64) -> bool:
     """Whether two convex polygons (K, 2) overlap, by the separating axis theorem."""
-    if (a.max(0) < b.min(0)).any() or (b.max(0) < a.min(0)).any():
-        return False
     for polygon in (a, b):
         edges = np.roll(polygon, -1, axis=0) - polygon
         normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
