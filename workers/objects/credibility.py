@@ -28,8 +28,11 @@ _AIRPLANE = "one mass, 0.114 kg, is given to five different parts of the toy (57
 _DUPLO = "one mass, 0.0372 kg, is given to six different bricks (460 to 1510 kg/m3; ABS has 1050)"
 
 EXCLUDED: dict[str, Exclusion] = {
+    "022_windex_bottle": Exclusion(
+        "the scan lost the transparent neck: the trigger floats 16 mm above the bottle", False
+    ),
     "028_skillet_lid": Exclusion(
-        "0.652 kg over the mesh's volume is 4170 kg/m3, where the lid is glass (2500 kg/m3)", False
+        "the scan lost the glass: knob and rim are apart, and 0.652 kg would be 4170 kg/m3", False
     ),
     "059_chain": Exclusion("a chain of loose links, which one rigid body cannot stand for", False),
     "063-a_marbles": Exclusion("the mesh is a cluster of loose marbles", False),
@@ -40,6 +43,7 @@ EXCLUDED: dict[str, Exclusion] = {
     ),
     **{f"072-{part}_toy_airplane": Exclusion(_AIRPLANE, True) for part in "abcde"},
     **{f"073-{part}_lego_duplo": Exclusion(_DUPLO, True) for part in "abcdef"},
+    "073-g_lego_duplo": Exclusion("a toy car with a bell on a loose cord, which is no rigid body", False),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ I64 = npt.NDArray[np.int64]
 MAX_FILE_BYTES = 512 * 2**20
 MAX_FACES = 2_000_000
 MAX_VERTICES = 4_000_000
-BLOCK_BYTES = 4 * 2**20
+BLOCK_BYTES = 2**20
 _INTEGER = re.compile(rb"-?\d+")
 _SPACES = re.compile(rb"[ \t]+")
 _CORNERS = re.compile(rb"(?:0 )*0|(?:0/0 )*0/0|(?:0//0 )*0//0|(?:0/0/0 )*0/0/0")
@@ -63,6 +64,7 @@ def read_obj(path: Path) -> ObjMesh:
     of the arrays. Raises InputError naming the file and the line or the index at fault: missing
     or oversized file, no faces, too many faces, unreadable numbers, NaN, index out of range.
     """
+    _refuse_at_a_glance(path)
     grown = _Growing([], [], [], [], {b"o": [], b"g": []})
     for first_line, lines in _blocks(path):
         _read_block(path, first_line, lines, grown)
@@ -127,6 +129,16 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
         raise InputError(
             path, "", f"cannot be read: {error.strerror or error}", "Check the path and its rights"
         ) from error
+
+
+def _refuse_at_a_glance(path: Path) -> None:
+    """Counts lines that begin a face, hundreds of times faster than reading them."""
+    count = 0
+    with suppress(OSError), path.open("rb") as file:  # what cannot be read is reported by `_blocks`
+        while count <= MAX_FACES and (block := file.read(BLOCK_BYTES)):
+            count += block.count(b"\nf ")
+    if count > MAX_FACES:
+        raise InputError(path, "", f"the mesh has more than {MAX_FACES:,} faces", "Simplify the mesh")
 
 
 def _read_block(path: Path, first_line: int, lines: list[bytes], grown: _Growing) -> None:

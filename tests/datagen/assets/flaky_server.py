@@ -68,7 +68,7 @@ def serve() -> Generator[Site]:
             self.wfile.write(rest[: site.cut_after.pop(0)] if site.cut_after else rest)
             self.close_connection = True
 
-        def log_message(self, *args: Any) -> None:
+        def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - as in the base class
             """Keeps the test output quiet."""
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)

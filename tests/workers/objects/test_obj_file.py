@@ -119,6 +119,11 @@ def test_limits_stop_the_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(obj_file, "MAX_FACES", 999)
     with pytest.raises(InputError, match="more than 999 faces"):
         read_obj(path)
+    # Polygons are more faces than lines: the first glance lets them pass, the reading does not.
+    fans = tmp_path / "fans.obj"
+    fans.write_text(HEAD + "f 1 2 3 1 2 3\n" * 300)
+    with pytest.raises(InputError, match="more than 999 faces"):
+        read_obj(fans)
     monkeypatch.setattr(obj_file, "MAX_FILE_BYTES", 1000)
     with pytest.raises(InputError, match="bytes"):
         read_obj(path)
