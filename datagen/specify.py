@@ -15,8 +15,8 @@ from schemas.specification import Source, Specification
 from workers.houses.house import HouseSource
 from workers.labels import LABEL_SOURCES
 from workers.objects.model import ObjectSource
-from workers.rendering import RENDERERS
-from workers.settling import SETTLERS
+from workers.rendering import RENDERERS, load_renderer
+from workers.settling import SETTLERS, first_settler, load_settler
 
 _MAX_CONFIG_BYTES = 1 << 20
 # Distributions whose version can move bits of a sample, by the engine that needs them.
@@ -35,7 +35,7 @@ def specify(
     """The specification that the options (dotted names, None where not given) and the file ask for.
 
     An option wins over the file, the file over the default. Raises InputError naming the option or
-    the file and the field.
+    the file and the field, or an engine that cannot be imported here.
     """
     fields = _read_config(config) if config else {}
     for reserved in ("label_source", "houses", "objects", "engines"):
@@ -46,6 +46,10 @@ def specify(
     for name, value in options.items():
         if value is not None:
             _put(fields, name, value, config)
+    settle = fields.setdefault("settle", {})
+    if isinstance(settle, dict):
+        # SAPIEN where its libraries are, else what works here; the choice is recorded.
+        settle.setdefault("engine", first_settler())
     fields |= {
         "label_source": label_source,
         "houses": Source(kind=houses.kind, digest=houses.digest),
@@ -70,6 +74,8 @@ def specify(
     ):
         if name not in registry:
             raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
+    load_settler(spec.settle.engine)
+    load_renderer(spec.observation.renderer)
     return spec.model_copy(update={"engines": _engines(spec)})
 
 

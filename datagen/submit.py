@@ -47,6 +47,7 @@ _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstor
 
 def submit(
     label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic.")],
+    /,
     *,
     n: Annotated[int, Parameter(help="Labels wanted; a larger number later extends the run.")],
     out: Annotated[str, Parameter(help="The run's folder.")],
@@ -63,11 +64,13 @@ def submit(
         Parameter(help="Houses to use, disjoint by split [all]."),
     ] = None,
     seed: Annotated[int | None, Parameter(help="Seed of the whole run [0].")] = None,
-    settler: Annotated[str | None, Parameter(help="Physics that settles scenes: sapien, pybullet.")] = None,
-    renderer: Annotated[
-        str | None, Parameter(help="Renderer of the RGB-D frame: embree, sapien, pybullet.")
+    settler: Annotated[
+        str | None, Parameter(help="Physics: sapien, or pybullet [sapien, or what can be imported].")
     ] = None,
-    noise: Annotated[bool, Parameter(help="Add the sensor noise model to the frame.")] = False,
+    renderer: Annotated[
+        str | None, Parameter(help="Renderer of the RGB-D frame: embree, sapien or pybullet [embree].")
+    ] = None,
+    noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
     workers: Annotated[
         int | None, Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers.")
@@ -193,8 +196,9 @@ def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[
 def finish(run: Run, summary: JobSummary, out: str) -> int:
     """Seal what there is, say how it went and how to go on; return the exit code."""
     tally = summary.tally
+    made = f"{tally.labels:,} new, {run.n:,} wanted"
     rows = [
-        ("labels", f"{tally.labels:,} new, {run.n:,} wanted"),
+        ("labels", made if tally.shards else f"nothing to do: all {run.n:,} labels are there"),
         ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
         ("time", f"{seconds(summary.elapsed_s)}" + _rate(summary)),
         ("retries", str(tally.retries)),

@@ -99,8 +99,8 @@ def _points(camera: Camera, pixels: npt.NDArray[np.int64], depth_m: F32, centre_
     """Back-projection: points (N, 3) in world axes relative to the target."""
     T = camera.T_world_camera
     local = pixel_directions(camera, pixels) * depth_m[:, None]
-    points: F32 = local @ T[:3, :3].T.astype(np.float32) + (T[:3, 3] - centre_m).astype(np.float32)
-    return points
+    points = local @ T[:3, :3].T.astype(np.float32) + (T[:3, 3] - centre_m).astype(np.float32)
+    return points.astype(np.float32, copy=False)
 
 
 def farthest_points(points_m: F32, count: int) -> npt.NDArray[np.int64]:

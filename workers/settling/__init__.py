@@ -28,3 +28,14 @@ def load_settler(name: str) -> Settler:
         mend = "Run `datagen doctor`, or take another one with --settler"
         raise InputError("--settler", name, f"cannot be imported here: {error}", mend) from error
     return settler
+
+
+def first_settler() -> str:
+    """The first settler of the registry that can be imported here."""
+    for name, target in SETTLERS.items():
+        try:
+            import_module(target.split(":")[0])
+        except ImportError:
+            continue
+        return name
+    raise InputError("settlers", "", "none can be imported here", "Run `datagen doctor`")
