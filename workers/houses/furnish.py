@@ -115,18 +115,15 @@ class Furnisher:
         if self.rng.random() < 0.7:
             self.at_wall("HousePlant", is_tall=True)
         if self.layout.room.room_type != "Kitchen" and self.rng.random() < 0.7:
-            self.at_wall("FloorLamp")
+            self.at_wall("FloorLamp", is_tall=True)
 
     def _hang_picture(self) -> None:
         picture = self.one_of("Painting")
         base_m = float(self.rng.uniform(1.45, 1.6))
         for spot in self.layout.wall_spots(picture, self.rng):
-            zones = [*self.layout.door_zones, *self.layout.windows]
-            x0, y0, x1, y1 = spot.rects[0]
-            if all(x1 < z[0] or z[2] < x0 or y1 < z[1] or z[3] < y0 for z in zones):
+            if self.layout.is_wall_free(spot) and not self.layout.is_behind_tall(spot):
                 self.add(spot, base_m)
-                # Nothing tall is to stand in front of it.
-                self.layout.windows.append(spot.rects[0])
+                self.layout.windows.append(spot.rects[0])  # nothing tall is to stand in front of it
                 return
 
 
@@ -182,14 +179,16 @@ def _equip(f: Furnisher, run: tuple[Spot, dict[str, Any]]) -> None:
             f.put_on(run, asset, right, front)
             taken.append((right, front, radius))
     f.clutter(run, 8, taken)
+    cupboards: list[Spot] = []
     for k in range(int((back.x[1] - back.x[0]) // 0.62)):
         asset = BUILTIN_ASSETS["WallCabinet_1"]
         xy = spot.local(back.x[0] + 0.31 + 0.62 * k, -depth / 2 + asset.size_m[1] / 2)
         hung = spot_at(asset, *xy, spot.yaw_deg)
-        x0, y0, x1, y1 = hung.rects[0]
-        free = all(x1 < z[0] or z[2] < x0 or y1 < z[1] or z[3] < y0 for z in f.layout.windows)
-        if free and COUNTER_HEIGHT_M + 0.5 + asset.size_m[2] < WALL_HEIGHT_M:
-            f.add(hung, COUNTER_HEIGHT_M + 0.5)
+        if f.layout.is_wall_free(hung) and COUNTER_HEIGHT_M + 0.5 + asset.size_m[2] < WALL_HEIGHT_M:
+            cupboards.append(hung)
+    for hung in cupboards:
+        f.add(hung, COUNTER_HEIGHT_M + 0.5)
+        f.layout.windows.append(hung.rects[0])  # nothing tall is to stand there
 
 
 def dining(f: Furnisher, keeps_fronts_free: bool = False) -> bool:

@@ -21,11 +21,9 @@ def _halves(asset: Asset) -> tuple[float, float, float]:
 
 def _legs(x: float, y: float, z: tuple[float, float], side: float, rgb: Rgb) -> list[Solid]:
     """Four square legs whose outer faces are at +-x and +-y."""
-    return [
-        box((sx * x - side, sx * x) if sx > 0 else (-x, -x + side),
-            (sy * y - side, sy * y) if sy > 0 else (-y, -y + side), z, rgb)
-        for sx in (-1, 1) for sy in (-1, 1)
-    ]  # fmt: skip
+    across = ((-x, side - x), (x - side, x))
+    along = ((-y, side - y), (y - side, y))
+    return [box(i, j, z, rgb) for i in across for j in along]
 
 
 def table(asset: Asset, rgb: Rgb) -> list[Solid]:
@@ -267,15 +265,10 @@ def bed(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
     pillows = 2 if x > 0.6 else 1
     room = min(0.11, height - top) if height - top > 0.04 else 0.11
+    deep = min(0.19, 0.2 * y)
     for k in range(pillows):
-        centre = (k - (pillows - 1) / 2) * 0.9 * x
-        solids.append(
-            ball(
-                (centre, -y + head + 0.22, top + room / 2),
-                (min(0.33, 0.42 * x), 0.19, room / 2),
-                _CUSHION_PILLOW,
-            )
-        )
+        centre = ((k - (pillows - 1) / 2) * 0.9 * x, -y + head + deep + 0.03, top + room / 2)
+        solids.append(ball(centre, (min(0.33, 0.42 * x), deep, room / 2), _CUSHION_PILLOW))
     return solids
 
 
@@ -314,7 +307,7 @@ def sink(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A basin with a rim, on a pedestal where it stands on the floor."""
     x, y, height = _halves(asset)
     rim = min(height, 0.86) if height > 0.5 else height
-    deep = min(0.16, 0.6 * rim)
+    deep = min(0.16, rim) if rim < 0.3 else 0.16
     wall = min(0.06, 0.2 * min(x, y))
     z = (rim - deep, rim)
     solids = [

@@ -51,17 +51,16 @@ def _check_header(path: Path) -> None:
         size = path.stat().st_size
         with path.open("rb") as stream:
             head = stream.read(20)
-            if size > MAX_FILE_BYTES:
-                raise InputError(path, "", f"more than {MAX_FILE_BYTES >> 20} MiB", _MEND)
-            if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
-                raise InputError(path, "", "not a binary glTF file", _MEND)
-            length = int.from_bytes(head[12:16], "little")
-            if length > size:
-                raise InputError(path, "", "the file ends too early", _MEND)
-            document = json.loads(stream.read(length))
-            counts = [int(a["count"]) for a in document.get("accessors", [])]
+            length = min(int.from_bytes(head[12:16], "little"), size)
+            text = stream.read(length) if size <= MAX_FILE_BYTES else b""
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror})", _MEND) from None
+    if size > MAX_FILE_BYTES:
+        raise InputError(path, "", f"more than {MAX_FILE_BYTES >> 20} MiB", _MEND)
+    if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
+        raise InputError(path, "", "not a binary glTF file", _MEND)
+    try:
+        counts = [int(a["count"]) for a in json.loads(text).get("accessors", [])]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(path, "", "its description is not valid glTF", _MEND) from None
     if counts and (max(counts) > _MAX_COUNT or min(counts) < 0 or sum(counts) > 4 * _MAX_COUNT):
@@ -94,7 +93,7 @@ def _merged(pieces: list[Any]) -> Mesh:
 def _face_rgb(piece: Any) -> U8:
     """One colour a face: its vertex colours, the texture at its middle, or the material's factor."""
     count = len(piece.faces)
-    visual = cast(Any, piece.visual)
+    visual = piece.visual
     if visual.kind == "vertex" or visual.kind == "face":
         return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
     material = getattr(visual, "material", None)

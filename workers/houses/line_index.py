@@ -17,6 +17,7 @@ import mmap
 import os
 import re
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -196,7 +197,7 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
     """None where the cache lacks the file, or holds something that does not fit together."""
     data_path, index_path = _names(cache, digest)
     try:
-        with np.load(index_path, allow_pickle=False) as stored:
+        with index_path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in ("spans", "digests", "ids", "numbers", "size")}
         size = int(arrays["size"][0])
         if data_path.stat().st_size != size:
@@ -204,7 +205,7 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
         with data_path.open("rb") as stream:
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         return _index(path, data, arrays)
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zlib.error):
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zlib.error, zipfile.BadZipFile):
         return None  # absent or damaged: it is built anew
 
 

@@ -20,6 +20,7 @@ _CELL_M = 0.1
 _BODY_RADIUS_M = 0.28
 _DOOR_ZONE_M = 0.9
 _GAP_M = 0.03
+_CHEST_M = 1.3
 
 # Unity yaw by wall side: south, west, north, east; furniture looks into the room.
 _YAW_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -65,6 +66,7 @@ class RoomLayout:
     windows: list[Rect]
     solid: list[Rect] = field(default_factory=list)
     kept: list[Rect] = field(default_factory=list)
+    tall: list[Rect] = field(default_factory=list)
 
     def fits(self, spot: Spot, ignore_kept: bool = False, is_tall: bool = False) -> bool:
         """Whether the spot is free and the doors of the room stay joined by a path."""
@@ -77,9 +79,19 @@ class RoomLayout:
                 return False
         return self._is_joined_with(spot.rects)
 
+    def is_wall_free(self, spot: Spot) -> bool:
+        """Whether something may hang there: no door, window or other hanging thing."""
+        return not any(_overlap(spot.rects[0], z, 0.0) for z in [*self.door_zones, *self.windows])
+
+    def is_behind_tall(self, spot: Spot) -> bool:
+        """Whether something taller than a person's chest stands there."""
+        return any(_overlap(spot.rects[0], r, 0.0) for r in self.tall)
+
     def take(self, spot: Spot, front_m: float = 0.0) -> None:
         """Fill the spot and keep a zone of that depth in front of it free."""
         self.solid.extend(spot.rects)
+        if spot.asset.size_m[2] > _CHEST_M:
+            self.tall.extend(spot.rects)
         if front_m > 0:
             self.kept.extend(_front_zone(r, spot.yaw_deg, front_m) for r in spot.rects[:1])
 

@@ -59,8 +59,10 @@ def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], 
 
 @lru_cache(maxsize=64)
 def _circle(sides: int) -> F64:
+    """A regular polygon (sides, 2), stretched so that its bounding box is exactly [-1, 1]."""
     angle = (np.arange(sides) + 0.5) * (2 * np.pi / sides)
-    return np.stack([np.cos(angle), np.sin(angle)], 1)
+    corners = np.stack([np.cos(angle), np.sin(angle)], 1)
+    return corners / np.abs(corners).max(0)
 
 
 def frustum(
@@ -72,7 +74,7 @@ def frustum(
     sides: int = 10,
 ) -> Solid:
     """A (tapered, elliptic) column from the radii (x, y) at its bottom to those at its top."""
-    circle = _circle(sides) / np.cos(np.pi / sides) * 0.985  # about the area of the round one
+    circle = _circle(sides)
     low = np.column_stack([circle * bottom_m + centre_m, np.full(sides, z[0])])
     high = np.column_stack([circle * top_m + centre_m, np.full(sides, z[1])])
     return prism(low, high, rgb)

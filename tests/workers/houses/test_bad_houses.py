@@ -1,0 +1,255 @@
+"""Hostile and broken input: one line that names file, house and field, and never a traceback."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.errors import InputError
+from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
+from workers.houses import line_index, open_houses
+from workers.houses.asset_table import Asset
+from workers.houses.loader import build_house
+from workers.houses.reading import Node
+
+NAN, INFINITY = float("nan"), float("inf")
+
+
+def put(*path: Any, value: Any) -> Callable[[dict], None]:
+    """A change of the document at a path."""
+
+    def change(document: dict) -> None:
+        for key in path[:-1]:
+            document = document[key]
+        document[path[-1]] = value
+
+    return change
+
+
+def drop(*path: Any) -> Callable[[dict], None]:
+    def change(document: dict) -> None:
+        for key in path[:-1]:
+            document = document[key]
+        del document[path[-1]]
+
+    return change
+
+
+def deep(levels: int) -> Any:
+    return json.loads("[" * levels + "]" * levels)
+
+
+BOW_TIE = [xyz(0, 0, 0), xyz(4, 0, 3), xyz(4, 0, 0), xyz(0, 0, 3)]
+LINE = [xyz(0, 0, 0), xyz(1, 0, 0), xyz(2, 0, 0)]
+
+# (what is changed, what the message must name)
+BROKEN: dict[str, tuple[Callable[[dict], None], str]] = {
+    "no rooms": (put("rooms", value=[]), "$.rooms: a house without rooms"),
+    "rooms missing": (drop("rooms"), "'rooms' is missing"),
+    "rooms null": (put("rooms", value=None), "$.rooms: null where a list"),
+    "rooms an object": (put("rooms", value={}), "$.rooms: an object where a list"),
+    "too many rooms": (put("rooms", value=[{}] * 300), "$.rooms: 300 entries"),
+    "room a number": (put("rooms", 0, value=3), "$.rooms[0]: a number where an object"),
+    "room id twice": (put("rooms", 1, "id", value="room|0"), "$.rooms[1].id"),
+    "room id empty": (put("rooms", 1, "id", value=""), "$.rooms[1].id"),
+    "room type missing": (drop("rooms", 0, "roomType"), "$.rooms[0]: key 'roomType'"),
+    "floor with two corners": (put("rooms", 0, "floorPolygon", value=LINE[:2]), "$.rooms[0].floorPolygon"),
+    "floor on a line": (put("rooms", 0, "floorPolygon", value=LINE), "$.rooms[0].floorPolygon"),
+    "floor crosses itself": (put("rooms", 0, "floorPolygon", value=BOW_TIE), "$.rooms[0].floorPolygon"),
+    "floor with 100 corners": (put("rooms", 0, "floorPolygon", value=LINE * 34), "102 entries"),
+    "floor corner NaN": (put("rooms", 0, "floorPolygon", 0, "x", value=NAN), "floorPolygon[0].x: nan"),
+    "floor corner far": (put("rooms", 0, "floorPolygon", 0, "x", value=5000), "floorPolygon[0].x: 5000"),
+    "floor corner text": (put("rooms", 0, "floorPolygon", 0, "z", value="1"), "floorPolygon[0].z: a text"),
+    "walls missing": (drop("walls"), "'walls' is missing"),
+    "wall id twice": (put("walls", 1, "id", value="w|0|west"), "$.walls[1].id"),
+    "wall with 3 corners": (drop("walls", 0, "polygon", 3), "$.walls[0].polygon: 3 corners"),
+    "wall without height": (put("walls", 0, "polygon", value=[xyz(0, 0, 0)] * 4), "$.walls[0].polygon"),
+    "wall of 100 m": (put("walls", 0, "polygon", 2, "y", value=100), "$.walls[0].polygon: a wall 100 m"),
+    "wall corner infinite": (put("walls", 0, "polygon", 1, "x", value=INFINITY), "polygon[1].x: inf"),
+    "wall colour 300": (put("walls", 0, "material", "color", "r", value=300), "color.r: 300"),
+    "hole without area": (put("doors", 0, "holePolygon", value=[xyz(1, 0, 0)] * 2), "$.doors[0].holePolygon"),
+    "hole past the wall": (
+        put("doors", 0, "holePolygon", value=[xyz(9, 0, 0), xyz(10, 2, 0)]), "$.doors[0].holePolygon"),
+    "hole with one corner": (put("doors", 0, "holePolygon", value=[xyz(0, 0, 0)]), "$.doors[0].holePolygon"),
+    "door wall a list": (put("doors", 0, "wall0", value=[]), "$.doors[0].wall0: a list"),
+    "windows a text": (put("windows", value="none"), "$.windows: a text"),
+    "objects missing": (drop("objects"), "'objects' is missing"),
+    "object id twice": (put("objects", 0, "children", 0, "id", value="0|table"), "children[0].id"),
+    "object position missing": (drop("objects", 0, "position"), "$.objects[0]: key 'position'"),
+    "object y missing": (drop("objects", 0, "position", "y"), "position: key 'y'"),
+    "object true": (put("objects", 0, "position", "x", value=True), "position.x: a truth value"),
+    "object far": (put("objects", 0, "position", "x", value=-1e30), "position.x: -1e+30"),
+    "object yaw NaN": (put("objects", 0, "rotation", "y", value=NAN), "rotation.y: nan"),
+    "object huge integer": (put("objects", 0, "position", "x", value=10**400), "position.x: a huge number"),
+    "asset a number": (put("objects", 0, "assetId", value=7), "$.objects[0].assetId: a number"),
+    "id of 10,000 letters": (put("objects", 0, "id", value="x" * 10_000), "$.objects[0].id"),
+    "children an object": (put("objects", 0, "children", value={"a": 1}), "$.objects[0].children"),
+    "too many children": (put("objects", 0, "children", value=[0] * 2000), "2000 entries"),
+    "too many objects": (put("objects", value=[0] * 6000), "$.objects: 6000 entries"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_house_is_named_and_does_not_hide_the_others(tmp_path: Path, case: str):
+    change, named = BROKEN[case]
+    good, bad = two_rooms(), two_rooms()
+    bad["_id"] = "bad-house"
+    change(bad)
+    source = open_houses(f"procthor:{write_houses(tmp_path, [good, bad])}")
+    assert source.house_ids() == ["bad-house", "two-rooms"]
+    with pytest.raises(InputError) as caught:
+        source.load("bad-house")
+    message = str(caught.value)
+    assert "houses.jsonl.gz:2 (bad-house)" in message
+    assert named in message
+    assert "\n" not in message and len(message) < 1000
+    assert source.load("two-rooms").rooms
+
+
+LINES: dict[str, tuple[bytes, str]] = {
+    "not JSON": (b"{rooms: 1}", "not JSON"),
+    "cut off": (json.dumps(two_rooms()).encode()[25:500], "not JSON"),
+    "nested 100,000 deep": (b"[" * 100_000, "nested too deeply"),
+    "not UTF-8": (b'{"rooms": "\xff\xfe"}', "not UTF-8"),
+    "a number": (b"12", "a number where an object"),
+    "null": (b"null", "null where an object"),
+    "a number of 10,000 digits": (b'{"rooms": ' + b"9" * 10_000 + b"}", "too many digits"),
+}
+
+
+@pytest.mark.parametrize("case", LINES)
+def test_a_line_that_is_no_house_is_named(tmp_path: Path, case: str):
+    line, named = LINES[case]
+    source = open_houses(f"procthor:{write_houses(tmp_path, [two_rooms(), line])}")
+    assert len(source.house_ids()) == 2
+    broken = next(i for i in source.house_ids() if i != "two-rooms")
+    with pytest.raises(InputError, match=named) as caught:
+        source.load(broken)
+    assert "houses.jsonl.gz:2" in str(caught.value)
+
+
+TABLES: dict[str, tuple[Any, str]] = {
+    "empty": ({}, "neither an object of assets"),
+    "a number": (5, "neither an object of assets"),
+    "no size": ({"A": {"objectType": "Bed"}}, "$.A: key 'size'"),
+    "two sides": ({"A": {"objectType": "Bed", "size": [1, 2]}}, "2 numbers"),
+    "negative side": ({"A": {"objectType": "Bed", "size": [1, -2, 1]}}, "-2 is not within"),
+    "kilometre side": ({"A": {"objectType": "Bed", "size": [1, 2000, 1]}}, "2000 is not within"),
+    "NaN side": ({"A": {"objectType": "Bed", "size": [1, NAN, 1]}}, "nan is not within"),
+    "NaN rest height": ({"A": {"objectType": "Bed", "size": [1, 1, 1], "surface_height_m": NAN}}, "nan"),
+    "type missing": ({"A": {"size": [1, 1, 1]}}, "key 'objectType'"),
+}
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_a_broken_size_table_is_refused_at_opening(tmp_path: Path, case: str):
+    sizes, named = TABLES[case]
+    write_houses(tmp_path, [two_rooms()], sizes)
+    with pytest.raises(InputError, match=r"asset_sizes\.json") as caught:
+        open_houses(f"procthor:{tmp_path}")
+    assert named in str(caught.value)
+
+
+def test_folders_and_references_that_do_not_exist(tmp_path: Path):
+    for ref in ("castle", "", "procthor", "procthor:/no/such/folder", f"procthor:{tmp_path}", "ai2thor:/no"):
+        with pytest.raises(InputError):
+            open_houses(ref)
+    with pytest.raises(InputError, match="ai2thor, builtin, procthor"):
+        open_houses("castle:x")
+    for ref in ("builtin:0", "builtin:-1", "builtin:many", "builtin:99999999"):
+        with pytest.raises(InputError, match="not a count"):
+            open_houses(ref)
+    write_houses(tmp_path, [two_rooms()], sizes=None)
+    with pytest.raises(InputError, match="no size table"):
+        open_houses(f"procthor:{tmp_path}")
+
+
+def test_a_folder_without_houses(tmp_path: Path):
+    write_houses(tmp_path, [])
+    with pytest.raises(InputError, match="no house"):
+        open_houses(f"procthor:{tmp_path}")
+    (tmp_path / "houses.jsonl.gz").unlink()
+    with pytest.raises(InputError, match="file with houses"):
+        open_houses(f"procthor:{tmp_path}")
+
+
+@pytest.mark.parametrize("damage", ["truncated", "not gzip", "flipped"])
+def test_damaged_archives_are_named(tmp_path: Path, damage: str):
+    path = write_houses(tmp_path, [two_rooms()]) / "houses.jsonl.gz"
+    data = path.read_bytes()
+    flipped = data[:60] + bytes(255 - b for b in data[60:90]) + data[90:]
+    path.write_bytes(
+        {"truncated": data[: len(data) // 2], "not gzip": b"PK" + data, "flipped": flipped}[damage]
+    )
+    with pytest.raises(InputError, match=r"houses\.jsonl\.gz"):
+        open_houses(f"procthor:{tmp_path}")
+
+
+def test_a_line_that_unpacks_without_end_is_refused_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(line_index, "MAX_LINE_BYTES", 1 << 20)
+    write_houses(tmp_path, [two_rooms()])
+    bomb = gzip.compress(b" " * (8 << 20))
+    (tmp_path / "bomb.jsonl.gz").write_bytes(bomb)
+    assert len(bomb) < 20_000
+    with pytest.raises(InputError, match=r"bomb\.jsonl\.gz:1"):
+        open_houses(f"procthor:{tmp_path}")
+
+
+def test_two_different_houses_with_one_id_are_refused_by_that_id(tmp_path: Path):
+    other = two_rooms()
+    other["objects"] = []
+    source = open_houses(f"procthor:{write_houses(tmp_path, [two_rooms(), other, two_rooms()])}")
+    assert source.house_ids() == ["two-rooms"]
+    with pytest.raises(InputError, match=r"two houses: houses\.jsonl\.gz:1 and houses\.jsonl\.gz:2"):
+        source.load("two-rooms")
+
+
+def test_a_house_that_is_not_there(tmp_path: Path):
+    source = open_houses(f"procthor:{write_houses(tmp_path, [two_rooms()])}")
+    with pytest.raises(InputError, match="no house 'x'"):
+        source.load("x")
+
+
+ASSETS = {
+    k: Asset(k, v["objectType"], (v["size"][0], max(v["size"][2], 0.01), v["size"][1]))
+    for k, v in SIZES.items()
+}
+WEIRD = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]), st.just({}),
+    st.just([1, [2]]), st.just(10**30),
+)  # fmt: skip
+
+
+def paths_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    out = [path] if path else []
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        out += paths_of(inner, (*path, key))
+    return out
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None)
+def test_any_value_anywhere_gives_a_house_or_an_input_error(data: st.DataObject):
+    document = two_rooms()
+    document["objects"].append(thing("0|chair", "Chair_1", xyz(1, 0.45, 1)))
+    paths = paths_of(document)
+    for _ in range(data.draw(st.integers(1, 3))):
+        path = data.draw(st.sampled_from(paths))
+        try:
+            put(*path, value=data.draw(WEIRD))(document)
+        except (KeyError, IndexError, TypeError):
+            continue  # an earlier change removed what lies on the path
+    try:
+        house = build_house(Node("file", "$", document), "h", "0" * 64, ASSETS)
+    except InputError as error:
+        assert str(error).startswith("file: $")
+    else:
+        assert house.rooms

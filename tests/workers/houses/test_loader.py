@@ -1,0 +1,241 @@
+"""Known answers: frames, walls and holes, what rests where, tops of corner counters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.workers.houses.house_checks import check_house, covers, top_below_m
+from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz
+from workers.houses import open_houses
+from workers.houses.furnishing import unity_rotation
+from workers.houses.house import House
+
+
+def load(folder: Path, document: dict) -> House:
+    source = open_houses(f"procthor:{write_houses(folder, [document])}")
+    house = source.load(source.house_ids()[0])
+    check_house(house)
+    return house
+
+
+def wall_covers(house: House, xy: tuple[float, float], z: float) -> bool:
+    return any(covers(b, xy, z) for b in house.bodies if b.object_type in ("Wall", "Door"))
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> House:
+    return load(tmp_path_factory.mktemp("house"), two_rooms())
+
+
+def body(house: House, body_id: str):
+    return next(b for b in house.bodies if b.body_id == body_id)
+
+
+def test_positions_exchange_y_and_z_and_yaw_turns_about(house: House):
+    table = body(house, "0|table").visual.vertices_m
+    # 1.2 wide and 0.8 deep, turned by 90 degrees, centred at Unity (1.5, 0.375, 2.0).
+    np.testing.assert_allclose(table.min(0)[:2], [1.5 - 0.4, 2.0 - 0.6], atol=1e-5)
+    np.testing.assert_allclose(table.max(0)[:2], [1.5 + 0.4, 2.0 + 0.6], atol=1e-5)
+    assert table.min() == 0.0
+
+
+@pytest.mark.parametrize(("yaw", "front"), [(0, (0, 1)), (90, (1, 0)), (180, (0, -1)), (270, (-1, 0))])
+def test_the_front_of_a_chair_turns_clockwise_with_yaw(tmp_path: Path, yaw: float, front: tuple[int, int]):
+    document = two_rooms()
+    document["objects"] = [thing("0|chair", "Chair_1", xyz(2, 0.45, 1.5), yaw)]
+    vertices = body(load(tmp_path, document), "0|chair").visual.vertices_m
+    high = vertices[vertices[:, 2] > 0.8].mean(0)[:2] - (2, 1.5)  # the backrest
+    assert high @ np.array(front) < -0.2  # opposite to the front
+    assert abs(high @ np.array([front[1], -front[0]])) < 1e-6
+
+
+@given(st.floats(-360, 360), st.floats(-360, 360), st.floats(-360, 360))
+@settings(max_examples=50, deadline=None)
+def test_rotations_are_proper_and_follow_unity(x: float, y: float, z: float):
+    rotation = unity_rotation(x, y, z)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) > 0.999
+    # Unity turns a vector by z, x and y in this order about fixed axes, clockwise along each axis.
+    v = np.array([0.3, -0.5, 0.8])
+    for axis, angle in ((2, z), (0, x), (1, y)):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        t = np.deg2rad(angle)
+        v[a], v[b] = np.cos(t) * v[a] - np.sin(t) * v[b], np.sin(t) * v[a] + np.cos(t) * v[b]
+    np.testing.assert_allclose(rotation @ [0.3, 0.8, -0.5], v[[0, 2, 1]], atol=1e-9)
+
+
+def test_yaw_alone_matches_the_published_formula():
+    # World dx = lx cos t + lz sin t, dz = -lx sin t + lz cos t.
+    t = np.deg2rad(30)
+    dx, dz = 2 * np.cos(t) + 3 * np.sin(t), -2 * np.sin(t) + 3 * np.cos(t)
+    np.testing.assert_allclose(unity_rotation(0, 30, 0) @ [2, 3, 0], [dx, dz, 0], atol=1e-12)
+
+
+def test_things_rest_exactly_on_the_top_whether_lifted_or_not(house: House):
+    surface = house.surfaces[0]
+    assert surface.height_m == pytest.approx(0.755, abs=1e-6)
+    for name in ("0|mug", "0|card"):
+        assert body(house, name).visual.vertices_m[:, 2].min() == pytest.approx(0.755, abs=1e-5)
+        assert body(house, name).kind == "small"
+        assert body(house, name).room_id == "room|0"
+    np.testing.assert_allclose(top_below_m(house, surface.surface_id), 0, atol=1e-5)
+
+
+def test_a_card_without_thickness_still_has_volume(house: House):
+    assert np.ptp(body(house, "0|card").visual.vertices_m[:, 2]) >= 0.003
+
+
+def test_the_inner_doorway_is_open_where_wall0_says(house: House):
+    # wall0 runs from (4, 3) to (4, 0): 0.4 to 1.4 along it is y = 2.6 to 1.6.
+    for y, is_solid in ((2.8, True), (2.55, False), (2.1, False), (1.65, False), (1.5, True), (0.3, True)):
+        assert wall_covers(house, (4.0, y), 1.0) is is_solid, y
+    assert wall_covers(house, (4.0, 2.1), 2.3)  # the lintel
+
+
+def test_a_hole_given_along_wall1_alone_is_mirrored(tmp_path: Path):
+    document = two_rooms()
+    document["walls"] = [w for w in document["walls"] if w["id"] != "w|0|east"]
+    house = load(tmp_path, document)
+    assert not wall_covers(house, (4.0, 2.1), 1.0)
+    assert wall_covers(house, (4.0, 0.9), 1.0)
+
+
+def test_walls_of_both_rooms_become_one_with_two_colours(tmp_path: Path):
+    document = two_rooms()
+    next(w for w in document["walls"] if w["id"] == "w|1|west")["material"] = {
+        "name": "x", "color": {"r": 1, "g": 0, "b": 0}
+    }  # fmt: skip
+    house = load(tmp_path, document)
+    at_four = [
+        b for b in house.bodies
+        if b.object_type == "Wall" and np.abs(b.visual.vertices_m[:, 0] - 4.0).max() < 0.02
+    ]  # fmt: skip
+    assert len(at_four) == 1
+    mesh = at_four[0].visual
+    middle = mesh.vertices_m[mesh.faces].mean(1)
+    right = mesh.face_rgb[np.isclose(middle[:, 0], 4.01, atol=1e-3)]
+    left = mesh.face_rgb[np.isclose(middle[:, 0], 3.99, atol=1e-3)]
+    assert (right == (255, 0, 0)).all() and len(right)  # seen from room 1
+    assert (left == (128, 64, 255)).all() and len(left)
+
+
+def test_windows_are_holes_above_a_sill_and_doors_to_the_outside_are_closed(house: House):
+    # The east wall of room 1 runs from (8, 3) to (8, 0): 1 to 2 along it is y = 2 to 1.
+    assert not wall_covers(house, (8.0, 1.5), 1.5)
+    assert wall_covers(house, (8.0, 1.5), 0.5)
+    assert wall_covers(house, (8.0, 1.5), 2.2)
+    # The way out in the south wall, which runs from (4, 0) to (0, 0): x = 3 to 2.
+    assert wall_covers(house, (2.5, 0.0), 1.0)
+    assert any(b.object_type == "Door" for b in house.bodies)
+
+
+def test_a_window_down_to_the_floor_stops_a_base(tmp_path: Path):
+    document = two_rooms()
+    document["windows"][0]["holePolygon"] = [xyz(1, 0, 0), xyz(2, 2, 0)]
+    house = load(tmp_path, document)
+    assert wall_covers(house, (8.0, 1.5), 0.05)
+    assert not wall_covers(house, (8.0, 1.5), 0.5)
+
+
+def test_open_walls_are_passages(tmp_path: Path):
+    document = two_rooms()
+    document["doors"] = document["doors"][1:]
+    for w in document["walls"]:
+        w["empty"] = w["id"] in ("w|0|east", "w|1|west")
+    house = load(tmp_path, document)
+    assert not wall_covers(house, (4.0, 1.0), 1.0)
+    assert house.skipped["open wall"] == 2
+
+
+def test_walls_that_overlap_in_part_do_not_fill_the_door(tmp_path: Path):
+    document = two_rooms()
+    document["walls"].append(wall("long", "room|1", (4.0, 0.0), (4.0, 5.0)))
+    house = load(tmp_path, document)
+    assert not wall_covers(house, (4.0, 2.1), 1.0)
+    assert wall_covers(house, (4.0, 4.5), 1.0)
+
+
+def test_floors_lie_below_zero_and_cover_their_rooms(house: House):
+    for k, room in enumerate(house.rooms):
+        floor = body(house, f"floor-{room.room_id}")
+        assert floor.visual.vertices_m[:, 2].max() == 0.0
+        assert floor.room_id == room.room_id
+        for x, y in ((0.5, 0.5), (3.5, 2.5), (2.0, 1.5)):
+            assert covers(floor, (4 * k + x, y), -0.01)
+
+
+def test_an_l_counter_leaves_its_corner_free(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [thing("0|c", "Countertop_L_8x6", xyz(2, 0.47, 1.5))]
+    house = load(tmp_path, document)
+    counter = body(house, "0|c")
+    # Back run along -z (world -y), wing at +x; the corner at (-x, +y) is empty.
+    assert covers(counter, (1.0, 0.8), 0.5)
+    assert covers(counter, (3.0, 2.2), 0.5)
+    assert not covers(counter, (1.2, 2.0), 0.5)
+    first, second = sorted(house.surfaces, key=lambda s: s.surface_id)
+    assert first.size_m == pytest.approx((2.4, 0.61))
+    assert second.size_m == pytest.approx((0.61, 1.8 - 0.61))
+    np.testing.assert_allclose(second.T_world_surface[:3, 3], [2 + 1.2 - 0.305, 1.805, 0.943], atol=1e-6)
+    for s in house.surfaces:
+        np.testing.assert_allclose(top_below_m(house, s.surface_id), 0, atol=1e-5)
+
+
+def test_a_u_counter_has_two_wings_and_a_free_middle(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [thing("0|c", "Countertop_C_10x8", xyz(2, 0.47, 1.5), 180)]
+    house = load(tmp_path, document)
+    counter = body(house, "0|c")
+    assert len(house.surfaces) == 3
+    assert not covers(counter, (2.0, 1.0), 0.5)  # turned about: it opens towards -y
+    assert all(covers(counter, (x, 0.6), 0.5) for x in (0.7, 3.3))
+
+
+def test_a_desk_with_a_hutch_carries_things_in_front_of_it(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [thing("0|desk", "Desk_9", xyz(2, 0.8, 1.5))]
+    house = load(tmp_path, document)
+    surface = house.surfaces[0]
+    assert surface.height_m == pytest.approx(0.8)
+    assert surface.size_m == pytest.approx((1.4, 0.45))
+    np.testing.assert_allclose(top_below_m(house, surface.surface_id), 0, atol=1e-5)
+
+
+def test_unknown_assets_and_hidden_things_are_counted(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] += [
+        thing("0|what", "0a1b", xyz(1, 1, 1), children=[thing("0|on", "Mug_1", xyz(1, 1.2, 1))]),
+        thing("0|fridge", "Fridge_1", xyz(3, 0.9, 1), children=[thing("0|in", "Mug_1", xyz(3, 0.9, 1))]),
+    ]
+    house = load(tmp_path, document)
+    assert house.skipped == {"unknown asset": 1, "on an unknown asset": 1, "hidden inside furniture": 1}
+
+
+def test_a_tilted_bat_keeps_its_centre(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [
+        {"id": "0|bat", "assetId": "Bat_1", "position": xyz(2, 0.5, 1.5), "rotation": xyz(90, 0, 0)}
+    ]
+    vertices = body(load(tmp_path, document), "0|bat").visual.vertices_m
+    np.testing.assert_allclose((vertices.min(0) + vertices.max(0)) / 2, [2, 1.5, 0.5], atol=1e-5)
+    assert np.ptp(vertices[:, 1]) == pytest.approx(0.96, abs=1e-5)
+
+
+def test_things_outside_every_room_carry_nothing(tmp_path: Path):
+    document = two_rooms()
+    document["objects"] = [thing("out", "Table_1", xyz(20, 0.375, 2.0))]
+    house = load(tmp_path, document)
+    assert not house.surfaces
+    assert house.skipped == {"surface outside every room": 1}
+
+
+def test_unknown_keys_are_tolerated(tmp_path: Path):
+    document = two_rooms()
+    document["proceduralParameters"] = {"lights": []}
+    document["rooms"][0]["ceilings"] = []
+    assert len(load(tmp_path, document).rooms) == 2

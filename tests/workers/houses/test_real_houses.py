@@ -1,0 +1,103 @@
+"""Forty houses of the real set, spread over it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.workers.houses.house_checks import check_house, top_below_m
+from workers.geometry.planar import inside_any
+from workers.houses import open_houses
+from workers.houses.house import House, HouseSource
+
+
+@pytest.fixture(scope="module")
+def source(assets: Path) -> HouseSource:
+    return open_houses(f"procthor:{assets / 'procthor'}")
+
+
+@pytest.fixture(scope="module")
+def houses(source: HouseSource) -> list[House]:
+    ids = source.house_ids()
+    return [source.load(i) for i in ids[:: len(ids) // 40]]
+
+
+def test_the_set_is_whole(source: HouseSource):
+    assert len(source.house_ids()) == 2018
+    assert source.house_ids() == sorted(source.house_ids())
+
+
+def test_real_houses_satisfy_the_contract(houses: list[House]):
+    assert len(houses) >= 40
+    for house in houses:
+        check_house(house)
+
+
+def test_loading_twice_gives_the_same(source: HouseSource, houses: list[House]):
+    for house in houses[:5]:
+        again = source.load(house.house_id)
+        assert again.digest == house.digest
+        for a, b in zip(house.bodies, again.bodies, strict=True):
+            assert (a.visual.vertices_m == b.visual.vertices_m).all()
+            assert (a.visual.face_rgb == b.visual.face_rgb).all()
+
+
+def test_surfaces_lie_exactly_on_their_furniture(houses: list[House]):
+    count = 0
+    for house in houses:
+        for s in house.surfaces:
+            if 0.3 <= s.height_m <= 1.2 and min(s.size_m) >= 0.3:
+                np.testing.assert_allclose(top_below_m(house, s.surface_id), 0, atol=1e-4)
+                count += 1
+    assert count > 80
+
+
+def test_small_things_on_tops_neither_float_nor_sink(houses: list[House]):
+    gaps = []
+    for house in houses:
+        for s in house.surfaces:
+            T = s.T_world_surface
+            for b in house.bodies:
+                v = b.visual.vertices_m
+                low = v[:, 2].min() - s.height_m
+                middle = ((v.min(0) + v.max(0)) / 2 - T[:3, 3]) @ T[:3, :3]
+                is_on = (np.abs(middle[:2]) < np.array(s.size_m) / 2).all() and abs(low) < 0.1
+                if b.kind == "small" and is_on:
+                    gaps.append(low)
+    assert len(gaps) > 200
+    assert np.mean(np.abs(gaps) < 1e-3) > 0.97
+
+
+def test_furniture_stands_on_the_floor_inside_its_room(houses: list[House]):
+    for house in houses:
+        floors = [r.polygon_m for r in house.rooms]
+        furniture = [b for b in house.bodies if b.kind == "furniture"]
+        middles = np.array(
+            [(b.visual.vertices_m.min(0) + b.visual.vertices_m.max(0))[:2] / 2 for b in furniture]
+        )
+        assert inside_any(middles.astype(np.float64), floors).all()
+        for b in furniture:
+            z = b.visual.vertices_m[:, 2]
+            hangs = b.object_type in ("Painting", "Television")
+            assert hangs or abs(z.min()) < 0.01 or b.object_type == "BaseballBat", b.object_type
+
+
+def test_most_houses_have_somewhere_to_put_things(houses: list[House]):
+    usable = [
+        sum(0.3 <= s.height_m <= 1.2 and min(s.size_m) >= 0.4 and max(s.size_m) >= 0.5 for s in h.surfaces)
+        for h in houses
+    ]
+    assert np.mean(np.array(usable) > 0) > 0.9
+
+
+def test_doors_let_through_and_connect(houses: list[House]):
+    """Every pair of neighbouring rooms that a door joins has a gap in the wall between them."""
+    for house in houses[:10]:
+        if len(house.rooms) < 2:
+            continue
+        walls = [b for b in house.bodies if b.object_type == "Wall"]
+        parts = [p for b in walls for p in b.convex_parts_m]
+        lintels = [p for p in parts if 1.8 < p[:, 2].min() < 2.4]
+        assert len(lintels) >= len(house.rooms) - 1

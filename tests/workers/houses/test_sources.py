@@ -1,0 +1,142 @@
+"""Opening folders: digests, order, caches, splits, and how sources are named."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.errors import InputError
+from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
+from workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
+from workers.houses.line_index import cache_folder, open_lines
+
+
+def named(name: str, **more: object) -> dict:
+    return {**two_rooms(), "_id": name, **more}
+
+
+def test_every_source_is_registered_and_its_package_imports_nothing_heavy():
+    assert set(HOUSE_SOURCES) == {"builtin", "procthor", "ai2thor"}
+    code = "import sys, workers.houses; print(*(m for m in ('scipy', 'trimesh', 'PIL') if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+def test_the_digest_is_of_content_not_of_names_or_compression(tmp_path: Path):
+    houses = [named("a"), named("b"), named("c")]
+    first = open_houses(f"procthor:{write_houses(tmp_path / 'one', houses)}")
+    second = open_houses(f"procthor:{write_houses(tmp_path / 'two', houses[::-1], name='x.jsonl')}")
+    write_houses(tmp_path / "three", houses[:1], name="train.jsonl.gz")
+    write_houses(tmp_path / "three", houses[1:], name="val.jsonl")
+    third = open_houses(f"procthor:{tmp_path / 'three'}")
+    assert first.digest == second.digest == third.digest
+    assert first.house_ids() == second.house_ids() == third.house_ids() == ["a", "b", "c"]
+    assert first.load("b").digest == third.load("b").digest
+    changed = [*houses[:2], named("c", extra=1)]
+    assert open_houses(f"procthor:{write_houses(tmp_path / 'four', changed)}").digest != first.digest
+    sizes = {**SIZES, "New_1": {"objectType": "Bed", "size": [1, 1, 1]}}
+    assert open_houses(f"procthor:{write_houses(tmp_path / 'five', houses, sizes)}").digest != first.digest
+
+
+def test_single_files_lists_and_official_names(tmp_path: Path):
+    write_houses(tmp_path, [{k: v for k, v in two_rooms().items() if k != "_id"}] * 1, name="train.jsonl.gz")
+    (tmp_path / "one.json").write_text(json.dumps(named("single"), indent=1))
+    (tmp_path / "many.json").write_text(json.dumps([named("m0"), named("m1")]))
+    (tmp_path / "type_annotations.json").write_text("{}")
+    source = open_houses(f"procthor:{tmp_path}")
+    assert source.house_ids() == ["m0", "m1", "single", "train-000001"]
+    for house_id in source.house_ids():
+        assert len(source.load(house_id).rooms) == 2
+
+
+def test_ids_come_from_the_top_level_alone(tmp_path: Path):
+    source = open_houses(f"procthor:{write_houses(tmp_path, [named('real', _source={'_id': 'other'})])}")
+    assert source.house_ids() == ["real"]
+
+
+def test_the_original_asset_database_serves_as_well(tmp_path: Path):
+    write_houses(tmp_path, [two_rooms()], sizes=None)
+    entries: dict[str, list[dict]] = {}
+    for asset_id, value in SIZES.items():
+        box = dict(zip("xyz", value["size"], strict=True))
+        entries.setdefault(value["objectType"], []).append(
+            {"assetId": asset_id, "objectType": value["objectType"], "boundingBox": box}
+        )
+    for table in (entries, [e for group in entries.values() for e in group]):
+        (tmp_path / "asset-database.json").write_text(json.dumps(table))
+        house = open_houses(f"procthor:{tmp_path}").load("two-rooms")
+        assert [s.height_m for s in house.surfaces] == [pytest.approx(0.75)]
+
+
+def test_the_cache_is_used_repaired_and_never_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
+    ref = f"procthor:{write_houses(tmp_path / 'houses', [named('a'), named('b')])}"
+    before = open_houses(ref)
+    before.load("a")
+    cached = sorted((tmp_path / "cache").rglob("*.*"))
+    assert [p.suffix for p in cached] == [".jsonl", ".npz"]
+    data, index = cached
+    index.write_bytes(b"PK\x03\x04 nonsense")
+    assert open_houses(ref).load("b").digest == before.load("b").digest
+    data.write_bytes(data.read_bytes()[:-9])
+    assert open_houses(ref).digest == before.digest
+    bad = bytearray(data.read_bytes())
+    bad[40] ^= 1
+    data.write_bytes(bytes(bad))
+    with pytest.raises(InputError, match="changed since"):
+        open_houses(ref).load("a")
+
+
+def test_without_a_cache_everything_works_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    ref = f"procthor:{write_houses(tmp_path / 'houses', [named('a'), named('b')])}"
+    digest = open_houses(ref).digest
+    monkeypatch.setenv("DATAGEN_CACHE", str(blocked / "below-a-file"))
+    assert cache_folder() is None
+    source = open_houses(ref)
+    assert source.digest == digest and source.load("a").rooms
+
+
+def test_a_cache_that_cannot_take_the_houses_is_done_without(tmp_path: Path):
+    path = write_houses(tmp_path, [named("a")]) / "houses.jsonl.gz"
+    index = open_lines(path, tmp_path / "gone")
+    assert index.ids == ["a"] and isinstance(index.data, bytes)
+
+
+def test_many_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
+    ref = f"procthor:{write_houses(tmp_path / 'houses', [named(f'h{k}') for k in range(20)])}"
+    with ThreadPoolExecutor(8) as pool:
+        sources = list(pool.map(lambda _: open_houses(ref), range(16)))
+    assert len({s.digest for s in sources}) == 1
+    assert all(s.load("h7").rooms for s in sources)
+    assert len(list((tmp_path / "cache").rglob("*.*"))) == 2  # no leftovers
+
+
+@given(st.text(max_size=30))
+def test_a_split_depends_on_the_id_alone(house_id: str):
+    assert split_of(house_id) == split_of(house_id)
+    assert split_of(house_id) in ("train", "val", "test")
+
+
+def test_splits_are_disjoint_complete_and_near_80_10_10():
+    source = open_houses("builtin:2000")
+    parts = [ids_of_split(source, s) for s in ("train", "val", "test")]
+    assert (
+        sorted(itertools.chain(*parts)) == sorted(source.house_ids()) == sorted(ids_of_split(source, "all"))
+    )
+    shares = np.array([len(p) for p in parts]) / 2000
+    np.testing.assert_allclose(shares, [0.8, 0.1, 0.1], atol=0.03)
+    # Houses of finished runs: these must never move.
+    held_out = [k for k in range(40) if split_of(f"builtin-{k:04d}") != "train"]
+    assert held_out == [1, 4, 6, 8, 9, 18, 19, 24, 25, 27, 29, 36, 37]
