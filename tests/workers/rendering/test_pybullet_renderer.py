@@ -1,0 +1,97 @@
+"""TinyRenderer against Embree: the same depth, the same bodies, the same rho."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pybullet
+import pytest
+
+from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
+from tests.workers.worlds import camera_at, table_house
+from workers.geometry.mesh import Mesh
+from workers.rendering.embree_renderer import ray_stage, render_embree
+from workers.rendering.frame import Camera, Stage
+from workers.rendering.pybullet_renderer import PybulletStage, render_pybullet
+from workers.rendering.visibility import visible_pixels
+
+
+@pytest.mark.parametrize("camera", cameras())
+def test_frames_agree_with_embree(camera: Camera) -> None:
+    stage = mixed_stage()
+    frame = render_pybullet(stage, camera)
+    assert frame.rgb.shape == (camera.height_px, camera.width_px, 3)
+    assert (frame.rgb.dtype, frame.depth_m.dtype, frame.body.dtype) == (np.uint8, np.float32, np.int16)
+    assert_same_view(frame, render_embree(stage, camera))
+
+
+def test_textures_and_face_colours_are_where_they_belong() -> None:
+    stage = mixed_stage()
+    above = camera_at((1.9, 1.6, 1.5), (1.9, 1.7, 0.75), 160, 120, 300.0)
+    frame, reference = render_pybullet(stage, above), render_embree(stage, above)
+    assert_same_hues(frame, reference, 4)
+    view = cameras()[0]
+    frame, reference = render_pybullet(stage, view), render_embree(stage, view)
+    for label, channel in ((1, 0), (2, 2), (3, 1)):
+        assert frame.rgb[frame.body == label].mean(0).argmax() == channel
+        assert reference.rgb[reference.body == label].mean(0).argmax() == channel
+
+
+def test_where_nothing_stands_there_is_no_depth_and_no_body() -> None:
+    camera = camera_at((2.0, 1.5, 1.5), (2.1, 1.5, 9.0), 64, 48, 200.0)
+    frame = render_pybullet(mixed_stage(), camera)
+    assert (frame.body == -1).all()
+    assert not frame.depth_m.any()
+
+
+def test_a_mesh_with_more_faces_than_bullet_takes_at_once_is_whole() -> None:
+    stage = mixed_stage()
+    body = stage.house.bodies[-1]
+    n = 45_000  # the table again, after many faces without area, lands in the second piece
+    faces = np.concatenate([np.zeros((n, 3), np.int32), body.visual.faces])
+    colours = np.concatenate([np.zeros((n, 3), np.uint8), body.visual.face_rgb])
+    heavy = replace(body, visual=Mesh(body.visual.vertices_m, faces, colours))
+    house = replace(stage.house, bodies=(*stage.house.bodies[:-1], heavy))
+    camera = cameras()[0]
+    whole = render_pybullet(Stage(house, stage.objects, stage.T_world_object), camera)
+    np.testing.assert_array_equal(whole.body, render_pybullet(stage, camera).body)
+    np.testing.assert_array_equal(whole.depth_m, render_pybullet(stage, camera).depth_m)
+
+
+def test_rho_agrees_with_embree_from_all_sides() -> None:
+    stage = mixed_stage()
+    rng = np.random.default_rng(3)
+    angle = rng.uniform(0, 2 * np.pi, 40)
+    eyes = np.stack([2 + 0.7 * np.cos(angle), 1.5 + 0.7 * np.sin(angle), rng.uniform(0.8, 1.4, 40)], axis=1)
+    rays = ray_stage(stage)
+    with PybulletStage(stage) as loaded:
+        for target in (0, 1):
+            ours_alone, ours_seen = loaded.visible_pixels(target, eyes, 48)
+            alone, seen = visible_pixels(rays, target, eyes, 48)
+            assert (ours_alone > 0).all()
+            assert np.abs(ours_alone - alone).max() <= 0.01 * alone.max()
+            gap = np.abs(ours_seen / ours_alone - seen / alone)
+            assert gap.mean() < 0.005 and gap.max() < 0.03
+    assert (seen / alone).min() < 0.9  # something was hidden, so that the comparison means something
+
+
+def test_an_eye_within_the_target_sees_nothing() -> None:
+    stage = mixed_stage()
+    with PybulletStage(stage) as loaded:
+        counts = loaded.visible_pixels(0, stage.T_world_object[0, :3, 3][None], 16)
+    assert [c.tolist() for c in counts] == [[0], [0]]
+
+
+def test_worlds_are_closed_at_the_end() -> None:
+    free = pybullet.connect(pybullet.DIRECT)
+    pybullet.disconnect(physicsClientId=free)
+    stage = Stage(table_house(), (), np.zeros((0, 4, 4)))
+    render_pybullet(stage, cameras()[0])
+    assert not pybullet.isConnected(physicsClientId=free)
+    broken = replace(
+        stage.house.bodies[0], visual=Mesh(np.zeros((0, 3)), np.ones((1, 3), int), np.zeros((1, 3), int))
+    )
+    with pytest.raises(IndexError):
+        render_pybullet(replace(stage, house=replace(stage.house, bodies=(broken,))), cameras()[0])
+    assert not pybullet.isConnected(physicsClientId=free)

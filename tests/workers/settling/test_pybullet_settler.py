@@ -1,0 +1,161 @@
+"""Settling by Bullet: known resting places, the same as PhysX's, and the traps of its frames."""
+
+from __future__ import annotations
+
+import multiprocessing
+
+import numpy as np
+import pybullet
+import pytest
+
+from schemas.errors import InputError
+from schemas.specification import SettleParams
+from tests.workers.worlds import (
+    TABLE_TOP_M,
+    ball_model,
+    box_mesh,
+    box_model,
+    box_vertices,
+    cylinder_model,
+    model_of,
+    on_table,
+    table_house,
+)
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import translation, yaw_pose
+from workers.objects.model import ObjectModel
+from workers.settling.pybullet_settler import settle_pybullet
+from workers.settling.settler import SettleResult
+
+PARAMS = SettleParams()
+PARTS = [part for body in table_house().bodies for part in body.convex_parts_m]
+
+
+def settle(models: list[ObjectModel], poses: list[F64], **params: object) -> SettleResult:
+    return settle_pybullet(PARTS, models, np.stack(poses), PARAMS.model_copy(update=params))
+
+
+def three_objects() -> tuple[list[ObjectModel], list[F64]]:
+    models = [box_model("box", (0.1, 0.06, 0.2)), cylinder_model("can", 0.04, 0.1), ball_model("ball", 0.04)]
+    return models, [on_table(m, dx, 0.0, 0.01) for m, dx in zip(models, (-0.3, 0.0, 0.3), strict=True)]
+
+
+def bent() -> ObjectModel:
+    """An L whose centre of mass is off its origin and whose principal axes are tilted."""
+    foot, back = (
+        box_vertices((0.12, 0.05, 0.03), (0, 0, -0.035)),
+        box_vertices((0.03, 0.05, 0.07), (-0.045, 0, 0.015)),
+    )
+    return model_of("bent", box_mesh((0.12, 0.05, 0.1)), [foot, back], 0.4)
+
+
+def test_things_rest_at_half_their_height_without_a_margin() -> None:
+    models, poses = three_objects()
+    result = settle(models[:2], poses[:2])
+    assert result.at_rest and result.steps < 500
+    rest = result.T_world_object[:, 2, 3] - [m.size_m[2] / 2 for m in models[:2]]
+    np.testing.assert_allclose(rest, TABLE_TOP_M, atol=1e-4)
+    assert result.penetration_m < 1e-4
+
+
+def test_resting_places_agree_with_physx() -> None:
+    pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
+    from workers.settling.sapien_settler import settle_sapien
+
+    models, poses = three_objects()
+    models.append(bent())
+    poses.append(on_table(models[-1], 0.0, 0.25, 0.01))
+    ours = settle(models, poses)
+    theirs = settle_sapien(PARTS, models, np.stack(poses), PARAMS)
+    assert ours.at_rest and theirs.at_rest
+    gap_m = ours.T_world_object[:, :3, 3] - theirs.T_world_object[:, :3, 3]
+    assert np.abs(gap_m).max() < 2e-3
+    upright = [0, 1, 3]  # a ball may roll onto another facet
+    np.testing.assert_allclose(ours.T_world_object[upright], theirs.T_world_object[upright], atol=0.02)
+
+
+def test_an_object_that_stands_still_keeps_its_pose() -> None:
+    model = bent()
+    start = yaw_pose(2.1, 1.4, TABLE_TOP_M + 0.05, 0.7)
+    result = settle([model], [start])
+    np.testing.assert_allclose(result.T_world_object[0], start, atol=1e-3)
+
+
+def test_eighty_parts_are_one_body() -> None:
+    # Steps of a ring; only if all parts count does it lie flat.
+    angles = 2 * np.pi * np.arange(80) / 80
+    parts = [box_vertices((0.01, 0.01, 0.02), (0.1 * np.cos(a), 0.1 * np.sin(a), 0.0)) for a in angles]
+    ring = model_of("ring", box_mesh((0.21, 0.21, 0.02)), parts, 0.2)
+    result = settle([ring], [on_table(ring, 0, 0, 0.01)])
+    np.testing.assert_allclose(result.T_world_object[0], on_table(ring), atol=1e-3)
+    inside = box_model("inside", (0.03, 0.03, 0.03))
+    nested = settle([ring, inside], [on_table(ring, 0, 0, 0.002), on_table(inside, 0, 0, 0.002)])
+    np.testing.assert_allclose(nested.T_world_object[1], on_table(inside), atol=1e-3)
+
+
+@pytest.mark.parametrize(("slope_deg", "holds"), [(27.0, True), (35.0, False)])
+def test_the_friction_of_a_pair_is_the_one_asked_for(slope_deg: float, holds: bool) -> None:
+    # 0.6 is the tangent of 31 degrees.
+    angle = np.radians(slope_deg)
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    ramp = (box_vertices((2, 1, 0.1), (0, 0, -0.05)) @ tilt[:3, :3].T).astype(np.float32)
+    plate = box_model("plate", (0.1, 0.1, 0.02))
+    start = tilt @ translation(0, 0, 0.011)
+    params = PARAMS.model_copy(update={"max_steps": 240})
+    moved_m = np.linalg.norm(settle_pybullet([ramp], [plate], start[None], params).T_world_object[0, :3, 3])
+    assert (moved_m < 0.02) == holds
+
+
+def _poses_in_a_new_process(queue: multiprocessing.Queue) -> None:  # type: ignore[type-arg]
+    queue.put(settle(*three_objects()).T_world_object)
+
+
+def test_two_processes_agree_bit_for_bit() -> None:
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_poses_in_a_new_process, args=(queue,))
+    process.start()
+    other = queue.get(timeout=60)
+    process.join()
+    models, poses = three_objects()
+    settle(models[::-1], poses[::-1])  # what came before leaves nothing behind
+    np.testing.assert_array_equal(settle(models, poses).T_world_object, other)
+
+
+def test_what_still_moves_after_the_last_step_is_not_at_rest() -> None:
+    ball = ball_model("ball", 0.04)
+    result = settle([ball], [on_table(ball, 0, 0, 0.5)], max_steps=22)
+    assert result.steps == 22 and not result.at_rest
+    assert result.residual_speed_mps == pytest.approx(9.81 * 22 * PARAMS.timestep_s, rel=1e-3)
+    fallen_m = 0.5 * 9.81 * (22 * PARAMS.timestep_s) ** 2
+    assert on_table(ball, 0, 0, 0.5)[2, 3] - result.T_world_object[0, 2, 3] == pytest.approx(
+        fallen_m, rel=0.06
+    )
+    assert result.penetration_m == 0
+
+
+def test_penetration_is_the_depth_of_the_deepest_contact() -> None:
+    # A box wedged between walls that are 8 mm too close: shared by both sides, or all on one, and tilt.
+    box = box_model("box", (0.1, 0.1, 0.1))
+    walls = [box_vertices((0.1, 1, 1), (sign * 0.096, 0, 0.5)) for sign in (-1, 1)]
+    floor = box_vertices((1, 1, 0.1), (0, 0, -0.05))
+    start = translation(0, 0, 0.05)[None]
+    result = settle_pybullet([floor, *walls], [box], start, PARAMS.model_copy(update={"max_steps": 100}))
+    assert 0.0035 < result.penetration_m < 0.012
+
+
+def test_no_objects_rest_at_once() -> None:
+    result = settle_pybullet(PARTS, [], np.zeros((0, 4, 4)), PARAMS)
+    assert result.at_rest and result.T_world_object.shape == (0, 4, 4)
+    assert result.residual_speed_mps == 0
+
+
+def test_every_world_is_closed_also_after_an_error() -> None:
+    first = pybullet.connect(pybullet.DIRECT)
+    pybullet.disconnect(physicsClientId=first)
+    flat = model_of("flat", box_mesh((0.1, 0.1, 0.01)), [box_vertices((0.1, 0.1, 0.0))], 0.1)
+    with pytest.raises(InputError, match="flat: convex_parts_m"):
+        settle([flat], [on_table(flat)])
+    settle_pybullet([], [], np.zeros((0, 4, 4)), PARAMS)
+    assert not pybullet.isConnected(physicsClientId=first)  # numbers are given from the lowest free one
