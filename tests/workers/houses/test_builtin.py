@@ -127,10 +127,8 @@ def test_chairs_face_their_table_or_desk(houses: list[House]):
 
 def test_the_same_house_in_another_process_and_a_longer_collection():
     code = (
-        "from workers.houses.builtin import house_document
-"
-        "from schemas.identity import digest_of
-"
+        "from workers.houses.builtin import house_document\n"
+        "from schemas.identity import digest_of\n"
         "print(digest_of(house_document(7)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
