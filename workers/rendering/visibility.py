@@ -12,8 +12,8 @@ from workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.
 _SKIN_M = 5e-4
-# Rays in flight at once; bounds memory at about 50 MB. Twice as many no longer fit the cache.
-_MAX_RAYS = 1 << 17
+# Rays in flight at once; bounds memory at about 25 MB. Many more no longer fit the cache.
+_MAX_RAYS = 1 << 16
 
 I32 = npt.NDArray[np.int32]
 
@@ -49,14 +49,16 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
     # Alone, in the target's own frame.
     local_axes = T_world_target[:3, :3].T @ axes
     local_eyes = ((eyes_m - T_world_target[:3, 3]) @ T_world_target[:3, :3]).astype(np.float32)
-    parameter = nearest(stage.objects[target], local_eyes[eye], _directions(local_axes, eye, x, y))
+    parameter = nearest(
+        stage.objects[target], local_eyes.take(eye, axis=0), _directions(local_axes, eye, x, y)
+    )
     hit = np.flatnonzero(parameter < MISS)
     eye, limits = eye[hit], parameter[hit] - np.float32(_SKIN_M)
     directions = _directions(axes, eye, x[hit], y[hit])
     alone = np.bincount(eye, minlength=n).astype(np.int32)
 
     # What is left of these rays after the house and each other object that may stand before it.
-    free = ~occluded(stage.house, eyes_m.astype(np.float32)[eye], directions, limits)
+    free = ~occluded(stage.house, eyes_m.astype(np.float32).take(eye, axis=0), directions, limits)
     for k in range(len(stage.objects)):
         if k == target:
             continue
@@ -64,8 +66,9 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
         if len(between):
             T = stage.T_world_object[k]
             local = ((eyes_m - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
-            towards = directions[between] @ T[:3, :3].astype(np.float32)
-            free[between] = ~occluded(stage.objects[k], local[eye[between]], towards, limits[between])
+            towards = directions.take(between, axis=0) @ T[:3, :3].astype(np.float32)
+            origins_m = local.take(eye.take(between), axis=0)
+            free[between] = ~occluded(stage.objects[k], origins_m, towards, limits.take(between))
     return alone, np.bincount(eye[free], minlength=n).astype(np.int32)
 
 
