@@ -89,7 +89,9 @@ class Ai2thorHouses:
         digest = hashlib.sha256(text)
         stage, is_stage_turned = self._stage(scene, house_id)
         digest.update(stage.digest)
-        mesh = stage.mesh.transformed(_stage_pose(is_stage_turned))
+        mesh = _without_ceiling(stage.mesh.transformed(_stage_pose(is_stage_turned)))
+        if not len(mesh.faces):
+            raise scene.get("stage_instance").error("a stage without walls or floor", _MEND)
         skipped: Counter[str] = Counter()
         placed: list[tuple[Body, F64, F64, Mesh]] = []
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
@@ -257,12 +259,11 @@ def _stage_pose(is_turned: bool) -> F64:
 
 
 def _walls_and_rooms(stage: Mesh, things: list[tuple[Body, F64]]) -> tuple[list[Body], list[Room]]:
-    """The stage without its ceiling as a body, and a room for every patch of floor."""
+    """The stage as a body, and a room for every patch of floor."""
     normals, _ = normals_and_areas(stage)
     corner_z = stage.vertices_m[stage.faces][:, :, 2]
     ceiling_m = float(stage.vertices_m[:, 2].max())
     is_floor = (normals[:, 2] > 0.97) & (np.abs(corner_z).max(1) < 0.05)
-    is_ceiling = (np.abs(normals[:, 2]) > 0.9) & (corner_z.min(1) > max(1.8, ceiling_m - 0.5))
     polygons: list[F64] = []
     for outline in outlines(stage, is_floor):
         polygon = clean_polygon(outline)
@@ -281,10 +282,17 @@ def _walls_and_rooms(stage: Mesh, things: list[tuple[Body, F64]]) -> tuple[list[
     for room in plain:
         kind = next((name for t, name in _ROOM_BY_TYPE if t in within[room.room_id]), "Room")
         rooms.append(Room(room.room_id, kind, room.polygon_m, room.ceiling_m))
-    kept = ~is_ceiling
-    shown = Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
-    parts = slab_parts(shown, 0.02, _WALL_TOP_M)
-    return [Body("stage", "wall", "Wall", "", "", shown, parts)], rooms
+    parts = slab_parts(stage, 0.02, _WALL_TOP_M)
+    return [Body("stage", "wall", "Wall", "", "", stage, parts)], rooms
+
+
+def _without_ceiling(stage: Mesh) -> Mesh:
+    """The stage, z up, without level faces near its top: houses are lit and seen from above."""
+    normals, _ = normals_and_areas(stage)
+    corner_z = stage.vertices_m[stage.faces][:, :, 2]
+    near_top = corner_z.min(1) > max(1.8, float(stage.vertices_m[:, 2].max()) - 0.5)
+    kept = ~((np.abs(normals[:, 2]) > 0.9) & near_top)
+    return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
 
 
 def _with_room(body: Body, room_id: str) -> Body:

@@ -17,6 +17,7 @@ from workers.houses.solids import placed
 
 MAX_OBJECTS = 5000
 MAX_CHILDREN = 1000
+MAX_BODIES = 20_000
 _MAX_ANGLE_DEG = 1e6
 _UPRIGHT_DEG = 2.0
 # Files place things up to 5 cm above what they stand on and leave the fall to the simulator.
@@ -72,6 +73,8 @@ def _body(node: Node, asset: Asset, T: F64, kind: BodyKind, seen: set[str]) -> B
     body_id = node.get("id").text()
     if body_id in seen:
         raise node.get("id").error(f"two objects have the id {body_id!r}")
+    if len(seen) >= MAX_BODIES:
+        raise node.error(f"more than {MAX_BODIES} objects in one house", "Remove the house.")
     seen.add(body_id)
     mesh, parts_m = placed(*asset_geometry(asset), T)
     return Body(body_id, kind, asset.object_type, asset.asset_id, "", mesh, parts_m)

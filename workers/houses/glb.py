@@ -85,6 +85,8 @@ def _merged(pieces: list[Any]) -> Mesh:
     keep = (
         (indices[:, 0] != indices[:, 1]) & (indices[:, 1] != indices[:, 2]) & (indices[:, 0] != indices[:, 2])
     )
+    if not keep.any():
+        raise ValueError("no triangle with three different corners")
     return Mesh(
         (keys * 1e-5).astype(np.float32), indices[keep].astype(np.int32), np.concatenate(colours)[keep]
     )

@@ -25,7 +25,7 @@ from workers.houses.solids import join
 from workers.houses.walls import WINDOW_SILL_M, Hole, WallSegment, wall_bodies
 
 MAX_ROOMS = 200
-MAX_WALLS = 4000
+MAX_WALLS = 2000
 MAX_HOLES = 1000
 _MAX_HEIGHT_M = 30.0
 _DEFAULT_CEILING_M = 2.5

@@ -271,6 +271,25 @@ def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.Mo
         load(root)
 
 
+def test_a_stage_that_is_only_a_ceiling_is_refused(root: Path):
+    export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", [floor_at(2.5)])
+    with pytest.raises(InputError, match="a stage without walls or floor"):
+        load(root)
+
+
+def test_a_mesh_without_area_is_refused(root: Path):
+    point = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
+    export(root / "ai2thor/ai2thorhab-uncompressed/assets/objects/Mug_1.glb", [point])
+    with pytest.raises(InputError, match=r"Mug_1\.glb"):
+        load(root)
+
+
+def floor_at(height: float):
+    mesh = floor(0, 4, 0, 3, (200, 200, 200))
+    mesh.apply_translation((0, height, 0))
+    return mesh
+
+
 def test_folders_without_scenes(tmp_path: Path):
     with pytest.raises(InputError, match="ai2thor-hab/configs/scenes"):
         open_houses(f"ai2thor:{tmp_path}")

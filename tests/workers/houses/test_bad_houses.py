@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from schemas.errors import InputError
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
-from workers.houses import line_index, open_houses
+from workers.houses import furnishing, line_index, open_houses
 from workers.houses.asset_table import Asset
 from workers.houses.loader import build_house
 from workers.houses.reading import Node
