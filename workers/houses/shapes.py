@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from workers.geometry.mesh import F32, Mesh
+from workers.houses import fixture_shapes as x
 from workers.houses import furniture_shapes as f
 from workers.houses import small_shapes as s
 from workers.houses.asset_table import Asset
@@ -48,7 +49,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Candle": (s.column, ((240, 228, 200), (200, 80, 70))),
     "Cart": (f.cart, _METAL),
     "Chair": (f.chair, _WOOD),
-    "ClothesDryer": (f.washing_machine, _ENAMEL),
+    "ClothesDryer": (x.washing_machine, _ENAMEL),
     "CoffeeMachine": (s.coffee_machine, _METAL),
     "CoffeeTable": (f.side_table, _WOOD),
     "CounterTop": (f.counter, _WOOD),
@@ -62,7 +63,7 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Egg": (s.pebble, ((232, 214, 186),)),
     "FloorLamp": (s.lamp, _METAL),
     "Footstool": (f.stool, _WOOD),
-    "Fridge": (f.fridge, _METAL[:2] + _ENAMEL),
+    "Fridge": (x.fridge, _METAL[:2] + _ENAMEL),
     "GarbageBag": (s.pebble, ((40, 42, 46),)),
     "GarbageCan": (s.bin_, _METAL),
     "HousePlant": (s.plant, _CLAY),
@@ -86,25 +87,25 @@ SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "Shelf": (f.shelf, _WOOD),
     "ShelvingUnit": (f.shelf, _WOOD),
     "SideTable": (f.side_table, _WOOD),
-    "Sink": (f.sink, _ENAMEL),
+    "Sink": (x.sink, _ENAMEL),
     "SoapBottle": (s.dispenser, _PLASTIC),
     "Sofa": (f.sofa, _CLOTH),
     "SprayBottle": (s.dispenser, _PLASTIC),
     "Statue": (s.statue, _CLAY),
     "Stool": (f.stool, _WOOD),
-    "Stove": (f.stove, _METAL[:2] + _ENAMEL),
+    "Stove": (x.stove, _METAL[:2] + _ENAMEL),
     "TVStand": (f.tv_stand, _WOOD),
     "Table": (f.table, _WOOD),
     "TeddyBear": (s.teddy, ((150, 106, 66),)),
     "Television": (s.screen, ((38, 38, 42),)),
     "TissueBox": (s.block, _PLASTIC),
     "Toaster": (s.toaster, _METAL),
-    "Toilet": (f.toilet, _ENAMEL),
+    "Toilet": (x.toilet, _ENAMEL),
     "ToiletPaper": (s.column, _ENAMEL),
     "Tomato": (s.pebble, ((200, 52, 38),)),
     "Vase": (s.vase, _CLAY),
-    "WallCabinet": (f.wall_cabinet, _WOOD),
-    "WashingMachine": (f.washing_machine, _ENAMEL),
+    "WallCabinet": (x.wall_cabinet, _WOOD),
+    "WashingMachine": (x.washing_machine, _ENAMEL),
     "WineBottle": (s.bottle, _GLASS),
 }
 

@@ -217,6 +217,15 @@ def test_a_house_that_is_not_there(tmp_path: Path):
         source.load("x")
 
 
+def test_a_house_of_more_things_than_memory_would_bear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(furnishing, "MAX_BODIES", 50)
+    document = two_rooms()
+    document["objects"] = [thing(f"0|{k}", "Mug_1", xyz(1, 0.05, 1)) for k in range(60)]
+    source = open_houses(f"procthor:{write_houses(tmp_path, [document])}")
+    with pytest.raises(InputError, match=r"objects\[50\]: more than 50 objects"):
+        source.load("two-rooms")
+
+
 ASSETS = {
     k: Asset(k, v["objectType"], (v["size"][0], max(v["size"][2], 0.01), v["size"][1]))
     for k, v in SIZES.items()
