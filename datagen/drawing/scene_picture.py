@@ -52,7 +52,7 @@ def draw_scene_picture(
     clear = np.asarray(samples["base_is_clear"])
     draw_labels(axes[0, 1], xy, np.asarray(samples["label"]), clear)
     axes[0, 1].set_title("candidates by label")
-    axes[0, 1].legend(loc="upper right", fontsize=8)
+    axes[0, 1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8, frameon=False)
     score = np.asarray(samples["heuristic_score"])
     scale = draw_scores(axes[0, 2], xy, score, best_clear(score, clear))
     axes[0, 2].set_title("candidates by score H, best clear one in gold")
