@@ -1,0 +1,241 @@
+"""The main path from a specification to committed, sealed labels: rates, scaling, memory and size.
+
+    python -m benchmarks.throughput [--houses procthor:DIR] [--objects ycb:DIR] [--n 24000]
+                                    [--scenes 2000] [--quick]
+
+Whole runs through the functions of `datagen submit`, with Ray and a real store in a temporary
+folder; all figures come from the commit records. The steady rate of a job is the sum over its workers of
+labels per second from each worker's first commit to its last: it leaves out the start of Ray and
+the opening of sources, which are stated beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import stat
+import statistics
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from datagen.specify import specify
+from datagen.submit import JobSettings, manifest_of, run_job
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.run_records import Commit
+from schemas.seal import seal
+from schemas.storage import open_storage
+from workers.houses import open_houses
+from workers.objects import open_objects
+
+WANTED = 180_000
+CANDIDATES = 60
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one run cost. Times are wall seconds unless they say CPU."""
+
+    labels: int
+    scenes: int
+    whole_s: float  # Ray start, all shards, seal
+    ray_s: float  # start and end of the cluster
+    seal_s: float
+    opening_s: float  # what a worker's first attempt took longer than its others
+    steady_per_s: float  # labels
+    cpu_per_label_s: float
+    core_share: float  # CPU seconds per wall second of a worker in an attempt
+    write_share: float  # of a worker's steady time: encoding and writing a shard
+    between_share: float  # of a worker's steady time: commit, report and the way to the next attempt
+    peaks_bytes: tuple[int, ...]  # peak resident memory of each attempt of the busiest worker, in order
+    stored_bytes: int
+    disk_bytes: int  # with the blocks of files and folders
+
+
+def run(options: argparse.Namespace, n: int, workers: int, per_scene: int | str) -> Job:
+    """Make and seal n labels in a new folder and account for them."""
+    houses, objects = open_houses(options.houses), open_objects(options.objects)
+    fields: dict[str, Any] = {"seed": options.seed, "candidates.per_scene": per_scene}
+    if per_scene == "grid":
+        fields["candidates.robots_per_scene"] = 1
+    spec = specify("heuristic", houses, objects, fields, None)
+    with tempfile.TemporaryDirectory(dir=options.folder, prefix="datagen-throughput-") as folder:
+        out = f"{folder}/run"
+        manifest = manifest_of(spec, n, {"houses": options.houses, "objects": options.objects})
+        made = Run.create_or_open(open_storage(out), manifest, n)
+        settings = JobSettings(absolute(options.houses), absolute(options.objects), workers, "local", False)
+        started_s = time.perf_counter()
+        summary = run_job(made, settings)
+        ended_s = time.perf_counter()
+        if summary.end != "complete":
+            raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Mend that first")
+        seal(made)
+        sealed_s = time.perf_counter()
+        commits = sorted(made.commits(), key=lambda c: c.created)
+        return account(
+            commits,
+            Path(out),
+            sealed_s - started_s,
+            ended_s - started_s - summary.elapsed_s,
+            sealed_s - ended_s,
+        )
+
+
+def account(commits: Sequence[Commit], folder: Path, whole_s: float, ray_s: float, seal_s: float) -> Job:
+    """The figures of a job from its commits, in order of time, and its folder."""
+    by_worker: dict[int, list[Commit]] = defaultdict(list)
+    for commit in commits:
+        by_worker[commit.host.pid].append(commit)
+    rate = write_s = steady_s = between_s = 0.0
+    opening_s: list[float] = []
+    for own in by_worker.values():
+        if len(own) < 2:
+            continue
+        first, rest = own[0], own[1:]
+        span_s = seconds_of(own[-1]) - seconds_of(first)
+        rate += sum(c.samples for c in rest) / span_s
+        steady_s += span_s
+        write_s += sum(c.cost.stage_wall_s["write"] for c in rest)
+        between_s += span_s - sum(c.cost.wall_s for c in rest)
+        opening_s.append(first.cost.wall_s - statistics.median(c.cost.wall_s for c in rest))
+    if not steady_s:
+        raise InputError("--n", "", "no worker made two shards", "Ask for more labels")
+    labels = sum(c.samples for c in commits)
+    cpu_s, wall_s = sum(c.cost.cpu_s for c in commits), sum(c.cost.wall_s for c in commits)
+    longest = max(by_worker.values(), key=len)
+    stored, disk = sizes(folder)
+    return Job(
+        labels=labels,
+        scenes=sum(c.scenes for c in commits),
+        whole_s=whole_s,
+        ray_s=ray_s,
+        seal_s=seal_s,
+        opening_s=max(opening_s),
+        steady_per_s=rate,
+        cpu_per_label_s=cpu_s / labels,
+        core_share=cpu_s / wall_s,
+        write_share=write_s / steady_s,
+        between_share=between_s / steady_s,
+        peaks_bytes=tuple(c.cost.peak_rss_bytes for c in longest),
+        stored_bytes=stored,
+        disk_bytes=disk,
+    )
+
+
+def seconds_of(commit: Commit) -> float:
+    """When the commit was made."""
+    return datetime.fromisoformat(commit.created).timestamp()
+
+
+def sizes(folder: Path) -> tuple[int, int]:
+    """Bytes in files, and bytes in blocks with those of folders; a hard link counts once."""
+    entries = {s.st_ino: s for s in (p.lstat() for p in folder.rglob("*"))}.values()
+    stored = sum(s.st_size for s in entries if stat.S_ISREG(s.st_mode))
+    return stored, sum(s.st_blocks * 512 for s in entries)
+
+
+def absolute(ref: str) -> str:
+    """A source reference with its folder made absolute, as workers need it."""
+    kind, colon, folder = ref.partition(":")
+    return f"{kind}:{Path(folder).resolve()}" if colon else ref
+
+
+def main() -> None:
+    """Run the jobs and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--houses", default="builtin")
+    parser.add_argument("--objects", default="builtin")
+    parser.add_argument("--n", type=int, default=24_000, help="labels of the jobs with 60 candidates")
+    parser.add_argument("--scenes", type=int, default=2000, help="scenes of the memory job; 0 leaves it out")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, help="where the runs are written [the temporary folder]")
+    parser.add_argument("--quick", action="store_true", help="96 scenes a job, no memory job")
+    options = parser.parse_args()
+    if options.quick:
+        options.n, options.scenes = 96 * CANDIDATES, 0
+    scenes = -(-options.n // CANDIDATES)
+    print(f"load of the machine before: {os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} cores")
+    one = run(options, options.n, 1, CANDIDATES)
+    two = run(options, options.n, 2, CANDIDATES)
+    grid = run(options, scenes * 625, 2, "grid")
+    jobs = {"60, 1 worker": one, "60, 2 workers": two, "grid, 2 workers": grid}
+    print_jobs(jobs)
+    print_targets(one, two, grid)
+    if options.scenes:
+        print_memory(run(options, options.scenes * CANDIDATES, 1, CANDIDATES))
+
+
+def print_jobs(jobs: dict[str, Job]) -> None:
+    """One row a job."""
+    head = (
+        "job",
+        "labels",
+        "labels/s",
+        "steady",
+        "CPU ms",
+        "core",
+        "Ray s",
+        "open s",
+        "seal s",
+        "write",
+        "between",
+    )
+    print("{:<16}{:>9}{:>10}{:>8}{:>8}{:>7}{:>7}{:>8}{:>8}{:>8}{:>9}".format(*head))
+    for name, job in jobs.items():
+        print(
+            f"{name:<16}{job.labels:>9,}{job.labels / job.whole_s:>10,.0f}{job.steady_per_s:>8,.0f}"
+            f"{1e3 * job.cpu_per_label_s:>8.3f}{100 * job.core_share:>6.0f}%{job.ray_s:>7.1f}"
+            f"{job.opening_s:>8.1f}{job.seal_s:>8.2f}"
+            f"{100 * job.write_share:>7.1f}%{100 * job.between_share:>8.1f}%"
+        )
+    print(
+        "labels/s: with Ray's start, opening and sealing. steady: without. CPU ms: per label. core: share\n"
+        "of a core that a busy worker got; well below 100% another program used the machine, and rates\n"
+        "are too low. write, between: share of steady time; between covers commit, report and dispatch.\n"
+    )
+
+
+def print_targets(one: Job, two: Job, grid: Job) -> None:
+    """Figures beside what they should be."""
+    ratio = two.steady_per_s / one.steady_per_s
+    writing = two.write_share + two.between_share
+    per_label = two.stored_bytes / two.labels
+    size = per_label * WANTED
+    start_s = two.ray_s + two.opening_s
+    rows = [
+        ("labels/s, 60 candidates", f"{two.steady_per_s:,.0f}", ">= 500", two.steady_per_s >= 500),
+        ("labels/s, whole grid", f"{grid.steady_per_s:,.0f}", ">= 1,500", grid.steady_per_s >= 1500),
+        ("2 workers over 1", f"{ratio:.2f}", ">= 1.8", ratio >= 1.8),
+        ("  CPU a label, 2 over 1", f"{two.cpu_per_label_s / one.cpu_per_label_s:.2f}", "", True),
+        ("writing, committing", f"{100 * writing:.1f}%", "<= 5%", writing <= 0.05),
+        ("stored bytes a label", f"{per_label:,.0f}", "", True),
+        ("  with blocks of files", f"{two.disk_bytes / two.labels:,.0f}", "", True),
+        (f"{WANTED:,} labels, size", f"{size / 1e6:,.0f} MB", "< 400 MB", size < 400e6),
+        (f"{WANTED:,} labels, time", f"{(start_s + WANTED / two.steady_per_s) / 60:.1f} min", "", True),
+    ]
+    print(f"{'figure':<26}{'here':>10}{'target':>11}")
+    for name, value, target, reached in rows:
+        print(f"{name:<26}{value:>10}{target:>11}{'' if reached else '  MISSED'}")
+
+
+def print_memory(job: Job) -> None:
+    """Peak resident memory of one worker's attempts, early against late."""
+    later = job.peaks_bytes[1:]  # the first opens the sources
+    quarter = max(1, len(later) // 4)
+    first, last = statistics.median(later[:quarter]), statistics.median(later[-quarter:])
+    print(f"\nworker memory over {job.scenes:,} scenes in {len(job.peaks_bytes)} shards, peak of a shard, MB")
+    print(
+        f"first quarter {first / 1e6:,.0f}, last quarter {last / 1e6:,.0f}: {100 * (last / first - 1):+.1f}%"
+    )
+    points = [later[k * (len(later) - 1) // 9] / 1e6 for k in range(10)]
+    print("along the way: " + " ".join(f"{p:,.0f}" for p in points))
+
+
+if __name__ == "__main__":
+    main()
