@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from datagen.console import print_rows
 from datagen.drawing.scene_picture import best_clear, draw_scene_picture
 from datagen.scene_rows import read_scene
+from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 from schemas.identity import Stream, generator
 from schemas.run import Run
@@ -22,7 +23,7 @@ def show(
     run: Annotated[str, Parameter(help="The run's folder.")],
     *,
     out: Annotated[Path, Parameter(help="The picture to write, a .png file.")],
-    scene: Annotated[int, Parameter(help="Index of the scene.")] = 0,
+    scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
     houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
     objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
 ) -> int:

@@ -101,14 +101,21 @@ def _engines(spec: Specification) -> dict[str, str]:
 
 def _read_config(path: Path) -> dict[str, Any]:
     mend = "Give a TOML file as docs/data-format.md describes it"
+    if "\0" in str(path) or (path.exists() and not path.is_file()):
+        raise InputError(repr(str(path)), "--config", "is not a file", mend)  # a device has no end
     try:
         size = path.stat().st_size
         if size > _MAX_CONFIG_BYTES:
             raise InputError(path, "", f"{size} bytes is too large for a configuration", mend)
-        return tomllib.loads(path.read_text("utf-8"))
+        text = path.read_text("utf-8")
     except OSError as error:
         raise InputError(path, "", f"cannot be read: {error.strerror}", mend) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", f"is not TOML: {error}", mend) from None
+    try:
+        return tomllib.loads(text)
+    # A number of too many digits is a plain ValueError; broken TOML is one too.
+    except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"is not TOML: {error}", mend) from None
 
 

@@ -7,6 +7,7 @@ import platform
 import shlex
 import sys
 import tempfile
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -29,6 +30,7 @@ from cluster.task import ShardTask
 from datagen import __version__
 from datagen.console import print_rows, seconds
 from datagen.specify import layout_of, specify
+from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.record_files import now
@@ -49,7 +51,7 @@ def submit(
     label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic.")],
     /,
     *,
-    n: Annotated[int, Parameter(help="Labels wanted; a larger number later extends the run.")],
+    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number later extends the run.")],
     out: Annotated[str, Parameter(help="The run's folder.")],
     houses: Annotated[str, Parameter(help="builtin, procthor:DIR or ai2thor:DIR.")] = "builtin",
     objects: Annotated[str, Parameter(help="builtin or ycb:DIR.")] = "builtin",
@@ -57,13 +59,15 @@ def submit(
         str | None, Parameter(help="60 drawn from the 25x25 grid, another number, or grid for all 625.")
     ] = None,
     robots_per_scene: Annotated[
-        int | None, Parameter(help="Robots the candidates are dealt out to: 4, and 1 on a whole grid.")
+        int | None,
+        WHOLE_NUMBER,
+        Parameter(help="Robots the candidates are dealt out to: 4, and 1 on a whole grid."),
     ] = None,
     split: Annotated[
         Literal["train", "val", "test", "all"] | None,
         Parameter(help="Houses to use, disjoint by split [all]."),
     ] = None,
-    seed: Annotated[int | None, Parameter(help="Seed of the whole run [0].")] = None,
+    seed: Annotated[int | None, WHOLE_NUMBER, Parameter(help="Seed of the whole run [0].")] = None,
     settler: Annotated[
         str | None, Parameter(help="Physics: sapien, or pybullet [sapien, or what can be imported].")
     ] = None,
@@ -73,7 +77,9 @@ def submit(
     noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
     workers: Annotated[
-        int | None, Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers.")
+        int | None,
+        WHOLE_NUMBER,
+        Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
     ] = None,
     address: Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")] = "local",
     json: Annotated[
@@ -214,7 +220,11 @@ def finish(run: Run, summary: JobSummary, out: str) -> int:
             out, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume_command()}"
         )
     if summary.end == "failed":
-        sys.stderr.write(f"too many shards failed: see `datagen status {shlex.quote(out)}`\n")
+        causes = Counter(record.causes[-1] for record in run.quarantine_records() if record.causes)
+        most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
+        sys.stderr.write(
+            f"error: {out}: too many shards failed{most}. See: datagen status {shlex.quote(out)}\n"
+        )
     if summary.end == "interrupted":
         sys.stderr.write(
             f"interrupted with {summary.remaining} shards to go. Resume with:\n  {resume_command()}\n"
@@ -236,7 +246,7 @@ def _rate(summary: JobSummary) -> str:
 def _per_scene(text: str | None) -> int | str | None:
     if text is None or text == "grid":
         return text
-    if not text.isdigit() or not 1 <= int(text) <= 625:
+    if not (text.isascii() and text.isdigit() and len(text) < 9) or not 1 <= int(text) <= 625:
         raise InputError(
             "--candidates-per-scene", text, "is neither grid nor a number from 1 to 625", "Give 60, or grid"
         )

@@ -1,0 +1,196 @@
+"""Places that are no run, damaged and hostile runs, and disks that are full or closed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen import cli
+from schemas.run import Run
+from tests.refusals import refused
+from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two scenes. Tests only read it."""
+    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 2 * PER_SCENE)
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """The finished run, to be damaged."""
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("verb", ["status", "audit", "show"])
+@pytest.mark.parametrize("name", ["missing", "empty", "file", "foreign"])
+def test_a_place_that_is_no_run(
+    verb: str, name: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files_of(places["out"].parent)
+    more = ["--out", str(places["out"]) + ".png"] if verb == "show" else []
+    refused([verb, str(places[name]), *more], capsys, str(places[name]))
+    assert files_of(places["out"].parent) == before and not places["missing"].exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--scene", "2", "--out", "{tmp}/a.png"], ["--scene", "2", "0 to 1"]),
+        (["--scene", "-1", "--out", "{tmp}/a.png"], ["--scene", "-1"]),
+        (["--scene", "first", "--out", "{tmp}/a.png"], ["--scene", "first"]),
+        (["--scene", "9" * 30, "--out", "{tmp}/a.png"], ["--scene"]),
+        (["--out", "{tmp}/a.jpg"], ["a.jpg", ".png"]),
+        (["--out", "{tmp}/none/a.png"], ["{tmp}/none/a.png", "folder"]),
+        (["--houses", "builtin:3", "--out", "{tmp}/a.png"], ["--houses", "builtin"]),
+        (["--objects", "ycb:{tmp}", "--out", "{tmp}/a.png"], ["{tmp}"]),
+        ([], ["--out"]),
+    ],
+)
+def test_a_bad_picture(
+    arguments: list[str], words: list[str], finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    filled = [a.format(tmp=tmp_path) for a in arguments]
+    refused(["show", str(finished), *filled], capsys, *(w.format(tmp=tmp_path) for w in words))
+    assert list(tmp_path.iterdir()) == []
+
+
+def _edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def _reseed(path: Path) -> None:
+    _edit(path, lambda manifest: manifest["spec"].update(seed=9))
+
+
+DAMAGE: list[tuple[str, str, Callable[[Path], None], list[str]]] = [
+    ("manifest cut", "manifest.json", _cut, []),
+    ("manifest empty", "manifest.json", lambda p: p.write_text("") and None, []),
+    ("manifest a list", "manifest.json", lambda p: p.write_text("[]") and None, []),
+    ("manifest huge", "manifest.json", lambda p: p.write_text("[" * (64 << 20)) and None, ["bytes"]),
+    ("manifest deep", "manifest.json", lambda p: p.write_text("[" * 100_000) and None, []),
+    ("specification edited", "manifest.json", _reseed, ["spec_hash"]),
+    ("other format", "manifest.json", lambda p: _edit(p, lambda m: m.update(format_version=99)), ["99"]),
+    ("unknown key", "manifest.json", lambda p: _edit(p, lambda m: m.update(surprise=1)), ["surprise"]),
+    ("commit cut", "commits/000000.json", _cut, []),
+    ("commit of binary", "commits/000000.json", lambda p: p.write_bytes(b"\xff\x00") and None, []),
+    (
+        "commit that leaves the run", "commits/000000.json",
+        lambda p: _edit(p, lambda c: c.update(attempt="../../../etc")), ["attempt"],
+    ),
+    (
+        "commit with a path that leaves the run", "commits/000000.json",
+        lambda p: _edit(p, lambda c: c["files"][0].update(path="../../secret")), ["files.0.path"],
+    ),
+    (
+        "commit of another shard", "commits/000000.json",
+        lambda p: _edit(p, lambda c: c.update(shard=1)), ["shard"],
+    ),
+    (
+        "commit of another run", "commits/000000.json",
+        lambda p: _edit(p, lambda c: c.update(spec_hash="0" * 64)), ["spec_hash"],
+    ),
+    (
+        "commit with more rows", "commits/000000.json",
+        lambda p: _edit(p, lambda c: c.update(samples=10**9)), ["samples", "1000000000"],
+    ),
+    (
+        "commit of infinite cost", "commits/000000.json",
+        lambda p: p.write_text(p.read_text().replace('"wall_s":', '"wall_s":1e999,"was":', 1)) and None, [],
+    ),
+    ("plan cut", "plans/1.json", _cut, []),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", ["status", "audit", "submit", "show"])
+@pytest.mark.parametrize(("name", "key", "damage", "words"), DAMAGE, ids=[d[0] for d in DAMAGE])
+def test_a_damaged_run(
+    name: str, key: str, damage: Callable[[Path], None], words: list[str], verb: str, copied: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    if verb == "audit" and key.startswith("plans"):
+        verb = "status"  # an audit counts what is there, whatever was planned
+    damage(copied / key)
+    before = files_of(copied)
+    arguments = {
+        "submit": submit_arguments(copied, 2 * PER_SCENE),
+        "show": ["show", str(copied), "--out", str(copied.parent / "a.png")],
+    }
+    refused(arguments.get(verb, [verb, str(copied)]), capsys, f"{copied}/{key}", *words)
+    assert files_of(copied) == before
+    assert not (copied.parent / "a.png").exists()
+
+
+def test_a_shard_file_that_was_changed(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    commit = Run.open(copied).commit_of(0)
+    folder = copied / "shards" / "000000" / commit.attempt
+    file = next(folder / e.path for e in commit.files if e.path.endswith("/c.0"))
+    file.chmod(0o644)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(bytes(data))
+    picture = copied.parent / "a.png"
+    refused(["show", str(copied), "--out", str(picture)], capsys, str(folder))
+    assert not picture.exists()
+
+
+# Disks -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 256 kB, less than a small run needs."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or shutil.which("mount") is None or subprocess.run(command, check=False).returncode:
+        pytest.skip("mounting a small file system needs the rights of root")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tiny_disk / "run"
+    file = tmp_path / "small.toml"
+    file.write_text(CONFIG)
+    arguments = ["submit", "heuristic", "--n", "128", "--out", str(run), "--candidates-per-scene", "8"]
+    assert cli.run([*arguments, "--workers", "0", "--config", str(file)]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("{")]
+    assert len(told) == 1 and "No space left on device" in told[0] and "resume" in told[0].lower()
+    assert not (run / "data.zarr").exists()
+    for commit in Run.open(run).commits():  # what counts is whole
+        Run.open(run).check_digests(commit)
+
+
+def test_a_place_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    # Everything is imported and loaded by a first run: another user may not read this interpreter.
+    make_small_run(tmp_path / "first", PER_SCENE)
+    is_root = os.geteuid() == 0
+    closed.chmod(0o555)
+    if is_root:
+        os.seteuid(65534)
+    try:
+        arguments = ["submit", "heuristic", "--n", "8", "--out", str(closed / "run"), "--workers", "0"]
+        refused(arguments, capsys, str(closed / "run"), "Permission denied")
+    finally:
+        if is_root:
+            os.seteuid(0)
+        closed.chmod(0o755)
+    assert list(closed.iterdir()) == []

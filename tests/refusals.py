@@ -1,0 +1,22 @@
+"""What a refused command line must look like."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from datagen import cli
+
+
+def refused(arguments: list[str], capture: pytest.CaptureFixture[str], *words: str) -> str:
+    """Run a command line that must be refused; its one line of error, which holds all the words."""
+    capture.readouterr()
+    assert cli.run(arguments) == 2
+    told = capture.readouterr().err
+    assert told.count("\n") == 1 and told.startswith("error: "), told
+    assert "Traceback" not in told and len(told) < 2000
+    assert re.search(r"[.!] (See: datagen|[A-Z`]\S* \S)|Choose from: ", told), f"no mend in: {told}"
+    for word in words:
+        assert word in told, f"{word!r} not in: {told}"
+    return told
