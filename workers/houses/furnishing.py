@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -85,14 +86,22 @@ def _pose(node: Node, asset: Asset) -> tuple[F64, float]:
     x, y, z = node.get("position").point()
     turn = node.get("rotation")
     pitch, yaw, roll = (turn.get(k).number(-_MAX_ANGLE_DEG, _MAX_ANGLE_DEG) for k in "xyz")
-    rotation = unity_rotation(pitch, yaw, roll)
+    upright = _upright_rotation(yaw + 0.0)  # adding makes -0.0 the key of 0.0
+    rotation = upright if pitch == roll == 0 else unity_rotation(pitch, yaw, roll)
     tilt_deg = float(np.degrees(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0))))
     T = np.eye(4)
     if tilt_deg <= _UPRIGHT_DEG:
-        rotation = unity_rotation(0.0, yaw, 0.0)
+        rotation = upright
     T[:3, :3] = rotation
     T[:3, 3] = np.array([x, z, y]) - rotation @ (0.0, 0.0, asset.size_m[2] / 2)
     return T, tilt_deg
+
+
+@lru_cache(maxsize=256)  # most things stand at one of four angles
+def _upright_rotation(yaw_deg: float) -> F64:
+    rotation = unity_rotation(0.0, yaw_deg, 0.0)
+    rotation.setflags(write=False)
+    return rotation
 
 
 def unity_rotation(x_deg: float, y_deg: float, z_deg: float) -> F64:
