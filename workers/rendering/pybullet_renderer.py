@@ -18,8 +18,9 @@ from workers.geometry.transforms import inverse, look_at, quaternion_wxyz
 from workers.rendering.face_texture import face_normals, face_texture
 from workers.rendering.frame import I16, Camera, Frame, Stage
 
-# Depth range; what is nearer or farther is not drawn.
-_NEAR_M, _FAR_M = 0.02, 60.0
+# What is nearer or farther is not drawn. A near plane far off keeps depth sharp; one close to the
+# eye shows the wall that an eye stands in.
+_NEAR_M, _NEAR_FOR_BODIES_M, _FAR_M = 0.02, 0.001, 60.0
 # Bullet silently drops what exceeds 131,072 vertices of one mesh.
 _MAX_FACES = 40_000
 _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
@@ -41,7 +42,9 @@ class PybulletStage:
         self._alone: dict[int, _Drawing] = {}
         with ExitStack() as undo:  # a stage that fails to load leaves nothing behind
             self._full = undo.enter_context(_Drawing())
-            self._full.add(concatenate([body.visual for body in stage.house.bodies]), np.eye(4), 0)
+            # An eye within a wall or a cupboard sees it from inside.
+            house = concatenate([body.visual for body in stage.house.bodies])
+            self._full.add(house, np.eye(4), 0, both_sides=True)
             for k, model in enumerate(stage.objects):
                 self._full.add(model.visual, stage.T_world_object[k], 1 + k)
             self._closing = undo.pop_all()
@@ -103,17 +106,23 @@ class _Drawing:
     ) -> None:
         pybullet.disconnect(physicsClientId=self._world)
 
-    def add(self, mesh: Mesh, T_world_mesh: F64, label: int) -> None:
-        """Draw a mesh at a pose (4, 4); its pixels report `label`."""
+    def add(self, mesh: Mesh, T_world_mesh: F64, label: int, both_sides: bool = False) -> None:
+        """Draw a mesh at a pose (4, 4); its pixels report `label`.
+
+        TinyRenderer drops faces seen from behind whatever its flags say, so that `both_sides` adds
+        each face a second time, turned.
+        """
         uv, image = face_texture(mesh)
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
             file = Path(folder) / "texture.png"
             Image.fromarray(image).save(file)
             texture = pybullet.loadTexture(str(file), physicsClientId=self._world)
         corners = mesh.vertices_m[mesh.faces]  # (F, 3, 3)
+        if both_sides:
+            corners, uv = (np.concatenate([rows, rows[:, ::-1]]) for rows in (corners, uv))
         normals = face_normals(corners)
         w, x, y, z = quaternion_wxyz(T_world_mesh[:3, :3]).tolist()
-        for start in range(0, len(mesh.faces), _MAX_FACES):
+        for start in range(0, len(corners), _MAX_FACES):
             chunk = slice(start, start + _MAX_FACES)
             n = 3 * len(corners[chunk])
             shape = pybullet.createVisualShape(
@@ -135,7 +144,7 @@ class _Drawing:
             self._label_of_body.append(label)
 
     def render(self, camera: Camera) -> Frame:
-        rgba, buffer, segments = self._image(camera)
+        rgba, buffer, segments = self._image(camera, _NEAR_M)
         body = self._labels(segments)
         # The buffer holds OpenGL's window depth, which is not linear in metres.
         depth_m = _FAR_M * _NEAR_M / (_FAR_M - (_FAR_M - _NEAR_M) * buffer.astype(np.float64))
@@ -144,19 +153,19 @@ class _Drawing:
 
     def bodies(self, camera: Camera) -> I16:
         """The labels (H, W) that a camera sees; -1 for none."""
-        return self._labels(self._image(camera)[2])
+        return self._labels(self._image(camera, _NEAR_FOR_BODIES_M)[2])
 
     def _labels(self, segments: npt.NDArray[np.int32]) -> I16:
         labels = np.array([*self._label_of_body, -1], np.int16)  # -1, the background, takes the last
         return labels[segments]
 
-    def _image(self, camera: Camera) -> tuple[U8, F32, npt.NDArray[np.int32]]:
+    def _image(self, camera: Camera, near_m: float) -> tuple[U8, F32, npt.NDArray[np.int32]]:
         h, w = camera.height_px, camera.width_px
         _, _, rgba, buffer, segments = pybullet.getCameraImage(
             w,
             h,
             _view_matrix(camera),
-            _projection_matrix(camera),
+            _projection_matrix(camera, near_m),
             lightDirection=_LIGHT_DIRECTION,
             lightAmbientCoeff=_AMBIENT,
             lightDiffuseCoeff=_DIFFUSE,
@@ -179,7 +188,7 @@ def _view_matrix(camera: Camera) -> list[float]:
     return columns
 
 
-def _projection_matrix(camera: Camera) -> list[float]:
+def _projection_matrix(camera: Camera, near_m: float) -> list[float]:
     """OpenGL's projection for a pinhole whose principal point need not be the middle, by columns."""
     w, h = camera.width_px, camera.height_px
     # TinyRenderer samples a pixel at its lower left corner, not at its centre (measured).
@@ -187,8 +196,8 @@ def _projection_matrix(camera: Camera) -> list[float]:
     P = np.zeros((4, 4))
     P[0, 0], P[0, 2] = 2 * camera.fx_px / w, 1 - 2 * cx_px / w
     P[1, 1], P[1, 2] = 2 * camera.fy_px / h, 2 * cy_px / h - 1
-    P[2, 2] = -(_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M)
-    P[2, 3] = -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M)
+    P[2, 2] = -(_FAR_M + near_m) / (_FAR_M - near_m)
+    P[2, 3] = -2 * _FAR_M * near_m / (_FAR_M - near_m)
     P[3, 2] = -1.0
     columns: list[float] = P.T.ravel().tolist()
     return columns

@@ -9,7 +9,7 @@ import pybullet
 import pytest
 
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
-from tests.workers.worlds import camera_at, table_house
+from tests.workers.worlds import box_body, camera_at, table_house
 from workers.geometry.mesh import Mesh
 from workers.rendering.embree_renderer import ray_stage, render_embree
 from workers.rendering.frame import Camera, Stage
@@ -36,6 +36,18 @@ def test_textures_and_face_colours_are_where_they_belong() -> None:
     for label, channel in ((1, 0), (2, 2), (3, 1)):
         assert frame.rgb[frame.body == label].mean(0).argmax() == channel
         assert reference.rgb[reference.body == label].mean(0).argmax() == channel
+
+
+@pytest.mark.parametrize("towards_m", [(2.0, 1.5, 0.8), (0.0, 0.2, 1.4)])
+def test_an_eye_within_a_wall_sees_the_wall(towards_m: tuple[float, float, float]) -> None:
+    thick = box_body("wall|9", "wall", "Wall", (0.2, 1.0, 2.0), (1.0, 1.5, 1.0))
+    stage = Stage(table_house([thick]), (), np.zeros((0, 4, 4)))
+    camera = camera_at((1.02, 1.4, 1.2), towards_m, 80, 60, 60.0)
+    assert_same_view(render_pybullet(stage, camera), render_embree(stage, camera))
+    with PybulletStage(mixed_stage()) as loaded:
+        assert loaded.visible_pixels(0, np.array([[2.0, -0.004, 1.0], [2.0, -0.05, 1.0]]), 32)[
+            1
+        ].tolist() == [0, 0]
 
 
 def test_where_nothing_stands_there_is_no_depth_and_no_body() -> None:
