@@ -13,7 +13,7 @@ from schemas.errors import InputError, choices
 from schemas.run_records import Layout
 from schemas.specification import Source, Specification
 from workers.houses.house import HouseSource
-from workers.labels import LABEL_SOURCES
+from workers.labels import load_label_source
 from workers.objects.model import ObjectSource
 from workers.rendering import RENDERERS, load_renderer
 from workers.settling import SETTLERS, first_settler, load_settler
@@ -68,7 +68,6 @@ def specify(
         )
         raise InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend) from None
     for field, name, registry in (
-        ("label_source", spec.label_source, LABEL_SOURCES),
         ("settle.engine", spec.settle.engine, SETTLERS),
         ("observation.renderer", spec.observation.renderer, RENDERERS),
     ):
@@ -95,7 +94,7 @@ def _engines(spec: Specification) -> dict[str, str]:
     engines = {_ENGINE_PACKAGES[name]: version(_ENGINE_PACKAGES[name]) for name in sorted(names)}
     # numpy may change what a generator draws between feature releases, never between patches.
     engines["numpy"] = ".".join(version("numpy").split(".")[:2])
-    engines["labels"] = str(LABEL_SOURCES[spec.label_source].version)
+    engines["labels"] = str(load_label_source(spec.label_source).version)
     return engines
 
 

@@ -40,7 +40,7 @@ from schemas.seal import seal
 from schemas.specification import Specification
 from schemas.storage import open_storage
 from workers.houses import open_houses
-from workers.labels import LABEL_SOURCES
+from workers.labels import load_label_source
 from workers.objects import open_objects
 from workers.world import assemble_world
 
@@ -92,9 +92,7 @@ def submit(
     specification is refused with the fields that differ. Ctrl-C once finishes what is in flight,
     twice ends it at once; nothing that is committed is lost.
     """
-    if label_source not in LABEL_SOURCES:
-        known = ", ".join(sorted(LABEL_SOURCES))
-        raise InputError("datagen submit", label_source, "no such label source", f"Choose one of: {known}")
+    load_label_source(label_source)  # refuses an unknown one
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
     if workers is not None and not 0 <= workers <= 4096:
@@ -117,7 +115,7 @@ def submit(
     house_source, object_source = open_houses(houses), open_objects(objects)
     spec = specify(label_source, house_source, object_source, options, config)
     assemble_world(spec, house_source, object_source, houses, objects)  # refuses what cannot work, now
-    manifest = manifest_of(spec, n, {"houses": houses, "objects": objects})
+    manifest = manifest_of(spec, n, {"houses": _absolute(houses), "objects": _absolute(objects)})
     run = Run.create_or_open(open_storage(out), manifest, n)
     settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json)
     summary = run_job(run, settings)
@@ -137,7 +135,7 @@ class JobSettings:
 
 def manifest_of(spec: Specification, n: int, sources: dict[str, str]) -> Manifest:
     """The manifest of a new run of n labels."""
-    source = LABEL_SOURCES[spec.label_source]
+    source = load_label_source(spec.label_source)
     return Manifest(
         spec=spec,
         spec_hash=spec.hash(),
@@ -254,6 +252,8 @@ def _per_scene(text: str | None) -> int | str | None:
 
 
 def _absolute(ref: str) -> str:
-    """A source reference with its folder made absolute: workers run elsewhere."""
-    kind, colon, folder = ref.partition(":")
-    return f"{kind}:{Path(folder).resolve()}" if colon else ref
+    """A source reference with its file or folder made absolute: workers run elsewhere."""
+    kind, _, text = ref.partition(":")
+    # What names no file is a parameter of the source, as in builtin:400.
+    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
+    return f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref

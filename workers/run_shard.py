@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from schemas.cost import StageClock
-from schemas.errors import InputError, choices
 from schemas.fields import REDRAW_CAUSES, sized_schema
 from schemas.identity import Stream, generator, sample_ids
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates, draw_candidates
 from workers.bases.clearance import base_clearance_m
-from workers.labels import LABEL_SOURCES
+from workers.labels import load_label_source
 from workers.labels.source import LabelSource
 from workers.rendering.frame import Camera
 from workers.scenes.draw import draw_scene
@@ -49,7 +48,7 @@ def run_shard(spec: Specification, world: World, scene_indices: Sequence[int]) -
 
     The same specification and index give the same bytes, whatever else is in the shard.
     """
-    source, spec_hash = label_source_of(spec), spec.hash()
+    source, spec_hash = load_label_source(spec.label_source), spec.hash()
     schema = sized_schema(source.schema, spec)
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[dict[str, Any]] = []
@@ -69,15 +68,6 @@ def run_shard(spec: Specification, world: World, scene_indices: Sequence[int]) -
     schema.check("scene", len(scene_rows), scenes)
     schema.check("sample", sum(len(b["label"]) for b in sample_blocks), samples)
     return ShardResult(scenes, samples, clock, dict(redraws))
-
-
-def label_source_of(spec: Specification) -> LabelSource:
-    """The label source of a specification. Raises InputError where there is none of that name."""
-    if spec.label_source not in LABEL_SOURCES:
-        raise InputError(
-            "specification", "label_source", f"no source {spec.label_source!r}", choices(LABEL_SOURCES)
-        )
-    return LABEL_SOURCES[spec.label_source]
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

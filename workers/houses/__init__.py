@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 
 from schemas.errors import InputError, choices
 from workers.houses.house import HouseSource
 from workers.houses.split import ids_of_split, split_of
 
-
-def _builtin(text: str) -> HouseSource:
-    from workers.houses.builtin import open_builtin
-
-    return open_builtin(text)
-
-
-def _procthor(text: str) -> HouseSource:
-    from workers.houses.procthor import open_procthor
-
-    return open_procthor(text)
-
-
-def _ai2thor(text: str) -> HouseSource:
-    from workers.houses.ai2thor import open_ai2thor
-
-    return open_ai2thor(text)
-
-
-# Each opens the source that the text after the colon of a reference describes.
-HOUSE_SOURCES: dict[str, Callable[[str], HouseSource]] = {
-    "builtin": _builtin,
-    "procthor": _procthor,
-    "ai2thor": _ai2thor,
+# Name -> module and function that opens the source which the text after a reference's colon
+# describes. A kind's module is imported when it is asked for.
+HOUSE_SOURCES: dict[str, str] = {
+    "builtin": "workers.houses.builtin:open_builtin",
+    "procthor": "workers.houses.procthor:open_procthor",
+    "ai2thor": "workers.houses.ai2thor:open_ai2thor",
 }
 
 
@@ -40,7 +22,9 @@ def open_houses(ref: str) -> HouseSource:
     kind, _, text = ref.partition(":")
     if kind not in HOUSE_SOURCES:
         raise InputError("--houses", kind, "no such kind of houses", choices(HOUSE_SOURCES) + ".")
-    return HOUSE_SOURCES[kind](text)
+    module, function = HOUSE_SOURCES[kind].split(":")
+    source: HouseSource = getattr(import_module(module), function)(text)
+    return source
 
 
 __all__ = ["HOUSE_SOURCES", "HouseSource", "ids_of_split", "open_houses", "split_of"]

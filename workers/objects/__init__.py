@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+from importlib import import_module
 
 from schemas.errors import InputError, choices
-from workers.objects.builtin import BuiltinObjects
 from workers.objects.model import ObjectModel, ObjectSource
-from workers.objects.ycb import YcbObjects
 
 __all__ = ["OBJECT_SOURCES", "ObjectModel", "ObjectSource", "open_objects"]
 
 
-def _open_builtin(argument: str) -> ObjectSource:
-    if argument:
-        raise InputError(f"builtin:{argument}", "", "the built-in objects take no folder", "Write `builtin`")
-    return BuiltinObjects()
-
-
-def _open_ycb(argument: str) -> ObjectSource:
-    if not argument:
-        raise InputError("ycb", "", "the folder is missing", "Write `ycb:DIR`")
-    return YcbObjects(Path(argument).expanduser())
-
-
-# Each takes what follows the first colon of a reference, "" where there is none.
-OBJECT_SOURCES: dict[str, Callable[[str], ObjectSource]] = {
-    "builtin": _open_builtin,
-    "ycb": _open_ycb,
+# Name -> module and function that opens the source; it takes what follows the first colon of a
+# reference, "" where there is none. A kind's module is imported when it is asked for.
+OBJECT_SOURCES: dict[str, str] = {
+    "builtin": "workers.objects.builtin:open_builtin",
+    "ycb": "workers.objects.ycb:open_ycb",
 }
 
 
@@ -40,4 +26,6 @@ def open_objects(ref: str) -> ObjectSource:
     kind, _, argument = ref.partition(":")
     if kind not in OBJECT_SOURCES:
         raise InputError(ref or "objects", "", f"{kind!r} is no object source", choices(OBJECT_SOURCES))
-    return OBJECT_SOURCES[kind](argument)
+    module, function = OBJECT_SOURCES[kind].split(":")
+    source: ObjectSource = getattr(import_module(module), function)(argument)
+    return source

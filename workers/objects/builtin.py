@@ -60,6 +60,13 @@ class BuiltinObjects:
         return model
 
 
+def open_builtin(argument: str) -> BuiltinObjects:
+    """The built-in objects; `argument` is empty."""
+    if argument:
+        raise InputError(f"builtin:{argument}", "", "the built-in objects take no folder", "Write `builtin`")
+    return BuiltinObjects()
+
+
 def _digest(name: str) -> str:
     return digest_of([GENERATOR_VERSION, name, PUBLISHED_MASS_KG[name], RECIPES[name]])
 

@@ -82,3 +82,10 @@ def _model(entry: Entry, mass_kg: float, scan: Scan) -> ObjectModel:
         convex_parts_m=scan.parts.vertices_m,
         can_be_target=fits_gripper(scan.visual.vertices_m, scan.parts, mass_kg),
     )
+
+
+def open_ycb(folder: str) -> YcbObjects:
+    """The objects of a folder. Raises InputError where none is named, and as `YcbObjects` does."""
+    if not folder:
+        raise InputError("ycb", "", "the folder is missing", "Write `ycb:DIR`")
+    return YcbObjects(Path(folder).expanduser())
