@@ -114,7 +114,7 @@ class _Drawing:
         """
         uv, image = face_texture(mesh)
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
-            file = Path(folder) / "texture.png"
+            file = Path(folder) / "texture.bmp"
             Image.fromarray(image).save(file)
             texture = pybullet.loadTexture(str(file), physicsClientId=self._world)
         corners = mesh.vertices_m[mesh.faces]  # (F, 3, 3)
