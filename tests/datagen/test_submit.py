@@ -30,6 +30,7 @@ from tests.small_runs import (
     make_small_run,
     submit_arguments,
 )
+from tests.workers.objects.toy_set import write_bundle
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 N, LONG_N = 8 * PER_SCENE, 16 * PER_SCENE
@@ -238,3 +239,19 @@ def test_ctrl_c_says_how_to_resume_and_that_command_completes(finished_long: Pat
     (line,) = [line for line in told.splitlines() if line.strip().startswith("datagen ")]
     assert cli.run(shlex.split(line)[1:]) == 0
     assert_equal_runs(arrays_of(run), arrays_of(finished_long))
+
+
+def test_a_count_of_built_in_houses_and_a_relative_folder_reach_the_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_small_run(tmp_path / "run", PER_SCENE, "--houses", "builtin:30")
+    assert Run.open(run).manifest.sources == {"houses": "builtin:30", "objects": "builtin"}
+    folder = tmp_path / "objects"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    arguments = submit_arguments(tmp_path / "other", PER_SCENE, "--objects", "ycb:objects")
+    assert cli.run(arguments) == 2  # an empty folder, found from here
+    write_bundle(folder, *(f"{k:03d}_cube" for k in range(8)))
+    assert cli.run(arguments) == 0
+    monkeypatch.chdir("/")
+    assert cli.run(["show", str(tmp_path / "other"), "--out", str(tmp_path / "a.png")]) == 0
