@@ -27,7 +27,7 @@ from workers.objects import open_objects
 from workers.rendering.embree_renderer import ray_stage
 from workers.rendering.frame import Stage
 from workers.rendering.pybullet_renderer import PybulletStage
-from workers.rendering.rays import RayStage, first_hits
+from workers.rendering.rays import RayStage, first_hits, into_frame
 from workers.rendering.visibility import visible_pixels
 from workers.scenes.draw import draw_scene
 from workers.world import assemble_world
@@ -130,10 +130,15 @@ def stand_in_surfaces(rays: RayStage, eyes_m: F64) -> np.ndarray:
     centre_m = rays.T_world_object[0, :3, 3]
     distance_m = np.linalg.norm(centre_m - eyes_m, axis=1)
     towards = ((centre_m - eyes_m) / distance_m[:, None]).astype(np.float32)
-    hits = first_hits(rays.house, eyes_m.astype(np.float32), towards)
-    found = (hits.face >= 0) & (hits.parameter < distance_m)
-    behind = np.einsum("ij,ij->i", rays.house.normals[hits.face], towards) > 0
-    return found & (behind | (hits.parameter < NEAR_M))
+    first_m, behind = distance_m.copy(), np.zeros(len(eyes_m), bool)
+    bodies = [(rays.house, np.eye(4)), *zip(rays.objects[1:], rays.T_world_object[1:], strict=True)]
+    for body, T_world_body in bodies:
+        origins, directions = into_frame(T_world_body, eyes_m.astype(np.float32), towards)
+        hits = first_hits(body, origins, directions)
+        first = (hits.face >= 0) & (hits.parameter < first_m)
+        from_behind = np.einsum("ij,ij->i", body.normals[hits.face], directions) > 0
+        first_m, behind = np.where(first, hits.parameter, first_m), np.where(first, from_behind, behind)
+    return behind | (first_m < NEAR_M)
 
 
 def print_speed(labels: int, scenes: int, embree: Spent, tiny: Spent) -> None:
