@@ -233,6 +233,10 @@ def print_memory(job: Job) -> None:
     print(
         f"first quarter {first / 1e6:,.0f}, last quarter {last / 1e6:,.0f}: {100 * (last / first - 1):+.1f}%"
     )
+    middle = statistics.median(later[2 * quarter : 3 * quarter] or later)
+    print(
+        f"third quarter {middle / 1e6:,.0f}, to the last {100 * (last / middle - 1):+.1f}%: the growth that stays"
+    )
     points = [later[k * (len(later) - 1) // 9] / 1e6 for k in range(10)]
     print("along the way: " + " ".join(f"{p:,.0f}" for p in points))
 
