@@ -235,7 +235,7 @@ def print_memory(job: Job) -> None:
     )
     middle = statistics.median(later[2 * quarter : 3 * quarter] or later)
     print(
-        f"third quarter {middle / 1e6:,.0f}, to the last {100 * (last / middle - 1):+.1f}%: the growth that stays"
+        f"third quarter {middle / 1e6:,.0f}, to the last {100 * (last / middle - 1):+.1f}%: what still grows"
     )
     points = [later[k * (len(later) - 1) // 9] / 1e6 for k in range(10)]
     print("along the way: " + " ".join(f"{p:,.0f}" for p in points))
