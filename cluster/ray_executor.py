@@ -11,6 +11,7 @@ import logging
 import os
 import platform
 import signal
+import socket
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -129,6 +130,24 @@ class RayExecutor(Generic[T]):
             return obituary(task, "crashed", "the worker process died (killed, or ended by native code)")
         except e.RayError as error:  # node, raylet, owner or object gone: the shard is not to blame
             return obituary(task, "lost", f"{type(error).__name__}: {_first_line(error)}")
+
+
+def refuse_unreachable(address: str) -> None:
+    """Raise InputError where nothing listens at a `[ray://]HOST:PORT`; `local` and `auto` pass.
+
+    Ray itself tries for minutes, and with messages of its own.
+    """
+    if address in ("local", "auto"):
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    mend = "Start Ray there and give HOST:PORT, or use --address local"
+    if not host or not (port.isascii() and port.isdigit() and len(port) < 6):
+        raise InputError("--address", address, "not the address of a cluster", mend)
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+    # A name that cannot be encoded is a ValueError, a port above 65535 an OverflowError.
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError("--address", address, f"cannot be reached ({error})", mend) from None
 
 
 @contextmanager

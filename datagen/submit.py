@@ -23,7 +23,7 @@ from cluster.executor import Executor
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy
 from cluster.progress import progress
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster, refuse_unreachable
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask
@@ -99,6 +99,8 @@ def submit(
         raise InputError(
             "--workers", str(workers), "is not between 0 and 4096", "Leave it out for one a core"
         )
+    if workers != 0:
+        refuse_unreachable(address)
     per_scene = _per_scene(candidates_per_scene)
     options = {
         "seed": seed,

@@ -78,6 +78,17 @@ def test_a_bad_option(
     assert not places["out"].exists() and not places["missing"].exists()
 
 
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1:1", "ray://127.0.0.1:1", "here", "", ":", "a:b", "127.0.0.1:99999"]
+)
+def test_a_cluster_that_is_not_there(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["submit", "heuristic", "--n", "16", "--out", str(tmp_path / "out"), "--address", address]
+    refused(arguments, capsys, "--address", address, "--address local")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("source", ["plan", "Heuristic", "", "--n"])
 def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["submit", source, "--n", "16", "--out", str(tmp_path / "out"), "--workers", "0"], capsys)
