@@ -14,7 +14,7 @@ help:
 	@echo "make test    format check, lint, types, layers, tests"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
-	@echo "make docs    rewrite docs/data-format.md from the schemas"
+	@echo "make docs    rewrite docs/data-format.md and docs/specification.md from the schemas"
 	@echo "make venv    only the environment (.venv); PYTHON=python3.12 chooses another interpreter"
 	@echo "make clean   remove everything that make made"
 
@@ -49,6 +49,8 @@ docs: venv
 	@mkdir -p build
 	$(BIN)/python -m schemas.data_format > build/data-format.md
 	mv build/data-format.md docs/data-format.md
+	$(BIN)/python -m schemas.specification_page > build/specification.md
+	mv build/specification.md docs/specification.md
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info

@@ -16,6 +16,7 @@ from workers.houses.house import HouseSource
 from workers.labels import load_label_source
 from workers.objects.model import ObjectSource
 from workers.rendering import RENDERERS, load_renderer
+from workers.scenes import VERSION as SCENES_VERSION
 from workers.settling import SETTLERS, first_settler, load_settler
 
 _MAX_CONFIG_BYTES = 1 << 20
@@ -62,7 +63,7 @@ def specify(
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
         mend = (
-            "Take the key out, or correct it: docs/data-format.md lists all"
+            "Take the key out, or correct it: docs/specification.md lists all"
             if (first["type"] == "extra_forbidden")
             else "Correct the value"
         )
@@ -94,12 +95,13 @@ def _engines(spec: Specification) -> dict[str, str]:
     engines = {_ENGINE_PACKAGES[name]: version(_ENGINE_PACKAGES[name]) for name in sorted(names)}
     # numpy may change what a generator draws between feature releases, never between patches.
     engines["numpy"] = ".".join(version("numpy").split(".")[:2])
+    engines["scenes"] = str(SCENES_VERSION)
     engines["labels"] = str(load_label_source(spec.label_source).version)
     return engines
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    mend = "Give a TOML file as docs/data-format.md describes it"
+    mend = "Give a TOML file as docs/specification.md shows it"
     if "\0" in str(path) or (path.exists() and not path.is_file()):
         raise InputError(repr(str(path)), "--config", "is not a file", mend)  # a device has no end
     try:

@@ -28,10 +28,10 @@ class Source(_Frozen):
 
 
 class Range(_Frozen):
-    """A closed interval from which a number is drawn uniformly."""
+    """A closed interval, in metres, from which a length is drawn uniformly."""
 
-    low: float
-    high: float
+    low: Metres
+    high: Metres
 
     @model_validator(mode="after")
     def _ordered(self) -> Range:
@@ -41,7 +41,7 @@ class Range(_Frozen):
 
 
 class SceneParams(_Frozen):
-    """Choice of support surface, target and clutter (DESIGN: Scene)."""
+    """Choice of support surface, target and clutter."""
 
     n_clutter: int = Field(default=6, ge=0, le=30)
     support_height_m: Range = Range(low=0.3, high=1.2)

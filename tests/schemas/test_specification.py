@@ -1,0 +1,94 @@
+"""Specifications: frozen, strict, and hashed over all that changes a sample."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from datagen.specify import layout_of
+from schemas.fields import SCHEMAS, Field
+from schemas.specification import Source, Specification
+
+SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}
+SPEC = Specification.model_validate(SOURCES)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": 1},
+        {"split": "val"},
+        {"label_source": "plan"},
+        {"houses": Source(kind="a", digest="3" * 64)},
+        {"scene": {"n_clutter": 5}},
+        {"settle": {"engine": "pybullet"}},
+        {"observation": {"noise": {"enabled": True}}},
+        {"candidates": {"per_scene": "grid"}},
+        {"visibility": {"window_px": 32}},
+        {"heuristic": {"mu": 0.5}},
+        {"engines": {"sapien": "4"}},
+    ],
+)
+def test_every_part_moves_the_hash(change: dict[str, Any]) -> None:
+    assert Specification.model_validate(SOURCES | change).hash() != SPEC.hash()
+
+
+def test_the_hash_survives_a_round_trip_through_json() -> None:
+    again = Specification.model_validate_json(SPEC.model_dump_json())
+    assert again == SPEC
+    assert again.hash() == SPEC.hash()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"seed": -1},
+        {"seed": 2**63},
+        {"scene": {"n_cluter": 5}},
+        {"scene": {"support_height_m": {"low": 1.0, "high": 0.5}}},
+        {"candidates": {"base_height_m": {"low": -0.5, "high": 1.0}}},
+        {"observation": {"distance_m": {"low": 1.0, "high": 1e9}}},
+        {"heuristic": {"d_min": 0.9, "d_max": 0.2}},
+        {"heuristic": {"mu": float("nan")}},
+        {"candidates": {"per_scene": 626}},
+        {"settle": {"timestep_s": 0}},
+        {"houses": {"kind": "a", "digest": "xyz"}},
+    ],
+)
+def test_nonsense_is_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        Specification.model_validate(SOURCES | bad)
+
+
+def test_it_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        SPEC.seed = 3  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@given(st.integers(1, 10**7))
+def test_a_layout_holds_n_and_wastes_less_than_a_shard(n: int) -> None:
+    layout = layout_of(SPEC, n)
+    shards = layout.shards_for(n)
+    assert (shards - 1) * layout.samples_per_shard < n <= shards * layout.samples_per_shard
+    assert 1 <= layout.scenes_per_shard <= 32
+
+
+def test_the_papers_number_of_labels_divides_into_whole_shards() -> None:
+    layout = layout_of(SPEC, 180_000)
+    assert layout.scenes_per_shard == 30
+    assert layout.shards_for(180_000) * layout.samples_per_shard == 180_000
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMAS))
+def test_names_of_both_tables_and_of_dimensions_do_not_collide(name: str) -> None:
+    schema = SCHEMAS[name]
+    fields: list[Field] = [*schema.scene_fields, *schema.sample_fields]
+    names = [f.name for f in fields]
+    assert len(set(names)) == len(names)
+    assert not set(names) & ({"scene", "sample"} | {d for f in fields for d in f.dims})
+    assert all(d in schema.sizes for f in fields for d in f.dims)
+    assert all(f.doc for f in fields)
