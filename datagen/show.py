@@ -43,7 +43,7 @@ def show(
     )
     recalled = recall_scene(world, rows.record)
     noise_rng = generator(spec.seed, Stream.NOISE, scene, int(rows.record["retry"]))
-    frame = render_frame(world, recalled.stage, recalled.rays, recalled.camera, noise_rng)
+    frame = render_frame(spec.observation, recalled.stage, recalled.camera, noise_rng)
     draw_scene_picture(f"{run}, scene {scene}", recalled, frame, rows.record, rows.samples, out)
 
     score, label = rows.samples["heuristic_score"], rows.samples["label"]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
-from schemas.errors import InputError, choices
 from workers.houses.house import HouseSource
 from workers.houses.split import ids_of_split, split_of
+from workers.registry import entry
 
-# Name -> module and function that opens the source which the text after a reference's colon
-# describes. A kind's module is imported when it is asked for.
+# Each opens the source which the text after a reference's colon describes.
 HOUSE_SOURCES: dict[str, str] = {
     "builtin": "workers.houses.builtin:open_builtin",
     "procthor": "workers.houses.procthor:open_procthor",
@@ -20,10 +17,7 @@ HOUSE_SOURCES: dict[str, str] = {
 def open_houses(ref: str) -> HouseSource:
     """The source that a reference names: `builtin`, `procthor:DIR` or `ai2thor:DIR`."""
     kind, _, text = ref.partition(":")
-    if kind not in HOUSE_SOURCES:
-        raise InputError("--houses", kind, "no such kind of houses", choices(HOUSE_SOURCES) + ".")
-    module, function = HOUSE_SOURCES[kind].split(":")
-    source: HouseSource = getattr(import_module(module), function)(text)
+    source: HouseSource = entry(HOUSE_SOURCES, kind, "--houses")(text)
     return source
 
 

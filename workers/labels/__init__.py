@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
-from schemas.errors import InputError, choices
 from workers.labels.source import LabelSource
+from workers.registry import entry
 
-# Name -> module and the LabelSource in it, imported when it is asked for.
 LABEL_SOURCES: dict[str, str] = {
     "heuristic": "workers.labels.distance_visibility:HEURISTIC",
 }
@@ -15,8 +12,5 @@ LABEL_SOURCES: dict[str, str] = {
 
 def load_label_source(name: str) -> LabelSource:
     """The label source of that name. Raises InputError where there is none."""
-    if name not in LABEL_SOURCES:
-        raise InputError("label source", name or "''", "no such label source", choices(LABEL_SOURCES))
-    module, attribute = LABEL_SOURCES[name].split(":")
-    source: LabelSource = getattr(import_module(module), attribute)
+    source: LabelSource = entry(LABEL_SOURCES, name, "label source")
     return source

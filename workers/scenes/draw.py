@@ -9,7 +9,7 @@ import numpy as np
 from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.identity import Stream, generator
-from schemas.specification import SettleParams
+from schemas.specification import ObservationParams, SettleParams
 from workers.geometry.mesh import F64
 from workers.houses.house import Surface
 from workers.objects.model import ObjectModel
@@ -80,7 +80,7 @@ def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], cl
         )
         stage = Stage(house.house, models, settled.T_world_object)
         noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
-        cloud = _observe(world, stage, rays, camera, rng, noise_rng)
+        cloud = _observe(spec.observation, stage, rays, camera, rng, noise_rng)
     return Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
 
 
@@ -125,30 +125,28 @@ def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
 
 
 def render_frame(
-    world: World, stage: Stage, rays: RayStage, camera: Camera, noise_rng: np.random.Generator
+    params: ObservationParams, stage: Stage, camera: Camera, noise_rng: np.random.Generator
 ) -> Frame:
     """The whole frame by the specified renderer, with the specified noise."""
-    params = world.spec.observation
     frame = load_renderer(params.renderer)(stage, camera)
     return add_noise(frame, params.noise, noise_rng) if params.noise.enabled else frame
 
 
 def _observe(
-    world: World,
+    params: ObservationParams,
     stage: Stage,
     rays: RayStage,
     camera: Camera,
     rng: np.random.Generator,
     noise_rng: np.random.Generator,
 ) -> Cloud:
-    params = world.spec.observation
     # Embree casts single pixels: only those that the cloud draws. Noise looks at neighbours, and
     # the other renderers make whole frames.
     single = params.renderer == "embree" and not params.noise.enabled
     cast: PixelCaster = (
         (lambda pixels: cast_pixels(rays, camera, pixels))
         if single
-        else caster_of(render_frame(world, stage, rays, camera, noise_rng))
+        else caster_of(render_frame(params, stage, camera, noise_rng))
     )
     radius_m = float(rays.radii_m[0])
     return observe_cloud(cast, camera, 1, stage.T_world_object[0, :3, 3], radius_m, params, rng)

@@ -1,0 +1,38 @@
+"""Registries: plain dictionaries from a name to `module:attribute`, imported when it is asked for.
+
+So `datagen --help` waits for no simulator, and a machine that lacks one engine's system libraries
+uses another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from schemas.errors import InputError, choices
+
+
+def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
+    """What a registry holds under a name. `option` is where the name was given, for the error.
+
+    Raises InputError for an unknown name, listing the valid ones, and for an engine that cannot be
+    imported on this machine.
+    """
+    if name not in registry:
+        raise InputError(option, name or "''", "no such entry", choices(registry))
+    module, attribute = registry[name].split(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except ImportError as error:
+        mend = f"Run `datagen doctor`, or take another one: {', '.join(sorted(registry))}"
+        raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
+
+
+def can_import(registry: Mapping[str, str], name: str) -> bool:
+    """Whether an entry's module can be imported on this machine."""
+    try:
+        import_module(registry[name].split(":")[0])
+    except ImportError:
+        return False
+    return True
