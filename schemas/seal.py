@@ -6,11 +6,13 @@ packed in order of their index, and rows beyond n are cut by the arrays' shape a
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -151,10 +153,18 @@ def _sync_folders(draft: Path) -> None:
 def _take_the_name(draft: Path, sealed: Path) -> None:
     """Give the finished store its name; an older one steps aside first and is then removed."""
     old = sealed.with_name(f"{draft.name}.old")
-    if sealed.exists():
-        sealed.rename(old)
-    draft.rename(sealed)
-    shutil.rmtree(old, ignore_errors=True)
+    named = False
+    while not named:
+        with suppress(FileNotFoundError):
+            sealed.rename(old)
+        try:
+            draft.rename(sealed)
+            named = True
+        except OSError as e:
+            # Two jobs of one run end together: the other's store took the name just now.
+            if e.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        shutil.rmtree(old, ignore_errors=True)
     fd = os.open(sealed.parent, os.O_RDONLY)
     try:
         os.fsync(fd)

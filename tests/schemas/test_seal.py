@@ -153,3 +153,24 @@ def test_a_disk_that_fills_up_keeps_what_is_committed_and_goes_on_with_room(tiny
     group = zarr.open(seal(run), mode="r")
     shards = [*done, len(done), len(done) + 1]
     assert_equal(group, expected(run, shards, 2 * len(shards), 10 * len(shards)))
+
+
+def test_two_jobs_that_seal_at_the_same_time_leave_one_whole_store(tmp_path: Path):
+    """As when two drivers of one run see its last commit together."""
+    run = make_run(tmp_path, n=20)
+    seal(run)
+    renames: list[Path] = []
+    plain = Path.rename
+
+    def rename(path: Path, target: Path) -> Path:
+        if target == tmp_path / SEALED and not renames:
+            renames.append(path)
+            seal(Run.open(tmp_path))  # the other one, between this one's two steps
+        return plain(path, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "rename", rename)
+        seal(run)
+    assert renames
+    assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(run, [0, 1], 4, 20))
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
