@@ -15,7 +15,7 @@ class RunBooks:
         self._run = run
 
     def close(self, entry: LedgerEntry) -> None:
-        """Note how an attempt ended. An end that was noted before stands."""
+        """Note how an attempt ended. An end that was noted before stands, unless it was a guess."""
         self._run.end_attempt(entry)
 
     def quarantine(self, shard: int, trouble: Trouble) -> None:
@@ -45,8 +45,9 @@ def close_lost_attempts(run: Run) -> int:
     Call it when a job has ended. An attempt that began and never ended belonged to a driver that
     was killed; its worker may outlive the driver by moments and still reach its commit. So an
     attempt is judged only once its shard is decided: the one that won is closed as committed, at
-    the commit's cost, others as lost, at a cost that nobody knows. Where the shard is still open
-    they stay open, for the job that resumes.
+    the commit's cost, others as lost, at a cost that nobody knows; where the driver lives after
+    all, its own note replaces this one. Where the shard is still open they stay open, for the job
+    that resumes.
     """
     books, quarantined, closed = RunBooks(run), run.quarantined(), 0
     for start in run.unfinished_attempts():
@@ -68,7 +69,7 @@ def close_lost_attempts(run: Run) -> int:
                 attempt=start.attempt,
                 shard=start.shard,
                 outcome="lost",
-                cause="its driver ended before it did",
+                cause="it left no end, and its shard was decided without it",
                 started=start.started,
                 ended=utc_now(),
             )

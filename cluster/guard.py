@@ -31,11 +31,18 @@ from schemas.run_records import Cost, Host, Outcome
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.
 STACK_LIMIT = 16_000
+_CAUSE_LIMIT = 300  # a cause is read in a table and on a progress line; the stack has the whole text
 
 
 def utc_now() -> str:
     """The time, UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def short_line(text: str) -> str:
+    """The text as one short line."""
+    line = " ".join(text.split())
+    return line if len(line) <= _CAUSE_LIMIT else line[: _CAUSE_LIMIT - 3] + "..."
 
 
 class Meter:
@@ -76,7 +83,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
                 attempt=task.attempt,
                 shard=task.shard,
                 outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
-                cause=cause if ends_job else f"{type(error).__name__}: {cause}"[:1000],
+                cause=cause if ends_job else short_line(f"{type(error).__name__}: {cause}"),
                 stack=traceback.format_exc()[-STACK_LIMIT:],
                 started=started,
                 ended=utc_now(),
@@ -168,11 +175,15 @@ def collect_stack(notes: str, attempt: str) -> str:
 def obituary(task: Task, outcome: Outcome, cause: str) -> AttemptReport:
     """The report of an attempt whose worker is gone, from what it left behind.
 
+    A cause of many lines is cut to one; where the worker left no stack, its whole text stands there.
     A stack that begins with faulthandler's timeout line tells a hang from a crash. The wall time is
     counted from the note; CPU time went with the process and is 0.
     """
     note, ended = read_note(task.notes, task.attempt), utc_now()
     stack = collect_stack(task.notes, task.attempt)
+    line = short_line(cause)
+    if line != cause:
+        stack, cause = stack or cause[-STACK_LIMIT:], line
     if outcome == "crashed" and stack.startswith("Timeout ("):
         outcome, cause = "hung", f"still running after its deadline of {task.deadline_s:g} s"
     elif outcome == "crashed" and stack.startswith("Fatal Python error"):

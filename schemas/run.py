@@ -225,11 +225,22 @@ class Run:
             raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")
 
     def end_attempt(self, entry: LedgerEntry) -> bool:
-        """Note how an attempt ended; False when its end was noted before. Long stacks are cut."""
+        """Note how an attempt ended; False when its end was noted before. Long stacks are cut.
+
+        An attempt that another job took for lost may still answer: its account replaces the guess.
+        """
         kept = entry.model_copy(
             update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
         )
-        return self.storage.put_new(f"ledger/{entry.attempt}.json", encode_record(kept))
+        key = f"ledger/{entry.attempt}.json"
+        if self.storage.put_new(key, encode_record(kept)):
+            return True
+        noted = read_record(self.storage, key, LedgerEntry)
+        if kept.cost is None or noted is None or noted.outcome != "lost" or noted.cost is not None:
+            return False
+        self.storage.put(key, encode_record(kept))
+        self.storage.sync([key])
+        return True
 
     def ledger(self) -> Iterator[LedgerEntry]:
         """Ends of all attempts, in order of their names."""

@@ -17,6 +17,7 @@ from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary
 from cluster.task import JobCannotGoOn, Product
 from schemas.run import Run
+from schemas.run_records import Cost, LedgerEntry
 from tests.cluster.simulated import Heard
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import make_run, write
@@ -97,6 +98,20 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
     assert ended["orphan"].cost == run.commit_of(2).cost and ended["lost-one"].cost is None
 
 
+def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Path) -> None:
+    """Two drivers at once: the first to end closes what the other still has in flight."""
+    run = make_run(tmp_path / "run", shards=())
+    run.start_attempt("slow", 0)
+    run.commit(write(run, 0, "fast"))
+    assert close_lost_attempts(run) == 1
+    books, cost = RunBooks(run), Cost(wall_s=7.0, cpu_s=6.0)
+    for seconds in (7.0, 9.0):  # an account stands, whoever comes later
+        told = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=seconds, cpu_s=6))
+        books.close(told)
+    (entry,) = run.ledger()
+    assert (entry.outcome, entry.cost) == ("superseded", cost)
+
+
 def test_the_second_interrupt_breaks_into_the_running_shard(tmp_path: Path) -> None:
     def interrupt_itself(task: ScriptedTask, meter: Meter) -> Product:
         for _ in range(2 if task.shard == 1 else 0):
@@ -133,3 +148,6 @@ def test_the_guard_reports_and_leaves_nothing_behind(tmp_path: Path) -> None:
     assert getattr(seen[0], "pid", 0) == os.getpid() and list(notes.iterdir()) == []
     gone = obituary(ScriptedTask(7, "b", 60, str(notes)), "lost", "node gone")
     assert (gone.outcome, gone.cause, gone.cost, gone.started) == ("lost", "node gone", None, "")
+    text = "ImportError: no module\n" + "a long story\n" * 100
+    long = obituary(ScriptedTask(7, "c", 60, str(notes)), "failed", text)
+    assert long.stack == text and len(long.cause) == 300 and "\n" not in long.cause
