@@ -150,7 +150,9 @@ class _Driver(Generic[T]):
             self._tally.in_flight = len(self._flights)
             self._events.tick(self._tally)
         failed = too_many_quarantined(self._policy, self._tally.quarantined, self._tally.shards)
-        end = self._end or ("failed" if failed else "complete")
+        end = self._end
+        if end is None or (end == "interrupted" and self._tally.finished == self._tally.shards):
+            end = "failed" if failed else "complete"  # a stop that left nothing to do is none
         return JobSummary(end, self._cause, self._tally, self._clock() - start_s)
 
     # Begin ---------------------------------------------------------------------------------

@@ -177,6 +177,12 @@ def test_one_request_drains_and_two_end_at_once() -> None:
     assert summary.remaining == 1000 - summary.tally.committed
 
 
+def test_a_stop_that_leaves_nothing_to_do_is_none() -> None:
+    summary, _, _ = stopping_at(12, 1, LENIENT, 5.0)
+    assert summary.remaining == 0
+    assert summary.end == "complete" and summary.exit_code == 0
+
+
 def test_draining_is_bounded() -> None:
     _, books, took_s = stopping_at(1000, 1, Policy(drain_s=30), 500.0)
     assert books.closed["cancelled"] > 0 and took_s == pytest.approx(30, abs=2)
