@@ -71,6 +71,8 @@ def account_for(runs: Iterable[Run]) -> Books:
     """
     books = Books()
     for run in runs:
+        # The ledger first: whatever it calls committed then has its commit, also while a job goes on.
+        ledger, unfinished = list(run.ledger()), run.unfinished_attempts()
         committed: set[str] = set()
         for commit in run.commits():
             committed.add(commit.attempt)
@@ -80,8 +82,8 @@ def account_for(runs: Iterable[Run]) -> Books:
             books.redraws.update(commit.redraws)
             books.useful.add(commit.cost)
             books.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-        for entry in run.ledger():
+        for entry in ledger:
             if entry.attempt not in committed:
                 books.waste.setdefault(entry.outcome, Account()).add(entry.cost)
-        books.running += sum(start.attempt not in committed for start in run.unfinished_attempts())
+        books.running += sum(start.attempt not in committed for start in unfinished)
     return books

@@ -45,6 +45,8 @@ def status_report(run: Run) -> dict[str, Any]:
         "created": run.manifest.created,
         "n": run.n,
         "labels": sum(run.layout.rows_wanted(c.shard, run.n)[1] for c in done),
+        # Commits count whole shards, and so more than n where the last one is cut.
+        "labels_made": sum(c.samples for c in commits),
         "positives": sum(c.positives for c in commits),
         "shards": {
             "planned": len(planned),
