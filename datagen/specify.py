@@ -51,6 +51,10 @@ def specify(
     if isinstance(settle, dict):
         # SAPIEN where its libraries are, else what works here; the choice is recorded.
         settle.setdefault("engine", first_settler())
+    candidates = fields.get("candidates")
+    if isinstance(candidates, dict) and candidates.get("per_scene") == "grid":
+        # The cells of a whole grid are ranked against each other, so one robot stands on all.
+        candidates.setdefault("robots_per_scene", 1)
     fields |= {
         "label_source": label_source,
         "houses": Source(kind=houses.kind, digest=houses.digest),

@@ -21,7 +21,7 @@ from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
 from cluster.executor import Executor
 from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy
+from cluster.policy import Policy, too_many_quarantined
 from cluster.progress import progress
 from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster, refuse_unreachable
 from cluster.stop import StopRequest, stop_on_signals
@@ -106,10 +106,7 @@ def submit(
         "seed": seed,
         "split": split,
         "candidates.per_scene": per_scene,
-        # The cells of a whole grid are ranked against each other, so one robot stands on all.
-        "candidates.robots_per_scene": 1
-        if robots_per_scene is None and per_scene == "grid"
-        else robots_per_scene,
+        "candidates.robots_per_scene": robots_per_scene,
         "settle.engine": settler,
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
@@ -159,7 +156,9 @@ def run_job(run: Run, settings: JobSettings) -> JobSummary:
     done = len(run.planned()) - len(missing)
     if not missing:
         close_lost_attempts(run)
-        return JobSummary("complete", "", Tally(0), 0.0)
+        given_up, shards = run.quarantined() & set(run.planned()), len(run.planned())
+        failed = too_many_quarantined(Policy(), len(given_up), shards)
+        return JobSummary("failed" if failed else "complete", "", Tally(0), 0.0)
     stop = StopRequest()
     with ExitStack() as stack:
         # Local paths travel to workers of this machine; on a cluster they are shared by all nodes.
@@ -194,7 +193,7 @@ def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[
     if settings.workers == 0:
         return InProcessExecutor(run_attempt)
     cores = len(os.sched_getaffinity(0))
-    workers = settings.workers or max(1, min(cores, shards))
+    workers = min(settings.workers or cores, shards)  # Ray starts them all at once
     ray_settings = RaySettings(address=settings.address, workers=workers)
     return RayExecutor(run_attempt, ray_settings, stack.enter_context(ray_cluster(ray_settings)))
 
@@ -202,15 +201,24 @@ def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[
 def finish(run: Run, summary: JobSummary, out: str) -> int:
     """Seal what there is, say how it went and how to go on; return the exit code."""
     tally = summary.tally
-    made = f"{tally.labels:,} new, {run.n:,} wanted"
+    n, given_up = run.n, sorted(run.quarantined())
+    if tally.shards:
+        labels = f"{tally.labels:,} new, {n:,} wanted"
+    elif given_up:
+        labels = f"nothing to do: the shards of {n:,} labels are made or given up"
+    else:
+        labels = f"nothing to do: all {n:,} labels are there"
     rows = [
-        ("labels", made if tally.shards else f"nothing to do: all {run.n:,} labels are there"),
+        ("labels", labels),
         ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
         ("time", f"{seconds(summary.elapsed_s)}" + _rate(summary)),
         ("retries", str(tally.retries)),
     ]
-    if tally.quarantined:
-        rows.append(("quarantined", f"{tally.quarantined} shards, {tally.quarantined_shards}"))
+    if given_up:
+        shown = (
+            f"{len(given_up)} shards, {given_up[:10]}: remove {shlex.quote(f'{out}/quarantine')} to try again"
+        )
+        rows.append(("quarantined", shown))
     if summary.end in ("complete", "failed") and run.committed():
         sealed = seal(run)
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))

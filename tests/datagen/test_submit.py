@@ -21,6 +21,7 @@ from PIL import Image
 from datagen import cli
 from schemas.fields import sized_schema
 from schemas.run import Run
+from schemas.run_records import QuarantineRecord
 from tests.small_runs import (
     PER_SCENE,
     arrays_of,
@@ -89,6 +90,26 @@ def test_the_same_command_again_does_nothing_and_says_so(
     assert files_of(copied, *folders) == before
     assert_equal_runs(arrays_of(copied), arrays)
     assert cli.run(submit_arguments(copied, N - PER_SCENE)) == 0  # a run never shrinks
+    assert_equal_runs(arrays_of(copied), arrays)
+
+
+def test_a_run_with_shards_given_up_says_so_again(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, arrays = Run.open(copied), arrays_of(copied)
+    for shard in (2, 5):
+        (copied / f"commits/{shard:06d}.json").unlink()
+        run.quarantine(
+            QuarantineRecord(
+                shard=shard, seed=0, first_scene=shard, scenes=1, attempts=(), causes=("failed: no luck",),
+                stacks=(), created="",
+            )
+        )  # fmt: skip
+    capsys.readouterr()
+    assert cli.run(submit_arguments(copied, N)) == 1
+    told = capsys.readouterr()
+    assert "given up" in told.out and "2 shards, [2, 5]" in told.out and "no luck" in told.err
+    assert arrays_of(copied)["label"].shape == (N - 2 * PER_SCENE,)
+    shutil.rmtree(copied / "quarantine")  # as the message says
+    assert cli.run(submit_arguments(copied, N)) == 0
     assert_equal_runs(arrays_of(copied), arrays)
 
 
