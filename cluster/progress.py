@@ -13,6 +13,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.progress import Task as Bar
+from rich.table import Column
 from rich.text import Text
 
 from cluster.tally import Tally
@@ -163,9 +164,11 @@ class TerminalBar:
     def _numbers(self) -> str:
         tally, left_s = self._tally, self._pace.left_s(self._tally)
         cpu_h = (tally.useful_cpu_s + tally.wasted_cpu_s) / 3600
+        # What is seldom there takes no room: a usual terminal has 80 columns.
+        given_up = f"  {tally.quarantined} quarantined" if tally.quarantined else ""
         return (
             f"{self._pace.labels_per_s(tally):,.0f} labels/s  {clock_text(left_s)} left  "
-            f"{tally.retries} retries  {tally.quarantined} quarantined  {cpu_h:.2f} core-h{self._note}"
+            f"{tally.retries} retries{given_up}  {cpu_h:.2f} core-h{self._note}"
         )
 
 
@@ -175,7 +178,8 @@ class _Numbers(ProgressColumn):
     max_refresh = 0.2
 
     def __init__(self, text: Callable[[], str]) -> None:
-        super().__init__()
+        # Where the terminal is narrow, the bar gives way and not the figures.
+        super().__init__(table_column=Column(no_wrap=True))
         self._text = text
 
     def render(self, task: Bar) -> Text:

@@ -63,6 +63,18 @@ def test_the_bar_shows_rate_time_left_retries_and_cost() -> None:
         assert text in shown
 
 
+def test_a_usual_terminal_shows_all_figures() -> None:
+    out, clock = io.StringIO(), FakeClock()
+    console = Console(file=out, force_terminal=True, width=80, color_system=None)
+    bar = TerminalBar(60, shards=3000, console=console, clock=clock)
+    clock.now_s = 40.0
+    bar.tick(Tally(3000, committed=1400, labels=84_000, retries=3, useful_cpu_s=7200))
+    bar.close()
+    last = [line for line in out.getvalue().splitlines() if "1400/3000" in line][-1]
+    assert "2,100 labels/s  0:00:46 left  3 retries  2.00 core-h" in last
+    assert "\u2026" not in last
+
+
 def test_clock_text() -> None:
     assert [clock_text(s) for s in (None, 0, 59.6, 3600, 360_000)] == [
         "-:--:--", "0:00:00", "0:01:00", "1:00:00", "100:00:00",
