@@ -29,6 +29,7 @@ from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask
 from datagen import __version__
 from datagen.console import print_rows, seconds
+from datagen.doctor.engines import probe_render_device
 from datagen.specify import layout_of, specify
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
@@ -114,6 +115,8 @@ def submit(
     house_source, object_source = open_houses(houses), open_objects(objects)
     spec = specify(label_source, house_source, object_source, options, config)
     assemble_world(spec, house_source, object_source, houses, objects)  # refuses what cannot work, now
+    if address == "local" and spec.observation.renderer == "sapien":
+        _refuse_no_render_device()
     manifest = manifest_of(spec, n, {"houses": _absolute(houses), "objects": _absolute(objects)})
     run = Run.create_or_open(open_storage(out), manifest, n)
     settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json)
@@ -249,6 +252,18 @@ def _rate(summary: JobSummary) -> str:
     if not summary.tally.labels or summary.elapsed_s <= 0:
         return ""
     return f", {summary.tally.labels / summary.elapsed_s:,.0f} labels/s"
+
+
+def _refuse_no_render_device() -> None:
+    """Every scene would fail, and a run of another renderer is another run: better now."""
+    device = probe_render_device()
+    if not device.succeeded:
+        raise InputError(
+            "--renderer",
+            "sapien",
+            f"no render device here ({device.text})",
+            "Take embree, or see `datagen doctor`",
+        )
 
 
 def _per_scene(text: str | None) -> int | str | None:

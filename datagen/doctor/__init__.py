@@ -8,7 +8,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -74,19 +76,17 @@ def as_table(checks: list[Check]) -> Table:
     return table
 
 
-def doctor(*, json: bool = False, houses: str | None = None, objects: str | None = None) -> int:
+def doctor(
+    *,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    houses: Annotated[
+        str | None, Parameter(help="Houses to look for: builtin, procthor:DIR or ai2thor:DIR.")
+    ] = None,
+    objects: Annotated[str | None, Parameter(help="Objects to look for: builtin or ycb:DIR.")] = None,
+) -> int:
     """Say what this machine can do, and how to mend what it cannot.
 
     Exits with 0 when labels can be made here, else with 1.
-
-    Parameters
-    ----------
-    json:
-        Print JSON instead of a table.
-    houses:
-        Houses to look for: builtin, procthor:DIR or ai2thor:DIR.
-    objects:
-        Objects to look for: builtin or ycb:DIR.
     """
     checks = [*host_checks(), *engine_checks(), *asset_checks(houses, objects)]
     failures = sum(check.status == "fail" for check in checks)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.doctor.check import Check, probe
+from datagen.doctor.check import Check, Probe, probe
 
 _SAPIEN_PHYSICS = """
 import importlib, importlib.metadata
@@ -85,12 +85,17 @@ def engine_checks() -> list[Check]:
         else Check("embree", "fail", embree.text, "Install again: make clean venv."),
         Check("ray", "ok", ray.text)
         if ray.succeeded
-        else Check("ray", "warn", ray.text, "Install again: make clean venv; or use --workers 1."),
+        else Check("ray", "warn", ray.text, "Install again: make clean venv; or use --workers 0."),
     ]
     if sapien.succeeded:
-        device = probe(_SAPIEN_RENDER)
+        device = probe_render_device()
         if device.succeeded:
             checks.append(Check("sapien render device", "ok", device.text))
         else:
             checks.append(Check("sapien render device", "warn", device.text, _MESA_MEND))
     return checks
+
+
+def probe_render_device() -> Probe:
+    """Whether SAPIEN finds a device to render with; says which, or why not."""
+    return probe(_SAPIEN_RENDER)

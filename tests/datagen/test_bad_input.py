@@ -89,6 +89,17 @@ def test_a_cluster_that_is_not_there(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_no_render_device_is_said_before_there_is_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, "/nowhere.json")
+    arguments = ["submit", "heuristic", "--n", "16", "--out", str(tmp_path / "out"), "--renderer", "sapien"]
+    refused(arguments, capsys, "--renderer", "no render device", "embree", "datagen doctor")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("source", ["plan", "Heuristic", "", "--n"])
 def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["submit", source, "--n", "16", "--out", str(tmp_path / "out"), "--workers", "0"], capsys)

@@ -55,6 +55,7 @@ def test_broken_engines_are_named_with_a_mend(monkeypatch: pytest.MonkeyPatch) -
     for check in found.values():
         assert "a_module_that_is_not_there" in check.detail
         assert check.mend
+    assert "--workers 0" in found["ray"].mend  # one worker is a worker of Ray's
 
 
 def test_one_settler_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
