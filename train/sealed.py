@@ -15,8 +15,10 @@ _MEND = "Seal the run again, and copy its data.zarr whole"
 
 
 def is_sealed_store(place: Path | str) -> bool:
-    """Whether the place is named like a sealed store (`....zarr`) and not like a run."""
-    return str(place).rstrip("/").endswith(".zarr")
+    """Whether the place is named like a sealed store (`....zarr`) and is not a run of such a name."""
+    if not str(place).rstrip("/").endswith(".zarr"):
+        return False
+    return not open_storage(place, probe=False, create=False).exists("manifest.json")
 
 
 def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], dict[str, StoredArray]]:

@@ -189,3 +189,10 @@ def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path, old: str,
     meta.write_text(text.replace(old, new))
     with pytest.raises(InputError):
         list(SampleReader([path]).shards())
+
+
+def test_a_run_may_be_named_like_a_store(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run.zarr", n=50)
+    seal(run)
+    assert len(SampleReader([tmp_path / "run.zarr"])) == 50
+    assert len(SampleReader([tmp_path / "run.zarr" / "data.zarr"])) == 50
