@@ -37,7 +37,7 @@ scene, and the samples of a scene lie together, in the order of their candidates
 Every array lies at the root of its group. The first dimension is `scene` or `sample`. Chunks hold
 the rows of one shard, or an equal part of them where a shard's rows exceed {MAX_CHUNK_BYTES // 2**20} MiB.
 Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written,
-so a missing file is damage; fill values (NaN, -1, the largest unsigned number) are no valid data.
+so a missing file is damage, and a fill value never stands for rows that were not stored.
 Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`.
 
 `data.zarr` has consolidated metadata, and the specification in its root's attributes:

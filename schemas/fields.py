@@ -1,7 +1,7 @@
 """Record schemas: the single source of truth for what a scene and a sample store.
 
-Store creation, batch checks, merge compatibility, audit ranges, the data-format page and the
-training keys all derive from the tables below.
+Store creation, batch checks, the attributes of stored arrays and the data-format page all derive
+from the tables below.
 """
 
 from __future__ import annotations

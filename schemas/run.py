@@ -1,6 +1,6 @@
-"""A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs: architecture).
+"""A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs/data-format.md).
 
-Readers, resume, merge, verify and audit trust commit records alone: a commit is written last and
+Readers, resume, seal and audit trust commit records alone: a commit is written last and
 create-only, so that of two racing attempts one wins and the other is waste.
 """
 

@@ -128,7 +128,7 @@ class HeuristicParams(_Frozen):
 
     The paper gives the weights, the threshold, the distance bounds and the visibility score, but
     not a, mu, sigma_l and sigma_r. The defaults put mu in the middle of the stated bounds, with
-    the bounds at two sigma; `calibrate` fits them to executed trials.
+    the bounds at two sigma.
     """
 
     distance: Literal["planar", "planar-over-reach", "mount-over-reach"] = "planar"
