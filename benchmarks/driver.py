@@ -1,18 +1,15 @@
 """What the driver costs per shard: a simulated cluster for the loop, a real folder for the ledger.
 
-python benchmarks/driver.py [--shards 1000000] [--ledger 2000] [--ray 1000]
+python -m benchmarks.driver [--shards 1000000] [--ledger 2000] [--ray 1000]
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
-import sys
 import tempfile
 import time
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from cluster.driver import Order, drive
 from cluster.guard import Meter, utc_now
@@ -94,7 +91,7 @@ def through_ray(shards: int) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--shards", type=int, default=1_000_000)
     parser.add_argument("--ledger", type=int, default=2000)
     parser.add_argument("--ray", type=int, default=1000)

@@ -31,7 +31,7 @@ FIELDS = (*SCENE_FIELDS, *SAMPLE_FIELDS, "sample_scene_index")
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--samples", type=int, default=60_000)
     parser.add_argument("--scenes-per-shard", type=int, default=20)
     parser.add_argument("--run", type=Path)

@@ -81,5 +81,5 @@ def _print(place: str, report: dict[str, Any]) -> None:
     print_rows(f"run {place}", rows)
     if report["causes"]:
         print_rows(
-            "causes", [(str(n), cause) for cause, n in report["causes"].items()], ("attempts", "cause")
+            "causes", [(cause, str(n)) for cause, n in report["causes"].items()], ("cause", "attempts")
         )
