@@ -92,8 +92,12 @@ def test_the_cache_is_used_repaired_and_never_trusted(tmp_path: Path, monkeypatc
     bad = bytearray(data.read_bytes())
     bad[40] ^= 1
     data.write_bytes(bytes(bad))
+    damaged = open_houses(ref)
+    # The folder still holds the house: a scene must not be drawn elsewhere for a damaged copy.
+    assert damaged.load("a").digest == before.load("a").digest
+    write_houses(tmp_path / "houses", [named("c"), named("d")])
     with pytest.raises(InputError, match="changed since"):
-        open_houses(ref).load("a")
+        damaged.load("a")
 
 
 def test_without_a_cache_everything_works_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
