@@ -104,6 +104,7 @@ class Ai2thorHouses:
             digest.update(template.digest)
             T_world = _pose(entry)
             placed.append(self._placed(number, name, template, T_world))
+            digest.update(placed[-1][0].object_type.encode())  # it decides what carries things
         bodies, rooms = _walls_and_rooms(mesh, [(b, xy) for b, xy, _, _ in placed])
         owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
         surfaces: list[Surface] = []
@@ -128,7 +129,7 @@ class Ai2thorHouses:
         mesh = mesh.transformed(_Y_UP_TO_WORLD)
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
-        is_stage = "stages" in file.parts
+        is_stage = "stages" in file.relative_to(self.root).parts  # the folder above may have any name
         template = _Template(mesh, () if is_stage else convex_parts(mesh), digest)
         self._templates[file] = template
         if len(self._templates) > _KEPT_MESHES:
@@ -165,8 +166,9 @@ class Ai2thorHouses:
 def open_ai2thor(folder: str) -> Ai2thorHouses:
     """The scenes below a download folder (the one that holds ai2thor-hab, or one above it).
 
-    Hashing every mesh would read many gigabytes, so the source's digest covers the names and
-    sizes of all scenes and meshes; each house's own digest covers the bytes of all its files.
+    Hashing every mesh would read many gigabytes, so the source's digest covers the object types and
+    the names and sizes of all scenes, meshes and object configurations; each house's own digest
+    covers the bytes of its scene and meshes and the types of its objects.
     """
     base = Path(folder)
     mend = "Name it as ai2thor:DIR, where DIR holds ai2thor-hab/ and ai2thorhab-uncompressed/."
@@ -181,12 +183,12 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     if not scenes or len(scenes) > _MAX_SCENES:
         raise InputError(top, "", f"{len(scenes)} scenes where 1 to {_MAX_SCENES} belong", mend)
     listing = [[i, scenes[i].stat().st_size] for i in sorted(scenes)]
-    meshes = sorted(
-        p for part in (_OBJECTS, Path("ai2thor-hab/assets")) for p in (root / part).rglob("*.glb")
-    )
-    listing += [[p.relative_to(root).as_posix(), p.stat().st_size] for p in meshes]
+    places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
+    files = sorted(p for part, pattern in places for p in (root / part).rglob(pattern))
+    listing += [[p.relative_to(root).as_posix(), p.stat().st_size] for p in files]
     ordered = {i: scenes[i] for i in sorted(scenes)}
-    return Ai2thorHouses(root, digest_of(listing), ordered, _types(root))
+    types = _types(root)
+    return Ai2thorHouses(root, digest_of([listing, sorted(types.items())]), ordered, types)
 
 
 def _types(root: Path) -> dict[int, str]:

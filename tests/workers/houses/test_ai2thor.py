@@ -184,6 +184,26 @@ def test_the_digests_follow_the_files(root: Path):
     assert load(root).digest != house
 
 
+def test_the_digests_follow_the_types_that_decide_what_carries_things(root: Path):
+    before, house = open_houses(f"ai2thor:{root}").digest, load(root)
+    mapping = root / "ai2thor/ai2thor-hab/configs/object_semantic_id_mapping.json"
+    mapping.write_text(json.dumps({"DiningTable": 4, "Bed": 3, "Mug": 5}))
+    changed = load(root)
+    assert house.surfaces[0].body_id != changed.surfaces[0].body_id  # the bed became a table
+    assert open_houses(f"ai2thor:{root}").digest != before
+    assert changed.digest != house.digest
+
+
+def test_the_name_of_the_folder_above_changes_nothing(root: Path):
+    house = load(root)
+    moved = root / "stages"
+    moved.mkdir()
+    (root / "ai2thor").rename(moved / "ai2thor")
+    again = load(moved)
+    assert [len(b.convex_parts_m) for b in again.bodies] == [len(b.convex_parts_m) for b in house.bodies]
+    assert again.digest == house.digest
+
+
 def test_upside_down_and_scaled_instances(root: Path):
     scene = json.loads(scene_file(root).read_text())
     scene["object_instances"] = [
