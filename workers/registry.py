@@ -29,6 +29,18 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
         raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
 
 
+def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
+    """The source that a reference `kind` or `kind:text` names, opened with its text.
+
+    Raises InputError as `entry` does, and where a folder is named without its kind.
+    """
+    kind, _, text = ref.partition(":")
+    if kind not in registry and "/" in kind:
+        mend = f"Write KIND:{ref}, where KIND is one of {', '.join(sorted(registry))}"
+        raise InputError(option, ref, "is a folder without its kind", mend)
+    return entry(registry, kind, option)(text)
+
+
 def can_import(registry: Mapping[str, str], name: str) -> bool:
     """Whether an entry's module can be imported on this machine."""
     try:

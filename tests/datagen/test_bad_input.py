@@ -38,6 +38,8 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--candidates-per-scene ²", ["--candidates-per-scene", "625"]),
     ("--robots-per-scene 0", ["robots_per_scene", "0"]),
     ("--houses castle", ["--houses", "castle", "builtin"]),
+    ("--houses {empty}", ["--houses", "Write KIND:{empty}", "procthor"]),
+    ("--objects {empty}", ["--objects", "Write KIND:{empty}", "ycb"]),
     ("--houses builtin:many", ["builtin", "many"]),
     ("--houses builtin:0", ["builtin"]),
     ("--houses procthor:", ["procthor", "no such folder"]),

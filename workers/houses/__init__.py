@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from workers.houses.house import HouseSource
 from workers.houses.split import ids_of_split, split_of
-from workers.registry import entry
+from workers.registry import open_source
 
 # Each opens the source which the text after a reference's colon describes.
 HOUSE_SOURCES: dict[str, str] = {
@@ -16,8 +16,7 @@ HOUSE_SOURCES: dict[str, str] = {
 
 def open_houses(ref: str) -> HouseSource:
     """The source that a reference names: `builtin`, `procthor:DIR` or `ai2thor:DIR`."""
-    kind, _, text = ref.partition(":")
-    source: HouseSource = entry(HOUSE_SOURCES, kind, "--houses")(text)
+    source: HouseSource = open_source(HOUSE_SOURCES, ref, "--houses")
     return source
 
 

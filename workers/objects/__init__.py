@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from workers.objects.model import ObjectModel, ObjectSource
-from workers.registry import entry
+from workers.registry import open_source
 
 __all__ = ["OBJECT_SOURCES", "ObjectModel", "ObjectSource", "open_objects"]
 
@@ -20,6 +20,5 @@ def open_objects(ref: str) -> ObjectSource:
 
     Raises InputError for an unknown kind, naming the valid ones, and as the source itself does.
     """
-    kind, _, argument = ref.partition(":")
-    source: ObjectSource = entry(OBJECT_SOURCES, kind, "--objects")(argument)
+    source: ObjectSource = open_source(OBJECT_SOURCES, ref, "--objects")
     return source
