@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from datagen.console import print_json, print_rows
 from schemas.run import Run
-from schemas.seal import SEALED
+from schemas.seal import sealed_root
 
 
 def status(
@@ -38,6 +38,7 @@ def status_report(run: Run) -> dict[str, Any]:
             causes[f"{entry.outcome}: {entry.cause}"] += 1
     unfinished = {start.attempt for start in run.unfinished_attempts()} - {c.attempt for c in commits}
     done = [c for c in commits if c.shard in planned]
+    root, absent = sealed_root(run), sorted(set(planned) - committed)
     return {
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
@@ -57,9 +58,19 @@ def status_report(run: Run) -> dict[str, Any]:
         "attempts": dict(sorted(outcomes.items())),
         "attempts_without_end": len(unfinished),
         "causes": dict(causes.most_common(20)),
-        "sealed": run.storage.exists(f"{SEALED}/zarr.json"),
+        # An older seal, of a shorter run or with fewer shards, does not count.
+        "sealed": root is not None and (root.n, root.missing_shards) == (run.n, absent),
+        "sealed_labels": root.n if root else None,
         "complete": len(committed & set(planned)) == len(planned),
     }
+
+
+def _seal(report: dict[str, Any]) -> str:
+    if report["sealed"]:
+        return "yes, data.zarr"
+    if report["sealed_labels"] is None:
+        return "no"
+    return f"data.zarr is older ({report['sealed_labels']:,} labels): submit the run again to seal it anew"
 
 
 def _print(place: str, report: dict[str, Any]) -> None:
@@ -72,7 +83,7 @@ def _print(place: str, report: dict[str, Any]) -> None:
         ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
         ("shards", f"{shards['committed']} of {shards['planned']} committed; {state}"),
         ("attempts", attempts),
-        ("sealed", "yes, data.zarr" if report["sealed"] else "no"),
+        ("sealed", _seal(report)),
         ("specification", report["spec_hash"][:16]),
         ("created", report["created"]),
     ]

@@ -7,6 +7,7 @@ packed in order of their index, and rows beyond n are cut by the arrays' shape a
 from __future__ import annotations
 
 import errno
+import json
 import os
 import secrets
 import shutil
@@ -17,11 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import zarr
+from pydantic import BaseModel
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from schemas.errors import InputError
 from schemas.fields import RecordSchema
+from schemas.record_files import MAX_RECORD_BYTES
 from schemas.run import Run, shard_folder
 from schemas.run_records import Commit
 from schemas.shard_files import (
@@ -71,6 +74,24 @@ def seal(run: Run) -> Path:
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     return folder / SEALED
+
+
+class SealedRoot(BaseModel):
+    """What the root zarr.json of a sealed store says of the run that it was laid over."""
+
+    n: int
+    missing_shards: list[int]
+
+
+def sealed_root(run: Run) -> SealedRoot | None:
+    """The attributes of RUN/data.zarr, or None where it does not exist or is not readable as ours."""
+    data = run.storage.get(f"{SEALED}/zarr.json", MAX_RECORD_BYTES)
+    if data is None:
+        return None
+    try:
+        return SealedRoot.model_validate(json.loads(data)["attributes"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
 
 
 def sealed_metadata(run: Run, schema: RecordSchema, n: int, shards: list[int]) -> dict[str, bytes]:

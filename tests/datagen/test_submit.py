@@ -160,6 +160,18 @@ def test_status_counts_what_is_there(finished: Path, capsys: pytest.CaptureFixtu
     assert "64 of 64" in capsys.readouterr().out
 
 
+def test_status_tells_an_older_seal(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grown = tmp_path / "grown"
+    shutil.copytree(finished, grown)
+    Run.open(grown).grow(2 * N)
+    report = json_of(capsys, ["status", str(grown)])
+    assert not report["sealed"] and report["sealed_labels"] == N
+    assert cli.run(["status", str(grown)]) == 0
+    assert "data.zarr is older" in capsys.readouterr().out
+
+
 def test_the_audit_adds_up(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = json_of(capsys, ["audit", str(finished)])
     run, arrays = Run.open(finished), arrays_of(finished)
