@@ -32,6 +32,7 @@ from datagen.console import print_rows, seconds
 from datagen.doctor.engines import probe_render_device
 from datagen.specify import layout_of, specify
 from datagen.whole_number import WHOLE_NUMBER
+from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.record_files import now
@@ -43,7 +44,8 @@ from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.labels import load_label_source
 from workers.objects import open_objects
-from workers.world import assemble_world
+from workers.scenes.draw import draw_scene
+from workers.world import World, assemble_world
 
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 
@@ -114,14 +116,24 @@ def submit(
     }
     house_source, object_source = open_houses(houses), open_objects(objects)
     spec = specify(label_source, house_source, object_source, options, config)
-    assemble_world(spec, house_source, object_source, houses, objects)  # refuses what cannot work, now
+    world = assemble_world(spec, house_source, object_source, houses, objects)
     if address == "local" and spec.observation.renderer == "sapien":
         _refuse_no_render_device()
+    if not (Path(out) / "manifest.json").exists():
+        _refuse_no_scene(world, houses)
     manifest = manifest_of(spec, n, {"houses": _absolute(houses), "objects": _absolute(objects)})
     run = Run.create_or_open(open_storage(out), manifest, n)
     settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json)
     summary = run_job(run, settings)
     return finish(run, summary, out)
+
+
+def _refuse_no_scene(world: World, houses: str) -> None:
+    """Draw a new run's first scene here: sources that give none are refused before anything is written."""
+    try:
+        draw_scene(world, 0, StageClock())
+    except InputError as error:
+        raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 
 
 @dataclass(frozen=True)
