@@ -27,7 +27,28 @@ REDRAW_CAUSES = (
     "penetration",  # a body ended inside another
     "not_finite",  # the physics returned NaN or infinite poses
     "no_viewpoint",  # no free place from which enough of the target is seen
+    "no_base",  # no candidate of the asked kind (clear, in-range) around the target
 )
+
+# How a candidate of `plan` and `sim` ended, and the stage that decided it; the order is part of the
+# data format. Where several grasps failed, the one that came furthest counts.
+OUTCOMES: dict[str, str] = {
+    "success": "execute",  # lifted and held; for `plan`: a whole plan was found
+    "base_collision": "base",  # the robot's body does not fit where it would stand
+    "out_of_reach": "reach",  # the target is farther from the mount than the arm is long
+    "no_grasp": "grasps",  # the hand alone collides with the scene in every grasp of the target
+    "no_ik": "ik",  # no joint configuration puts the hand at pregrasp and grasp
+    "arm_collision": "collision",  # there the arm hits the scene or itself
+    "no_start": "path",  # every tucked start pose collides
+    "no_path": "path",  # no collision-free path to the pregrasp within the iteration cap
+    "no_approach": "path",  # the straight line to the grasp jumps, leaves the limits or collides
+    "no_lift": "path",  # the straight line up does
+    "not_reached": "execute",  # the arm did not arrive: it was blocked or its drives fell behind
+    "missed": "execute",  # closed, with nothing between the fingers
+    "slipped": "execute",  # held after closing, not lifted with the hand
+    "dropped": "execute",  # lifted, and lost before the end of holding
+    "unstable": "execute",  # the physics left sense: NaN, or speeds no such motion has
+}
 
 
 @dataclass(frozen=True)
@@ -46,6 +67,7 @@ class Field:
     doc: str
     low: float | None = None
     high: float | None = None
+    codes: tuple[str, ...] = ()  # what the values 0, 1, ... mean
 
     @property
     def is_text(self) -> bool:
@@ -231,13 +253,69 @@ SAMPLE_FIELDS = (
     Field("label_version", "int16", (), "1", "", "version of the label source's code", 0),
 )
 
+_OUTCOME_CODES = tuple(OUTCOMES)
+
+PLAN_FIELDS = (
+    *SAMPLE_FIELDS,
+    Field("heuristic_label", "uint8", (), "1", "", "label of the distance-visibility rule", 0, 1),
+    Field(
+        "outcome",
+        "uint8",
+        (),
+        "1",
+        "",
+        "success, or the cause of the label 0",
+        0,
+        len(_OUTCOME_CODES) - 1,
+        _OUTCOME_CODES,
+    ),
+    Field("grasps_free", "int16", (), "1", "", "grasps of the target that the hand alone can take here", 0),
+    Field("grasps_tried", "int16", (), "1", "", "grasps for which joint configurations were looked for", 0),
+    Field(
+        "T_target_tcp",
+        "float32",
+        ("row", "column"),
+        "m",
+        "target",
+        "grasp that was planned, target frame; the identity where none was",
+        -10,
+        10,
+    ),
+    Field("grasp_score", "float32", (), "1", "", "share of floating-hand trials the grasp held", 0, 1),
+    Field("q_grasp_rad", "float32", ("joint",), "rad", "", "joints at the grasp; zeros where none", -7, 7),
+    Field("path_length_rad", "float32", (), "rad", "", "length in joint space, tucked to grasp", 0, 1000),
+    Field(
+        "path_clearance_m",
+        "float32",
+        (),
+        "m",
+        "",
+        "smallest distance of the arm to the scene on the way to the pregrasp",
+        0,
+        10,
+    ),
+)
+
+SIM_FIELDS = (
+    *PLAN_FIELDS,
+    Field("attempts", "int16", (), "1", "", "grasps that were executed", 0),
+    Field("trials", "int16", (), "1", "", "executions counted for the label; 1 without disturbance", 0),
+    Field("successes", "int16", (), "1", "", "those that lifted and held the target", 0),
+    Field("lift_m", "float32", (), "m", "world", "rise of the target in the last execution", -100, 100),
+    Field("slip_m", "float32", (), "m", "tcp", "motion of the target in the hand from closing on", 0, 100),
+    Field("disturbed_m", "float32", (), "m", "world", "largest motion of any other object", 0, 100),
+    Field("simulated_s", "float32", (), "s", "", "simulated time of all executions", 0, 1e6),
+)
+
 _SIZES = {
     "row": 4, "column": 4, "xy": 2, "xyz": 3, "channel": 3, "byte": 16, "fx_fy_cx_cy": 4,
-    "width_height": 2, "redraw_cause": len(REDRAW_CAUSES), "object": 7, "point": 4096,
+    "width_height": 2, "redraw_cause": len(REDRAW_CAUSES), "object": 7, "point": 4096, "joint": 7,
 }  # fmt: skip
 
 SCHEMAS: dict[str, RecordSchema] = {
-    "heuristic": RecordSchema("heuristic", 1, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
+    "heuristic": RecordSchema("heuristic", 2, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
+    "plan": RecordSchema("plan", 1, SCENE_FIELDS, PLAN_FIELDS, _SIZES),
+    "sim": RecordSchema("sim", 1, SCENE_FIELDS, SIM_FIELDS, _SIZES),
 }
 
 

@@ -19,11 +19,16 @@ class Stream(IntEnum):
     OBSERVE = 2
     CANDIDATES = 3
     NOISE = 4
+    PATH = 5
+    DISTURBANCE = 6
 
 
-def generator(seed: int, stream: Stream, scene_index: int, retry: int) -> np.random.Generator:
-    """The generator of one stage of one try of one scene; the same on every machine."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), scene_index, retry))
+def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
+    """The generator of one stage of one item; the same on every machine.
+
+    `index` is (scene index, retry), and for what a candidate draws (scene index, retry, candidate).
+    """
+    sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), *index))
     return np.random.Generator(np.random.PCG64(sequence))
 
 

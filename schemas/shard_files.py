@@ -168,7 +168,9 @@ def field_attributes(field: Field) -> dict[str, Any]:
     """An array's attributes: CF names where they exist."""
     attributes: dict[str, Any] = {"long_name": field.doc, "units": field.unit, "frame": field.frame}
     bounds = {"valid_min": field.low, "valid_max": field.high}
-    return {k: v for k, v in {**attributes, **bounds}.items() if v not in (None, "")}
+    # CF's way to say what integer codes mean; their values are 0, 1, ...
+    codes = {"flag_meanings": " ".join(field.codes)}
+    return {k: v for k, v in {**attributes, **bounds, **codes}.items() if v not in (None, "")}
 
 
 def _checked_text(field: Field, values: Array) -> Array:

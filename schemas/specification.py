@@ -103,6 +103,8 @@ class CandidateParams(_Frozen):
     grid_cells: int = Field(default=25, ge=2, le=200)
     grid_half_width_m: Metres = 1.0
     jitter: bool = True
+    # Only where the base is clear, or also within the arm's reach; None takes all cells.
+    within: Literal["clear", "in-range"] | None = None
     robots_per_scene: int = Field(default=4, ge=1, le=625)
     robot_per_candidate: bool = False
     camera_height_m: Range = Range(low=0.8, high=1.5)
@@ -115,6 +117,89 @@ class CandidateParams(_Frozen):
     def count(self) -> int:
         """Candidates of one scene."""
         return self.grid_cells**2 if self.per_scene == "grid" else self.per_scene
+
+
+class GraspParams(_Frozen):
+    """Grasps of the target: how many are looked for, and how many a scene keeps."""
+
+    per_object: int = Field(default=300, ge=1, le=10_000)
+    per_scene: int = Field(default=40, ge=1, le=1000)
+    # A grasp below this share of held floating-hand trials is not offered to the arm.
+    min_score: Fraction = 0.5
+
+
+class MotionParams(_Frozen):
+    """The kinematic stage: IK, collisions, path, straight approach and lift."""
+
+    ik_seeds: int = Field(default=3, ge=1, le=100)
+    pregrasp_m: Metres = 0.08
+    lift_m: Metres = 0.10
+    # Between neighbouring points of a straight line no joint may move further.
+    max_joint_jump_rad: float = Field(default=0.6, gt=0, le=6.3)
+    # Spacing of the configurations at which a path is checked against the scene.
+    check_step_rad: float = Field(default=0.05, gt=0, le=1.0)
+    # A count, never a time: labels must not depend on how fast a machine is.
+    path_iterations: int = Field(default=2000, ge=1, le=1_000_000)
+
+
+class TrialParams(_Frozen):
+    """Execution in physics: the whole planned path, close, lift, hold."""
+
+    timestep_s: float = Field(default=1 / 200, gt=0, le=0.02)
+    control_period_s: float = Field(default=1 / 20, gt=0, le=0.2)
+    object_friction: float = Field(default=0.6, ge=0, le=5)
+    finger_friction: float = Field(default=2.0, ge=0, le=5)
+    grip_force_n: float = Field(default=40.0, gt=0, le=1000)
+    hulls_per_object: int = Field(default=16, ge=1, le=1024)
+    approach_s: float = Field(default=0.6, gt=0, le=60)
+    close_s: float = Field(default=0.5, gt=0, le=60)
+    lift_s: float = Field(default=0.8, gt=0, le=60)
+    hold_s: float = Field(default=0.5, gt=0, le=60)
+    # Allowed motion of the object in the hand from the end of closing to the end of holding.
+    max_slip_m: Metres = 0.03
+    # Grasps tried one after the other, each in a fresh scene, until one lifts the target.
+    max_attempts: int = Field(default=3, ge=1, le=100)
+
+
+class Interval(_Frozen):
+    """A closed interval from which a number is drawn uniformly."""
+
+    low: float = Field(ge=0, le=100)
+    high: float = Field(ge=0, le=100)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Interval:
+        if self.high < self.low:
+            raise ValueError(f"high {self.high} is below low {self.low}")
+        return self
+
+
+class DisturbanceParams(_Frozen):
+    """What the planner does not know: each candidate's plan is executed `repeats` times so."""
+
+    repeats: int = Field(default=5, ge=1, le=1000)
+    target_position_std_m: Metres = 0.01
+    target_yaw_std_rad: float = Field(default=0.05, ge=0, le=3.2)
+    base_position_std_m: Metres = 0.02
+    base_yaw_std_rad: float = Field(default=0.02, ge=0, le=3.2)
+    object_friction: Interval = Interval(low=0.3, high=0.9)
+    mass_scale: Interval = Interval(low=0.8, high=1.2)
+
+
+class ArmParams(_Frozen):
+    """What the label sources `plan` and `sim` do with an arm; `trial` is None for `plan`."""
+
+    robot: str = "panda-scaled"
+    grasps: GraspParams = GraspParams()
+    motion: MotionParams = MotionParams()
+    trial: TrialParams | None = None
+    disturbance: DisturbanceParams | None = None
+
+
+class ScenesFrom(_Frozen):
+    """The run whose stored scenes and candidates are labelled again."""
+
+    spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
 class VisibilityParams(_Frozen):
@@ -162,9 +247,14 @@ class Specification(_Frozen):
     candidates: CandidateParams = CandidateParams()
     visibility: VisibilityParams = VisibilityParams()
     heuristic: HeuristicParams = HeuristicParams()
+    arm: ArmParams | None = None
+    scenes_from: ScenesFrom | None = None
     # Versions of the label code and of the engines that move bits, by name.
     engines: dict[str, str] = Field(default_factory=dict)
 
     def hash(self) -> str:
-        """sha256 of the canonical JSON: the identity of the endless sequence of samples."""
-        return digest_of(self.model_dump(mode="json"))
+        """sha256 of the canonical JSON: the identity of the endless sequence of samples.
+
+        What is None is left out, so that a later section, None by default, leaves older hashes alone.
+        """
+        return digest_of(self.model_dump(mode="json", exclude_none=True))

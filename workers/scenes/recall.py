@@ -20,13 +20,20 @@ Record = Mapping[str, Any]  # one row of the scene table, by field name
 
 @dataclass(frozen=True, eq=False)
 class RecalledScene:
-    """What a scene's record stands for."""
+    """What a scene's record stands for: a `SettledScene`, with the camera it was observed by."""
 
+    index: int
+    retry: int
     house: PreparedHouse
     models: tuple[ObjectModel, ...]
     T_world_object: F64  # (K, 4, 4)
     rays: RayStage
     camera: Camera
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        return self.T_world_object[0, :3, 3]
 
     @property
     def stage(self) -> Stage:
@@ -48,7 +55,9 @@ def recall_scene(world: World, record: Record) -> RecalledScene:
     fx, fy, cx, cy = (float(v) for v in record["intrinsics_px"])
     width, height = (int(v) for v in record["image_size_px"])
     camera = Camera(np.asarray(record["T_world_camera"], np.float64), width, height, fx, fy, cx, cy)
-    return RecalledScene(house, models, T_world_object, world.stage(house, names, T_world_object), camera)
+    rays = world.stage(house, names, T_world_object)
+    index, retry = int(record["scene_index"]), int(record["retry"])
+    return RecalledScene(index, retry, house, models, T_world_object, rays, camera)
 
 
 def _same(name: str, found: str, stored: str) -> None:

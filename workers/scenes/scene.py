@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from schemas.fields import REDRAW_CAUSES
 from workers.geometry.mesh import F64
@@ -24,6 +25,35 @@ class Redraw(Exception):
         super().__init__(cause)
         self.cause = cause
         self.detail = detail
+
+
+class SettledScene(Protocol):
+    """What a label source looks at: drawn anew (`Scene`) or recalled from a store. Object 0 is the target."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def retry(self) -> int: ...
+
+    @property
+    def house(self) -> PreparedHouse: ...
+
+    @property
+    def models(self) -> tuple[ObjectModel, ...]: ...
+
+    @property
+    def T_world_object(self) -> F64:
+        """Settled poses (K, 4, 4)."""
+        ...
+
+    @property
+    def rays(self) -> RayStage: ...
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

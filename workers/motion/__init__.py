@@ -1,0 +1,1 @@
+"""Motion: whether and how an arm gets its hand to a grasp, without physics."""

@@ -1,0 +1,31 @@
+"""What the kinematic stage finds out about one base pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from workers.geometry.mesh import F64
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """Joint paths from a tucked pose to a lifted object. Neighbouring rows are joined by straight lines."""
+
+    grasp: int  # row of the scene's GraspSet
+    home: int  # row of the robot's homes_rad
+    q_reach_rad: F64  # (M, A), home to pregrasp
+    q_approach_rad: F64  # (K, A), pregrasp to grasp, along a straight line of the TCP
+    q_lift_rad: F64  # (J, A), grasp to lifted, straight up
+    opening_m: float
+    length_rad: float  # of the reach and the approach, Euclidean in joint space
+    clearance_m: float  # smallest distance of arm and scene over q_reach_rad
+
+
+@dataclass(frozen=True, eq=False)
+class PlanReport:
+    """`outcome` is a key of OUTCOMES: success with a plan, or the cause of the try that came furthest."""
+
+    outcome: str
+    plan: MotionPlan | None
+    grasps_free: int  # grasps of the target that the hand alone can take in this scene
+    grasps_tried: int  # those for which IK was asked

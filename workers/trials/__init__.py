@@ -1,0 +1,1 @@
+"""Trials: planned grasps executed in physics."""
