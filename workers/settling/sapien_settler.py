@@ -9,8 +9,8 @@ import numpy as np
 
 from schemas.specification import SettleParams
 from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import pose, quaternion_wxyz
 from workers.objects.model import ObjectModel
+from workers.settling.sapien_bodies import add_object, add_static, pose_of
 from workers.settling.settler import SettleResult
 
 with warnings.catch_warnings():
@@ -19,7 +19,6 @@ with warnings.catch_warnings():
     import sapien
     from sapien import physx
 
-_UNSCALED = [1.0, 1.0, 1.0]
 _LOOK_EVERY = 5  # steps between looks at the speeds: reading them costs as much as a step
 
 
@@ -38,9 +37,10 @@ def settle_sapien(
     scene = sapien.Scene([system])
     scene.set_timestep(params.timestep_s)
     material = physx.PhysxMaterial(params.friction, params.friction, 0.0)
-    _add_static(scene, static_parts_m, material)
+    add_static(scene, static_parts_m, material)
     bodies = [
-        _add_object(scene, model, T, material) for model, T in zip(objects, T_world_object, strict=True)
+        add_object(scene, model.convex_parts_m, model.mass_kg, T, material)
+        for model, T in zip(objects, T_world_object, strict=True)
     ]
 
     steps, resting = 0, 0
@@ -56,7 +56,7 @@ def settle_sapien(
         calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
         resting = resting + _LOOK_EVERY if calm else 0
 
-    final = np.stack([_pose_of(b) for b in bodies]) if bodies else np.zeros((0, 4, 4))
+    final = np.stack([pose_of(b) for b in bodies]) if bodies else np.zeros((0, 4, 4))
     return SettleResult(
         T_world_object=final,
         steps=steps,
@@ -65,51 +65,6 @@ def settle_sapien(
         residual_angular_radps=angular,
         penetration_m=_deepest_contact(scene),
     )
-
-
-def _add_static(scene: sapien.Scene, static_parts_m: Sequence[F32], material: physx.PhysxMaterial) -> None:
-    body = physx.PhysxRigidStaticComponent()
-    for part in static_parts_m:
-        # PhysX wants hulls near their own origin: cooking loses precision far from it.
-        centre_m = part.mean(axis=0)
-        shape = physx.PhysxCollisionShapeConvexMesh(
-            np.ascontiguousarray(part - centre_m, np.float32), _UNSCALED, material
-        )
-        shape.set_local_pose(sapien.Pose(centre_m.tolist()))
-        body.attach(shape)
-    entity = sapien.Entity()
-    entity.add_component(body)
-    scene.add_entity(entity)
-
-
-def _add_object(
-    scene: sapien.Scene, model: ObjectModel, T_world_object: F64, material: physx.PhysxMaterial
-) -> physx.PhysxRigidDynamicComponent:
-    body = physx.PhysxRigidDynamicComponent()
-    for part in model.convex_parts_m:
-        body.attach(
-            physx.PhysxCollisionShapeConvexMesh(np.ascontiguousarray(part, np.float32), _UNSCALED, material)
-        )
-    # Scaling mass and inertia together keeps the mass distribution of the parts, which
-    # overlap a little, at the object's own mass.
-    scale = model.mass_kg / body.mass
-    inertia = np.asarray(body.inertia, np.float32) * np.float32(scale)
-    body.set_mass(model.mass_kg)
-    body.set_inertia(inertia.tolist())
-    entity = sapien.Entity()
-    entity.add_component(body)
-    entity.set_pose(_sapien_pose(T_world_object))
-    scene.add_entity(entity)
-    return body
-
-
-def _sapien_pose(T: F64) -> sapien.Pose:
-    return sapien.Pose(T[:3, 3].tolist(), quaternion_wxyz(T[:3, :3]).tolist())
-
-
-def _pose_of(body: physx.PhysxRigidDynamicComponent) -> F64:
-    p = body.entity.pose
-    return pose(np.asarray(p.p, np.float64), np.asarray(p.q, np.float64))
 
 
 def _deepest_contact(scene: sapien.Scene) -> float:
