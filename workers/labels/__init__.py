@@ -7,6 +7,8 @@ from workers.registry import entry
 
 LABEL_SOURCES: dict[str, str] = {
     "heuristic": "workers.labels.distance_visibility:HEURISTIC",
+    "plan": "workers.labels.plan:PLAN",
+    "sim": "workers.labels.sim:SIM",
 }
 
 

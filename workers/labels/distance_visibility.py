@@ -10,10 +10,10 @@ from workers.bases.candidates import Candidates, distances
 from workers.labels import heuristic as formula
 from workers.labels.source import Columns, LabelSource
 from workers.rendering.visibility import visible_pixels
-from workers.scenes.scene import Scene
+from workers.scenes.scene import SettledScene
 
 
-def label(scene: Scene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
+def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
     """Distances, pixel counts, rho, H and the label of every candidate."""
     with clock.stage("visibility"):
         eyes_m = np.column_stack([candidates.base_xy_m, candidates.camera_height_m]).astype(np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 from schemas.cost import StageClock
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates
-from workers.scenes.scene import Scene
+from workers.scenes.scene import SettledScene
 
 Columns = dict[str, np.ndarray[Any, Any]]
 
@@ -28,4 +28,4 @@ class LabelSource:
     name: str
     version: int
     schema: str
-    label: Callable[[Scene, Candidates, Specification, StageClock], Columns]
+    label: Callable[[SettledScene, Candidates, Specification, StageClock], Columns]

@@ -47,6 +47,7 @@ class Robot(Protocol):
 
     name: str  # as the registry and the specification name it
     reach_m: float  # largest distance from the first joint that moves the TCP to the TCP
+    shoulder_m: F64  # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther
     base_height_m: float
     base_radius_m: float | None  # footprint of its own mobile base; None stands on a pedestal
     gripper: Gripper

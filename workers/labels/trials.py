@@ -1,0 +1,228 @@
+"""What the label sources `plan` and `sim` share: candidate by candidate, to the stage that decides.
+
+base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
+-> executed in physics, up to `max_attempts` grasps, or `repeats` times in a disturbed world   (`sim`)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from schemas.cost import StageClock
+from schemas.errors import InputError
+from schemas.fields import OUTCOMES
+from schemas.identity import Stream, generator
+from schemas.specification import ArmParams, DisturbanceParams, Specification
+from workers.bases.candidates import Candidates
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse, translation, yaw_pose
+from workers.grasps.grasp import GraspSet
+from workers.grasps.keep import grasps_of
+from workers.motion.candidate import plan_candidate
+from workers.motion.plan import MotionPlan, PlanReport
+from workers.motion.scene import PlanningScene, pose_of_base, prepare
+from workers.robots import open_robot
+from workers.robots.robot import Robot
+from workers.scenes.scene import SettledScene
+from workers.trials.execute import TrialScene, prepare_trials, run_trial
+from workers.trials.trial import Disturbance, TrialResult
+
+_PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; success is first
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateTrial:
+    """All that was found out about one candidate."""
+
+    outcome: str
+    report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
+    plan: MotionPlan | None = None  # the last one that was made
+    results: tuple[TrialResult, ...] = ()
+    successes: int = 0
+
+
+@dataclass(eq=False)
+class ArmInScene:
+    """One robot in one scene; what planning and physics need is prepared when first asked for."""
+
+    scene: SettledScene
+    robot: Robot
+    grasps: GraspSet
+    arm: ArmParams
+    base_radius_m: float
+    clock: StageClock = field(default_factory=StageClock)
+
+    @cached_property
+    def planning(self) -> PlanningScene:
+        with self.clock.stage("grasps"):
+            return prepare(
+                self.scene,
+                self.robot,
+                self.grasps,
+                self.arm.motion,
+                self.arm.grasps.per_scene,
+                self.base_radius_m,
+            )
+
+    @cached_property
+    def trials(self) -> TrialScene:
+        assert self.arm.trial is not None
+        with self.clock.stage("execute"):
+            return prepare_trials(self.scene, self.robot, self.arm.trial, self.base_radius_m)
+
+    @cached_property
+    def tcp_positions_m(self) -> F64:
+        """World positions (G, 3) of the TCP at all grasps of the target."""
+        T = self.scene.T_world_object[0]
+        return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+
+    def is_within_reach(self, T_world_base: F64) -> bool:
+        """Whether the arm is long enough for any grasp of the target, in a straight line."""
+        shoulder_m = T_world_base[:3, :3] @ self.robot.shoulder_m + T_world_base[:3, 3]
+        gaps_m = np.linalg.norm(self.tcp_positions_m - shoulder_m, axis=1)
+        return bool((gaps_m <= self.robot.reach_m).any())
+
+
+def arm_in_scene(
+    scene: SettledScene, candidates: Candidates, row: int, spec: Specification, clock: StageClock
+) -> ArmInScene:
+    """The robot of candidate `row` in a scene. Raises InputError for an unknown robot or a wrong reach."""
+    arm = arm_of(spec)
+    with clock.stage("grasps"):
+        reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
+        robot = open_robot(arm.robot, reach_m, height_m)
+        grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps)
+    return ArmInScene(scene, robot, grasps, arm, spec.candidates.base_radius_m, clock)
+
+
+def arm_of(spec: Specification) -> ArmParams:
+    """The specification's arm section. Raises InputError where it has none."""
+    if spec.arm is None:
+        mend = "Submit plan or sim, which have an arm"
+        raise InputError("specification", "arm", f"none for label source {spec.label_source}", mend)
+    return spec.arm
+
+
+def try_candidate(
+    at: ArmInScene, candidates: Candidates, row: int, spec: Specification, record: bool = False
+) -> CandidateTrial:
+    """Plan, and where the specification asks for trials execute, one candidate.
+
+    Depends on the scene, the candidate and the specification alone, not on what was tried before.
+    """
+    if len(at.grasps) == 0:
+        return CandidateTrial("no_grasp")
+    if candidates.clearance_m[row] < 0:
+        return CandidateTrial("base_collision")
+    T_world_base = pose_of_base(
+        candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, at.scene.target_center_m
+    )
+    if not at.is_within_reach(T_world_base):
+        return CandidateTrial("out_of_reach")
+    key = (at.scene.index, at.scene.retry, row)
+    rng = generator(spec.seed, Stream.PATH, *key)
+    planning, clock = at.planning, at.clock
+    with clock.stage("plan"):
+        report = plan_candidate(planning, T_world_base, rng)
+    if report.plan is None or at.arm.trial is None:
+        return CandidateTrial(report.outcome, report, report.plan)
+    if at.arm.disturbance is not None:
+        disturbance_rng = generator(spec.seed, Stream.DISTURBANCE, *key)
+        T_world_target = at.scene.T_world_object[0]
+        disturbances = draw_disturbances(at.arm.disturbance, T_world_target, disturbance_rng)
+        return _repeat(at, T_world_base, report, report.plan, disturbances, record)
+    return _attempt(at, T_world_base, report, report.plan, rng, record)
+
+
+def _attempt(
+    at: ArmInScene,
+    T_world_base: F64,
+    report: PlanReport,
+    plan: MotionPlan,
+    rng: np.random.Generator,
+    record: bool,
+) -> CandidateTrial:
+    """Grasp after grasp, each in a fresh scene, until one lifts the target or they run out."""
+    trial = at.arm.trial
+    assert trial is not None
+    results: list[TrialResult] = []
+    failed: set[int] = set()
+    planning, trials, clock = at.planning, at.trials, at.clock
+    undisturbed = Disturbance.none(trial.object_friction)
+    while True:
+        with clock.stage("execute"):
+            results.append(run_trial(trials, T_world_base, plan, undisturbed, record))
+        failed.add(plan.grasp)
+        if results[-1].outcome == "success":
+            return CandidateTrial("success", report, plan, tuple(results), 1)
+        if len(results) == trial.max_attempts:
+            break
+        with clock.stage("plan"):
+            next_plan = plan_candidate(planning, T_world_base, rng, frozenset(failed)).plan
+        if next_plan is None:
+            break
+        plan = next_plan
+    outcome = max((r.outcome for r in results), key=_PROGRESS.index)
+    return CandidateTrial(outcome, report, plan, tuple(results), 0)
+
+
+def _repeat(
+    at: ArmInScene,
+    T_world_base: F64,
+    report: PlanReport,
+    plan: MotionPlan,
+    disturbances: list[Disturbance],
+    record: bool,
+) -> CandidateTrial:
+    """One plan, executed once in each disturbed world; good where at least half of them lift."""
+    trials, clock = at.trials, at.clock
+    results: list[TrialResult] = []
+    for disturbance in disturbances:
+        with clock.stage("execute"):
+            results.append(run_trial(trials, T_world_base, plan, disturbance, record))
+    successes = sum(r.outcome == "success" for r in results)
+    if 2 * successes >= len(results):
+        outcome = "success"
+    else:
+        counts = Counter(r.outcome for r in results if r.outcome != "success")
+        outcome = max(counts, key=lambda name: (counts[name], _PROGRESS.index(name)))
+    return CandidateTrial(outcome, report, plan, tuple(results), successes)
+
+
+def draw_disturbances(
+    params: DisturbanceParams, T_world_target: F64, rng: np.random.Generator
+) -> list[Disturbance]:
+    """`repeats` worlds that differ from the planned one; target and base slide and turn on their planes."""
+    centre = translation(*T_world_target[:3, 3])
+    drawn: list[Disturbance] = []
+    for _ in range(params.repeats):
+        target, base = rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.0, 3)
+        friction = rng.uniform(params.object_friction.low, params.object_friction.high)
+        mass_scale = rng.uniform(params.mass_scale.low, params.mass_scale.high)
+        # The target may lie on its side: it turns about the world's vertical, not about its own z.
+        turned = _planar(target, params.target_position_std_m, params.target_yaw_std_rad)
+        T_world_moved = centre @ turned @ inverse(centre) @ T_world_target
+        drawn.append(
+            Disturbance(
+                inverse(T_world_target) @ T_world_moved,
+                _planar(base, params.base_position_std_m, params.base_yaw_std_rad),
+                float(friction),
+                float(mass_scale),
+            )
+        )
+    return drawn
+
+
+def _planar(normal: F64, position_std_m: float, yaw_std_rad: float) -> F64:
+    x_m, y_m = normal[:2] * position_std_m
+    return yaw_pose(float(x_m), float(y_m), 0.0, float(normal[2] * yaw_std_rad))
+
+
+def target_tcp(at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> F64:
+    """Pose (4, 4) of the TCP in the target's frame at the grasp that was planned."""
+    T_world_tcp = T_world_base @ at.robot.T_base_tcp(plan.q_approach_rad[-1])
+    return inverse(at.scene.T_world_object[0]) @ T_world_tcp
