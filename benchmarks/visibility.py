@@ -18,9 +18,6 @@ import numpy as np
 
 from datagen.specify import specify
 from schemas.cost import StageClock
-from schemas.identity import Stream, generator
-from workers.bases.candidates import draw_candidates
-from workers.bases.clearance import base_clearance_m
 from workers.geometry.mesh import F64
 from workers.houses import open_houses
 from workers.objects import open_objects
@@ -83,9 +80,7 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
     embree, tiny = Spent(), Spent()
     rho, target_px, clear, in_surface = [], [], [], []
     for index in range(options.scenes):
-        scene = draw_scene(world, index, StageClock())
-        rng = generator(spec.seed, Stream.CANDIDATES, index, scene.retry)
-        candidates = draw_candidates(scene.target_center_m, spec.candidates, rng)
+        scene, candidates = draw_scene(world, index, StageClock())
         eyes_m = np.column_stack([candidates.base_xy_m, candidates.camera_height_m]).astype(np.float64)
         stage = Stage(scene.house.house, scene.models, scene.T_world_object)
 
@@ -115,7 +110,7 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
         both = np.array([by_embree, by_tiny], np.float64)  # (2 labellers, 2 counts, N)
         rho.append((both[:, 1] / np.maximum(both[:, 0], 1)).T)
         target_px.append(both[:, 0].T)
-        clear.append(base_clearance_m(candidates, scene.house.obstacles, spec.candidates) >= 0)
+        clear.append(candidates.clearance_m >= 0)
         in_surface.append(stand_in_surfaces(scene.rays, eyes_m))
     joined = (np.concatenate(rows) for rows in (rho, target_px, clear, in_surface))
     return Looks(*joined), embree, tiny

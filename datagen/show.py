@@ -9,11 +9,11 @@ from cyclopts import Parameter
 
 from datagen.console import print_rows
 from datagen.drawing.scene_picture import best_clear, draw_scene_picture
-from datagen.scene_rows import read_scene
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 from schemas.identity import Stream, generator
 from schemas.run import Run
+from schemas.scene_rows import read_scene
 from workers.scenes.draw import render_frame
 from workers.scenes.recall import recall_scene
 from workers.world import open_world

@@ -120,6 +120,14 @@ class RecordSchema:
                 raise InputError(place, name, f"value {a.max()} above {f.high}", mend)
 
 
+@dataclass(frozen=True, eq=False)
+class SceneRows:
+    """What is stored of one scene, by field name: its record, and its samples, one row a candidate."""
+
+    record: Mapping[str, Any]
+    samples: Mapping[str, np.ndarray[Any, Any]]
+
+
 _EXTENT = 1000.0  # no house is larger; a larger coordinate is a unit error or garbage
 
 SCENE_FIELDS = (

@@ -2,32 +2,33 @@
 
 draw a house, a support, a target and clutter   (redrawn until it works)
 settle them by physics
-observe one RGB-D frame
 sample base candidates
-label them
+observe one RGB-D frame                         (or recall scene and candidates from a store)
+label the candidates
 check the batch against its schema
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from schemas.cost import StageClock
-from schemas.fields import REDRAW_CAUSES, sized_schema
-from schemas.identity import Stream, generator, sample_ids
+from schemas.errors import InputError
+from schemas.fields import REDRAW_CAUSES, SceneRows, sized_schema
+from schemas.identity import sample_ids
 from schemas.specification import Specification
-from workers.bases.candidates import Candidates, draw_candidates
-from workers.bases.clearance import base_clearance_m
+from workers.bases.candidates import Candidates
 from workers.labels import load_label_source
 from workers.labels.source import LabelSource
 from workers.rendering.frame import Camera
 from workers.scenes.draw import draw_scene
-from workers.scenes.scene import Scene
+from workers.scenes.recall import recall_scene
+from workers.scenes.scene import Scene, SettledScene
 from workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -43,31 +44,73 @@ class ShardResult:
     redraws: dict[str, int]
 
 
-def run_shard(spec: Specification, world: World, scene_indices: Sequence[int]) -> ShardResult:
-    """Make the scenes of these indices and label their candidates.
+@dataclass(frozen=True, eq=False)
+class _Staged:
+    """A scene that waits for labels: what is looked at, and the rows that no label decides."""
 
-    The same specification and index give the same bytes, whatever else is in the shard.
+    scene: SettledScene
+    candidates: Candidates
+    record: Mapping[str, Any]
+    redraws: Mapping[str, int]
+
+
+def run_shard(
+    spec: Specification,
+    world: World,
+    scene_indices: Sequence[int],
+    stored: Iterable[SceneRows] | None = None,
+) -> ShardResult:
+    """Make the scenes of these indices, or take them from `stored`, and label their candidates.
+
+    The same specification and index give the same bytes, whatever else is in the shard. Stored
+    scenes keep theirs. Raises InputError where a stored scene is another one than its index says, or
+    its house and objects are not those of the world.
     """
     source, spec_hash = load_label_source(spec.label_source), spec.hash()
     schema = sized_schema(source.schema, spec)
     clock, redraws = StageClock(), Counter[str]()
-    scene_rows: list[dict[str, Any]] = []
+    scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
-    for index in scene_indices:
-        scene = draw_scene(world, index, clock)
-        rng = generator(spec.seed, Stream.CANDIDATES, index, scene.retry)
-        candidates = draw_candidates(scene.target_center_m, spec.candidates, rng)
-        labelled = source.label(scene, candidates, spec, clock)
-        common = candidate_columns(scene, candidates, spec, spec_hash, source)
-        scene_rows.append(scene_row(scene))
+    staged_scenes = (
+        (_draw(world, index, clock) for index in scene_indices)
+        if stored is None
+        else (_recall(world, index, rows, clock) for index, rows in zip(scene_indices, stored, strict=True))
+    )
+    for staged in staged_scenes:
+        labelled = source.label(staged.scene, staged.candidates, spec, clock)
+        common = candidate_columns(staged.scene.index, staged.candidates, spec_hash, source)
+        scene_rows.append(staged.record)
         sample_blocks.append(common | labelled)
-        redraws.update(scene.redraws)
+        redraws.update(staged.redraws)
 
     scenes = {f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields}
     samples = {name: np.concatenate([b[name] for b in sample_blocks]) for name in sample_blocks[0]}
     schema.check("scene", len(scene_rows), scenes)
     schema.check("sample", sum(len(b["label"]) for b in sample_blocks), samples)
     return ShardResult(scenes, samples, clock, dict(redraws))
+
+
+def _draw(world: World, index: int, clock: StageClock) -> _Staged:
+    scene, candidates = draw_scene(world, index, clock)
+    return _Staged(scene, candidates, scene_row(scene), scene.redraws)
+
+
+def _recall(world: World, index: int, rows: SceneRows, clock: StageClock) -> _Staged:
+    with clock.stage("draw"):
+        scene = recall_scene(world, rows.record)
+    if scene.index != index:
+        problem = f"scene {scene.index} is stored where scene {index} belongs"
+        raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
+    columns = rows.samples
+    candidates = Candidates(
+        base_xy_m=columns["base_xy_m"],
+        robot_index=columns["robot_index"],
+        camera_height_m=columns["camera_height_m"],
+        base_height_m=columns["base_height_m"],
+        arm_reach_m=columns["arm_reach_m"],
+        clearance_m=columns["base_clearance_m"],
+    )
+    return _Staged(scene, candidates, rows.record, {})
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:
@@ -111,23 +154,22 @@ def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def candidate_columns(
-    scene: Scene, candidates: Candidates, spec: Specification, spec_hash: str, source: LabelSource
+    scene_index: int, candidates: Candidates, spec_hash: str, source: LabelSource
 ) -> Columns:
     """The columns that the candidates alone decide, one row a candidate."""
     n = len(candidates)
-    clearance_m = base_clearance_m(candidates, scene.house.obstacles, spec.candidates)
     index = np.arange(n, dtype=np.int32)
     return {
-        "sample_id": sample_ids(spec_hash, scene.index, index),
-        "sample_scene_index": np.full(n, scene.index, np.int64),
+        "sample_id": sample_ids(spec_hash, scene_index, index),
+        "sample_scene_index": np.full(n, scene_index, np.int64),
         "candidate_index": index,
         "robot_index": candidates.robot_index,
         "base_xy_m": candidates.base_xy_m,
         "camera_height_m": candidates.camera_height_m,
         "base_height_m": candidates.base_height_m,
         "arm_reach_m": candidates.arm_reach_m,
-        "base_clearance_m": clearance_m,
-        "base_is_clear": clearance_m >= 0,
+        "base_clearance_m": candidates.clearance_m,
+        "base_is_clear": candidates.clearance_m >= 0,
         "label_source": np.full(n, source.name, dtype=object),
         "label_version": np.full(n, source.version, np.int16),
     }

@@ -8,7 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.specification import CandidateParams, Range
+from workers.bases.clearance import Obstacles, base_clearance_m
 from workers.geometry.mesh import F32, F64
+from workers.scenes.scene import Redraw
+
+Bools = npt.NDArray[np.bool_]
+
+# Times that all cells are looked at, each with its own jitter, before a scene is given up.
+_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +27,22 @@ class Candidates:
     camera_height_m: F32  # (N,)
     base_height_m: F32  # (N,)
     arm_reach_m: F32  # (N,)
+    clearance_m: F32  # (N,), free distance around the robot's body; below 0 it does not fit
 
     def __len__(self) -> int:
         return len(self.base_xy_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Robots:
+    """The R robots of one scene."""
+
+    camera_height_m: F32  # (R,)
+    base_height_m: F32  # (R,)
+    arm_reach_m: F32  # (R,)
+
+    def __len__(self) -> int:
+        return len(self.arm_reach_m)
 
 
 def grid_offsets(params: CandidateParams) -> F64:
@@ -35,33 +55,26 @@ def grid_offsets(params: CandidateParams) -> F64:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def draw_candidates(target_center_m: F64, params: CandidateParams, rng: np.random.Generator) -> Candidates:
-    """All cells of the grid, or a random subset without repetition and jittered within its cells.
+def draw_candidates(
+    target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
+) -> Candidates:
+    """All cells of the grid, or `per_scene` positions jittered within their cells, with robots on them.
 
-    Robots: `robots_per_scene` of them with the candidates dealt out in turn, so that a model can
-    encode a scene once a robot; or one a candidate, as the paper has it.
+    Cells are drawn from all without repetition, or from those that `within` asks for. Robots:
+    `robots_per_scene` of them with the candidates dealt out in turn, so that a model can encode a
+    scene once a robot; or one a candidate, as the paper has it. Raises Redraw("no_base") where
+    around this target there are too few places of the asked kind for these robots.
     """
-    offsets = grid_offsets(params)
     n = params.count
-    if params.per_scene != "grid":
-        offsets = offsets[rng.choice(len(offsets), size=n, replace=n > len(offsets))]
-        if params.jitter:
-            cell = 2 * params.grid_half_width_m / (params.grid_cells - 1)
-            offsets = offsets + rng.uniform(-cell / 2, cell / 2, size=offsets.shape)
-    robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
-
-    def draw(r: Range) -> F32:
-        return rng.uniform(r.low, r.high, size=robots).astype(np.float32)
-
-    camera, base, reach = draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m)
-    robot_index = (np.arange(n) % robots).astype(np.int16)
-    return Candidates(
-        base_xy_m=(target_center_m[:2] + offsets).astype(np.float32),
-        robot_index=robot_index,
-        camera_height_m=camera[robot_index],
-        base_height_m=base[robot_index],
-        arm_reach_m=reach[robot_index],
-    )
+    n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
+    robot_index = (np.arange(n) % n_robots).astype(np.int16)
+    if params.within is None:
+        base_xy_m = (target_center_m[:2] + _offsets(params, rng)).astype(np.float32)
+        robots = _draw_robots(params, n_robots, rng)
+    else:
+        robots = _draw_robots(params, n_robots, rng)
+        base_xy_m = _places_within(target_center_m, obstacles, params, robots, robot_index, rng)
+    return _stand(base_xy_m, robot_index, robots, obstacles, params)
 
 
 def distances(candidates: Candidates, target_center_m: F64) -> tuple[F32, F32]:
@@ -69,3 +82,81 @@ def distances(candidates: Candidates, target_center_m: F64) -> tuple[F32, F32]:
     planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64) - target_center_m[:2], axis=1)
     rise_m = target_center_m[2] - candidates.base_height_m.astype(np.float64)
     return planar_m.astype(np.float32), np.hypot(planar_m, rise_m).astype(np.float32)
+
+
+def _offsets(params: CandidateParams, rng: np.random.Generator) -> F64:
+    """Positions (N, 2) relative to the target: all cells, or a jittered subset."""
+    offsets, n = grid_offsets(params), params.count
+    if params.per_scene == "grid":
+        return offsets
+    return _jittered(offsets[rng.choice(len(offsets), size=n, replace=n > len(offsets))], params, rng)
+
+
+def _jittered(offsets_m: F64, params: CandidateParams, rng: np.random.Generator) -> F64:
+    if not params.jitter:
+        return offsets_m
+    cell = 2 * params.grid_half_width_m / (params.grid_cells - 1)
+    return offsets_m + rng.uniform(-cell / 2, cell / 2, size=offsets_m.shape)
+
+
+def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _Robots:
+    def draw(r: Range) -> F32:
+        return rng.uniform(r.low, r.high, size=n).astype(np.float32)
+
+    return _Robots(draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m))
+
+
+def _stand(
+    base_xy_m: F32,
+    robot_index: npt.NDArray[np.int16],
+    robots: _Robots,
+    obstacles: Obstacles,
+    params: CandidateParams,
+) -> Candidates:
+    """Robots put on their places (N, 2), world, with what is free around them."""
+    camera_m, base_m = robots.camera_height_m[robot_index], robots.base_height_m[robot_index]
+    clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, obstacles, params)
+    reach_m = robots.arm_reach_m[robot_index]
+    return Candidates(base_xy_m, robot_index, camera_m, base_m, reach_m, clearance_m)
+
+
+def _places_within(
+    target_center_m: F64,
+    obstacles: Obstacles,
+    params: CandidateParams,
+    robots: _Robots,
+    robot_index: npt.NDArray[np.int16],
+    rng: np.random.Generator,
+) -> F32:
+    """A place (N, 2), world, of the asked kind for the robot of each candidate.
+
+    A round looks at every cell in a random order and gives each at most once; cells come a second
+    time only where a whole round did not hold enough.
+    """
+    cells = grid_offsets(params)
+    base_xy_m = np.empty((len(robot_index), 2), np.float32)
+    open_ = np.ones(len(robot_index), np.bool_)
+    for _ in range(_ROUNDS):
+        order = rng.permutation(len(cells))
+        places_m = (target_center_m[:2] + _jittered(cells[order], params, rng)).astype(np.float32)
+        free = np.ones(len(cells), np.bool_)
+        for robot in range(len(robots)):
+            wanted = np.flatnonzero(open_ & (robot_index == robot))
+            if not len(wanted):
+                continue
+            standing = _stand(places_m, np.full(len(cells), robot, np.int16), robots, obstacles, params)
+            found = np.flatnonzero(free & _is_within(standing, target_center_m, params))[: len(wanted)]
+            base_xy_m[wanted[: len(found)]] = places_m[found]
+            open_[wanted[: len(found)]] = False
+            free[found] = False
+        if not open_.any():
+            return base_xy_m
+    raise Redraw("no_base")
+
+
+def _is_within(candidates: Candidates, target_center_m: F64, params: CandidateParams) -> Bools:
+    """Which candidates (N,) are of the kind that `params.within` asks for."""
+    clear = candidates.clearance_m >= 0
+    if params.within == "clear":
+        return clear
+    return clear & (distances(candidates, target_center_m)[1] <= candidates.arm_reach_m)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.specification import CandidateParams
-from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F32, F64
 from workers.geometry.planar import convex_hull, inside_any, signed_distances_to_convex, stack_polygons
 from workers.houses.house import House
@@ -40,16 +39,19 @@ def obstacles_of(house: House) -> Obstacles:
     )
 
 
-def base_clearance_m(candidates: Candidates, obstacles: Obstacles, params: CandidateParams) -> F32:
-    """Free distance (N,) around a robot's body; negative where it cuts an obstacle or stands in no room.
+def base_clearance_m(
+    base_xy_m: F32, base_height_m: F32, camera_height_m: F32, obstacles: Obstacles, params: CandidateParams
+) -> F32:
+    """Free distance (N,) around robots' bodies; negative where one cuts an obstacle or stands in no room.
 
-    The body is a cylinder of `base_radius_m` from the floor to the arm's mount and a mast of
+    Robot k stands at `base_xy_m` (N, 2), world, with its arm's mount and its camera at the heights
+    (N,). Its body is a cylinder of `base_radius_m` from the floor to the mount and a mast of
     `mast_radius_m` from there to the camera. An obstacle counts against the cylinder where it
     begins below the mount, and against the mast where it lies between mount and camera.
     """
-    xy = candidates.base_xy_m.astype(np.float64)
-    mount_m = candidates.base_height_m.astype(np.float64)
-    top_m = np.maximum(candidates.camera_height_m, candidates.base_height_m).astype(np.float64)
+    xy = base_xy_m.astype(np.float64)
+    mount_m = base_height_m.astype(np.float64)
+    top_m = np.maximum(camera_height_m, base_height_m).astype(np.float64)
     clearance = np.full(len(xy), FAR_M)
     reach = FAR_M + max(params.base_radius_m, params.mast_radius_m)
     near = (obstacles.polygons_m.max(1) > xy.min(0) - reach).all(1)

@@ -1,4 +1,4 @@
-"""One scene from its random streams: draw, settle, observe; redraw what does not work."""
+"""One scene from its random streams: draw, settle, sample bases, observe; redraw what does not work."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.identity import Stream, generator
 from schemas.specification import ObservationParams, SettleParams
+from workers.bases.candidates import Candidates, draw_candidates
 from workers.geometry.mesh import F64
 from workers.houses.house import Surface
 from workers.objects.model import ObjectModel
@@ -30,8 +31,8 @@ from workers.world import PreparedHouse, World
 _SURROUNDINGS_M = 0.3
 
 
-def draw_scene(world: World, index: int, clock: StageClock) -> Scene:
-    """Scene `index` of the specification's endless sequence: the first retry that works.
+def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, Candidates]:
+    """Scene `index` of the specification's endless sequence and its candidates: the first retry that works.
 
     Raises InputError when `scene.max_retries` redraws were not enough.
     """
@@ -51,7 +52,9 @@ def draw_scene(world: World, index: int, clock: StageClock) -> Scene:
     )
 
 
-def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], clock: StageClock) -> Scene:
+def _try_scene(
+    world: World, index: int, retry: int, redraws: dict[str, int], clock: StageClock
+) -> tuple[Scene, Candidates]:
     spec = world.spec
     with clock.stage("draw"):
         rng = generator(spec.seed, Stream.SCENE, index, retry)
@@ -70,10 +73,14 @@ def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], cl
         settled = load_settler(spec.settle.engine)(static, models, start, spec.settle)
         check_settled(settled, models, surface, spec.settle)
 
+    target_m = settled.T_world_object[0, :3, 3]
+    with clock.stage("draw"):
+        rng = generator(spec.seed, Stream.CANDIDATES, index, retry)
+        candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng)
+
     with clock.stage("observe"):
         rays = world.stage(house, names, settled.T_world_object)
         room = house.house.room(surface.room_id)
-        target_m = settled.T_world_object[0, :3, 3]
         rng = generator(spec.seed, Stream.OBSERVE, index, retry)
         camera, share = draw_viewpoint(
             rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
@@ -81,7 +88,8 @@ def _try_scene(world: World, index: int, retry: int, redraws: dict[str, int], cl
         stage = Stage(house.house, models, settled.T_world_object)
         noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
         cloud = _observe(spec.observation, stage, rays, camera, rng, noise_rng)
-    return Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
+    scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
+    return scene, candidates
 
 
 def _load_house(world: World, house_id: str) -> PreparedHouse:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.specification import CandidateParams, ObservationParams
-from workers.bases.candidates import Candidates
 from workers.bases.clearance import Obstacles, base_clearance_m
 from workers.geometry.mesh import F64
 from workers.geometry.planar import inside_polygon
@@ -41,8 +40,7 @@ def draw_viewpoint(
     xy = target_center_m[:2] + distance_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     column = height_m.astype(np.float32)
-    carriers = Candidates(xy.astype(np.float32), np.arange(n, dtype=np.int16), column, column, column)
-    free = base_clearance_m(carriers, obstacles, robot) >= 0
+    free = base_clearance_m(xy.astype(np.float32), column, column, obstacles, robot) >= 0
     usable = np.flatnonzero(free & inside_polygon(xy, room.polygon_m))
     eyes_m = np.column_stack([xy, height_m])
     for start in range(0, len(usable), _BLOCK):

@@ -1,19 +1,32 @@
-"""Candidates: the grid, its random subset, and the robots dealt out over them."""
+"""Candidates: the grid, its random subset, places that are clear or in range, and the robots on them."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.specification import CandidateParams
-from workers.bases.candidates import distances, draw_candidates, grid_offsets
+from tests.workers.worlds import ROOM_M, TABLE_TOP_M, table_house
+from workers.bases.candidates import Candidates, distances, draw_candidates, grid_offsets
+from workers.bases.clearance import base_clearance_m, obstacles_of
+from workers.scenes.scene import Redraw
 
-TARGET = np.array([3.0, -2.0, 0.8])
+TARGET = np.array([ROOM_M[0] / 2 - 0.35, ROOM_M[1] / 2 - 0.2, TABLE_TOP_M + 0.05])  # near a corner
+OBSTACLES = obstacles_of(table_house())
+SAME_HEIGHTS = {"camera_height_m": {"low": 1.2, "high": 1.2}, "base_height_m": {"low": 0.7, "high": 0.7}}
+FAR_ARMS = {"low": 0.8, "high": 1.0}
 
 
-def draw(seed: int = 0, **params: object):  # type: ignore[no-untyped-def]
-    return draw_candidates(TARGET, CandidateParams(**params), np.random.default_rng(seed))  # type: ignore[arg-type]
+def draw(seed: int = 0, **params: object) -> Candidates:
+    chosen = CandidateParams.model_validate(params)
+    return draw_candidates(TARGET, OBSTACLES, chosen, np.random.default_rng(seed))
+
+
+def cells_of(candidates: Candidates) -> np.ndarray:
+    """The grid cell (N, 2) that each candidate stands in."""
+    return np.rint((candidates.base_xy_m.astype(np.float64) - TARGET[:2]) * 12)
 
 
 def test_the_grid_spans_a_metre_each_way_and_holds_every_cell_once() -> None:
@@ -72,3 +85,73 @@ def test_distances_are_planar_and_from_the_mount() -> None:
     rel = candidates.base_xy_m - TARGET[:2]
     np.testing.assert_allclose(planar, np.hypot(rel[:, 0], rel[:, 1]), rtol=1e-6)
     np.testing.assert_allclose(mount**2, planar**2 + (TARGET[2] - candidates.base_height_m) ** 2, rtol=1e-5)
+
+
+def test_clearance_is_that_of_the_robot_where_it_stands() -> None:
+    for candidates in (draw(per_scene="grid"), draw(per_scene=60), draw(per_scene=60, within="clear")):
+        alone = [
+            base_clearance_m(
+                candidates.base_xy_m[k : k + 1],
+                candidates.base_height_m[k : k + 1],
+                candidates.camera_height_m[k : k + 1],
+                OBSTACLES,
+                CandidateParams(),
+            )[0]
+            for k in range(0, len(candidates), 7)
+        ]
+        np.testing.assert_array_equal(candidates.clearance_m[::7], alone)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 60), st.integers(1, 5))
+@settings(max_examples=30, deadline=None)
+def test_clear_candidates_are_clear_and_stand_in_different_cells(seed: int, n: int, robots: int) -> None:
+    candidates = draw(seed, per_scene=n, within="clear", robots_per_scene=robots)
+    assert len(candidates) == n and (candidates.clearance_m >= 0).all()
+    assert (candidates.robot_index == np.arange(n) % robots).all()
+    assert len({tuple(cell) for cell in cells_of(candidates)}) == n
+    again = draw(seed, per_scene=n, within="clear", robots_per_scene=robots)
+    np.testing.assert_array_equal(candidates.base_xy_m, again.base_xy_m)
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=20, deadline=None)
+def test_candidates_in_range_are_clear_and_within_reach_of_their_robot(seed: int) -> None:
+    candidates = draw(seed, per_scene=24, within="in-range", arm_reach_m=FAR_ARMS)
+    assert (candidates.clearance_m >= 0).all()
+    assert (distances(candidates, TARGET)[1] <= candidates.arm_reach_m).all()
+
+
+def test_the_places_of_clear_candidates_are_spread_as_the_clear_cells_are() -> None:
+    drawn = np.concatenate(
+        [draw(seed, per_scene=40, within="clear", **SAME_HEIGHTS).base_xy_m for seed in range(40)]
+    )
+    grid = draw(per_scene="grid", **SAME_HEIGHTS)
+    clear = grid.base_xy_m[grid.clearance_m >= 0]
+    np.testing.assert_allclose(drawn.mean(0), clear.mean(0), atol=0.05)
+    np.testing.assert_allclose(drawn.std(0), clear.std(0), atol=0.05)
+
+
+def test_cells_come_again_only_where_too_few_serve() -> None:
+    # A base almost as wide as the way between table and wall: few cells are clear.
+    wide = {"base_radius_m": 0.43, "jitter": False, **SAME_HEIGHTS}
+    grid = draw(per_scene="grid", **wide)
+    clear = int((grid.clearance_m >= 0).sum())
+    assert 10 < clear < 300
+    few = draw(per_scene=clear, within="clear", robots_per_scene=1, **wide)
+    assert len({tuple(cell) for cell in cells_of(few)}) == clear
+    many = draw(per_scene=2 * clear, within="clear", robots_per_scene=1, **wide)
+    cells = [tuple(cell) for cell in cells_of(many)]
+    assert {cells.count(cell) for cell in cells} == {2}
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"within": "clear", "base_radius_m": 2.0},
+        {"within": "in-range", "arm_reach_m": {"low": 0.05, "high": 0.05}},
+    ],
+)
+def test_a_scene_without_such_a_place_is_to_be_drawn_again(params: dict[str, object]) -> None:
+    with pytest.raises(Redraw) as redraw:
+        draw(**params)
+    assert redraw.value.cause == "no_base"

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from schemas.specification import CandidateParams
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, box_body, table_house
-from workers.bases.candidates import Candidates
 from workers.bases.clearance import base_clearance_m, obstacles_of
 
 PARAMS = CandidateParams()
@@ -21,16 +20,12 @@ MIDDLE_Y = ROOM_M[1] / 2
 def clearance(
     x: float, y: float, base_height_m: float = 0.8, camera_height_m: float = 1.2, house=None
 ) -> float:  # type: ignore[no-untyped-def]
-    one = np.ones(1, np.float32)
-    candidates = Candidates(
-        np.array([[x, y]], np.float32),
-        np.zeros(1, np.int16),
-        one * np.float32(camera_height_m),
-        one * np.float32(base_height_m),
-        one,
-    )
     obstacles = OBSTACLES if house is None else obstacles_of(house)
-    return float(base_clearance_m(candidates, obstacles, PARAMS)[0])
+    place, heights = (
+        np.array([[x, y]], np.float32),
+        np.array([[base_height_m], [camera_height_m]], np.float32),
+    )
+    return float(base_clearance_m(place, *heights, obstacles, PARAMS)[0])
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.3])

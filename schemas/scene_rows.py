@@ -1,0 +1,64 @@
+"""Scenes of a run, read from its committed shards: their records and their samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.fields import SceneRows
+from schemas.run import Run, shard_folder
+from schemas.shard_reading import Array, committed_place, read_metadata
+
+
+def read_scene(run: Run, scene: int) -> SceneRows:
+    """Scene `scene` of a run. InputError where it is not planned or its shard is not committed."""
+    scenes = -(-run.n // run.layout.candidates_per_scene)
+    if not 0 <= scene < scenes:
+        raise InputError(
+            run.storage.url, "--scene", f"{scene} is not in this run", f"Choose one from 0 to {scenes - 1}"
+        )
+    shard = scene // run.layout.scenes_per_shard
+    if shard not in run.committed():
+        raise InputError(
+            run.storage.url,
+            "--scene",
+            f"{scene} lies in shard {shard}, which is not committed",
+            "Resume the run, or choose another scene",
+        )
+    return next(read_scenes(run, [scene]))
+
+
+def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
+    """The scenes of these indices, in their order; neighbours of one shard are read together.
+
+    Scenes beyond the run's n are there too where their shard is. InputError for one whose shard is
+    not committed, or whose files are damaged.
+    """
+    per_shard, per_scene = run.layout.scenes_per_shard, run.layout.candidates_per_scene
+    loaded, arrays = -1, dict[str, Array]()
+    for scene in scenes:
+        shard, row = divmod(scene, per_shard)
+        if shard != loaded:
+            loaded, arrays = shard, _read_shard(run, shard)
+        rows = np.s_[row * per_scene : (row + 1) * per_scene]
+        yield SceneRows(
+            record={f.name: arrays[f.name][row] for f in run.schema.scene_fields},
+            samples={f.name: arrays[f.name][rows] for f in run.schema.sample_fields},
+        )
+
+
+def committed_scenes(run: Run) -> int:
+    """Scenes from the first on that are all committed, also those beyond n that fill the last shard."""
+    committed = run.committed()
+    shards = next(k for k in range(len(committed) + 1) if k not in committed)
+    return shards * run.layout.scenes_per_shard
+
+
+def _read_shard(run: Run, shard: int) -> dict[str, Array]:
+    commit = run.commit_of(shard)
+    folder = shard_folder(shard, commit.attempt)
+    place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)
+    names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
+    return place.read(read_metadata(run.storage, folder, names).values())
