@@ -1,1 +1,74 @@
 """Robots: one file of cited constants each. ROBOTS is the registry; `open_robot` opens one."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from schemas.errors import InputError
+from workers.registry import entry
+from workers.robots.description import RobotDescription, RobotLimits
+
+if TYPE_CHECKING:
+    from workers.robots.arm import Arm
+    from workers.robots.robot import Robot
+
+ROBOTS: dict[str, str] = {
+    "panda-scaled": "workers.robots.panda:PANDA_SCALED",
+    "panda": "workers.robots.panda:PANDA",
+}
+
+# Reaches are stated in whole millimetres.
+_REACH_STEP_M = 0.001
+
+
+def robot_limits(name: str) -> RobotLimits:
+    """What may be asked of a robot; reads constants alone. Raises InputError for an unknown name."""
+    return _description(name).limits
+
+
+def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
+    """A robot of the registry at one mount height; the last 64 are kept.
+
+    `reach_m` None takes the robot's own reach, which `panda-scaled` has not. Raises InputError naming
+    `--robot` for an unknown name, a reach or a height outside the robot's range, and naming the file
+    for a URDF or a mesh that cannot be used.
+    """
+    description = _description(name)
+    low, high = description.limits.reach_m
+    if reach_m is None and description.extension is not None:
+        raise InputError(
+            "--robot", name, "is scaled to a reach, and none is given", _within("reach", low, high)
+        )
+    if reach_m is not None and not low - _REACH_STEP_M <= reach_m <= high + _REACH_STEP_M:
+        raise InputError(
+            "--robot", name, f"a reach of {reach_m} m is outside its range", _within("reach", low, high)
+        )
+    bottom, top = description.limits.base_height_m or (0.0, math.inf)
+    if not (math.isfinite(base_height_m) and bottom <= base_height_m <= top):
+        mend = _within("base height", bottom, top)
+        raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", mend)
+    if description.lift is not None:
+        return _built(name, None, base_height_m)
+    # Pedestals of any height carry the same arm.
+    scaled = reach_m if description.extension is not None else None
+    return _built(name, scaled, 0.0).at_height(base_height_m)
+
+
+def _description(name: str) -> RobotDescription:
+    return entry(ROBOTS, name, "--robot")
+
+
+@lru_cache(maxsize=64)
+def _built(name: str, reach_m: float | None, base_height_m: float) -> Arm:
+    # Imported here, so that limits can be read without a simulator.
+    from workers.robots.arm import Arm
+
+    return Arm(_description(name), reach_m, base_height_m)
+
+
+def _within(what: str, low: float, high: float) -> str:
+    if math.isinf(high):
+        return f"Give a {what} of at least {low} m"
+    return f"Give a {what} of {low} m" if low == high else f"Give a {what} from {low} to {high} m"

@@ -1,0 +1,265 @@
+"""An arm as it is built: the URDF's links from the mount to the flange, scaled, with the hand on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.identity import digest_of
+from workers.geometry.mesh import F32, F64
+from workers.geometry.transforms import inverse, translation
+from workers.robots.chain import Chain, largest_reach_m
+from workers.robots.description import HandDescription, RobotDescription, robots_folder
+from workers.robots.hulls import shape_part
+from workers.robots.robot import Gripper, Parts
+from workers.robots.urdf import Inertial, Joint, Link, Shape, Tree, read_urdf, scaled_inertial
+
+_TUBE_SIDES = 12
+_REACH_TOLERANCE_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A link that carries shape, with all that is fixed to it."""
+
+    name: str
+    inertial: Inertial | None
+    parts_m: Parts  # link frame
+    visuals: tuple[tuple[Shape, float], ...]  # shapes in the link frame before the scale beside each
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Bodies 0 (root), 1..A (arm), then palm and two fingers. Joint k moves body k + 1."""
+
+    bodies: tuple[Body, ...]
+    arm: tuple[Joint, ...]  # (A,), with scaled origins; names of parent and child are those of bodies
+    palm: Joint
+    fingers: tuple[Joint, Joint]
+    T_root_mount: F64  # (4, 4)
+    T_palm_tcp: F64
+    reach_m: float
+    scale: float
+
+
+def assemble(description: RobotDescription, reach_m: float | None, lift_m: float) -> Assembly:
+    """Reads the URDFs and puts the robot together.
+
+    `reach_m` is for a robot that is scaled to its reach; `lift_m` for one with a torso. Raises InputError
+    naming the file and what is wrong in it.
+    """
+    tree = read_urdf(robots_folder() / description.urdf)
+    hand = read_urdf(robots_folder() / description.hand.urdf)
+    held = dict(description.held)
+    if description.lift:
+        held[description.lift.joint] = lift_m
+    heads = (description.root_link, *(tree.joint(name).child for name in description.arm_joints))
+    stops = {*description.arm_joints, *_joint_names_above(tree, description.hand.palm_link)}
+    clusters = [_cluster(tree, head, stops, held) for head in heads]
+    scale, extension_m = 1.0, 0.0
+    if description.extension is not None and reach_m is not None:
+        rule = description.extension
+        share = (rule.none_from_reach_m - reach_m) / (rule.none_from_reach_m - description.limits.reach_m[0])
+        extension_m = rule.longest_m * min(max(share, 0.0), 1.0)
+        scale = _scale_for(description, tree, clusters, extension_m, reach_m)
+    arm, palm, chain = _joints(description, tree, clusters, scale, extension_m)
+    links = [_body(tree.path, heads[k], clusters[k], scale) for k in range(len(heads))]
+    if extension_m > 0.0:
+        assert description.extension is not None
+        T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
+        tube = _tube(T_flange, extension_m, description.extension.radius_m)
+        links[-1] = replace(links[-1], parts_m=(*links[-1].parts_m, tube))
+    fingers = _fingers(hand, description.hand)
+    names = (description.hand.palm_link, *(joint.child for joint in fingers))
+    links += [_body(hand.path, name, {name: (hand.link(name), np.eye(4))}, 1.0) for name in names]
+    mount = tree.joint(description.arm_joints[0])
+    T_root_mount = np.eye(4)
+    if description.lift:
+        # The arm's base frame is where its first joint sits; elsewhere it is the root link itself.
+        T_root_mount[:3, 3] = (clusters[0][mount.parent][1] @ mount.T_parent_child)[:3, 3]
+    return Assembly(
+        tuple(links),
+        arm,
+        palm,
+        fingers,
+        T_root_mount,
+        description.hand.T_palm_tcp,
+        largest_reach_m(chain),
+        scale,
+    )
+
+
+_Cluster = dict[str, tuple[Link, F64]]  # links that do not move against the head, with their poses in it
+
+
+def _cluster(tree: Tree, head: str, stops: set[str], held: dict[str, float]) -> _Cluster:
+    found: _Cluster = {head: (tree.link(head), np.eye(4))}
+    waiting = [head]
+    while waiting:
+        parent = waiting.pop()
+        for joint in tree.children(parent):
+            if joint.name in stops:
+                continue
+            if joint.kind != "fixed" and joint.name not in held:
+                mend = "Name it in the robot's file, or use the URDF that ManiSkill brings"
+                raise InputError(tree.path, f"joint {joint.name}", "nobody says where it is held", mend)
+            T = found[parent][1] @ joint.T_parent_child
+            if joint.kind == "prismatic":
+                T = T @ translation(*(joint.axis * held[joint.name]))
+            found[joint.child] = (tree.link(joint.child), T)
+            waiting.append(joint.child)
+    return found
+
+
+def _joint_names_above(tree: Tree, link: str) -> tuple[str, ...]:
+    joint = tree.joint_above(link) if link in tree.links else None
+    return (joint.name,) if joint else ()
+
+
+def _joints(
+    description: RobotDescription, tree: Tree, clusters: list[_Cluster], scale: float, extension_m: float
+) -> tuple[tuple[Joint, ...], Joint, Chain]:
+    heads = [next(iter(cluster)) for cluster in clusters]
+    arm: list[Joint] = []
+    for k, name in enumerate(description.arm_joints):
+        joint = tree.joint(name)
+        if joint.kind not in ("revolute", "continuous"):
+            raise _wrong(tree.path, f"joint {name}", f"is {joint.kind}; joints of an arm turn")
+        if joint.parent not in clusters[k]:
+            raise _wrong(tree.path, f"joint {name}", f"does not follow {heads[k]}")
+        T = _scaled_pose(clusters[k][joint.parent][1] @ joint.T_parent_child, scale)
+        # Half a turn each way reaches every pose of a joint that turns freely.
+        lower, upper = max(joint.lower, -2 * np.pi), min(joint.upper, 2 * np.pi)
+        if joint.kind == "continuous":
+            lower, upper = -np.pi, np.pi
+        arm.append(
+            replace(joint, kind="revolute", parent=heads[k], T_parent_child=T, lower=lower, upper=upper)
+        )
+    if description.flange_link not in clusters[-1]:
+        raise _wrong(tree.path, f"link {description.flange_link}", f"is not fixed to {heads[-1]}")
+    T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
+    T_palm = T_flange @ translation(0.0, 0.0, extension_m) @ description.T_flange_palm
+    palm = Joint(
+        "hand_mount", "fixed", heads[-1], description.hand.palm_link, T_palm, np.array([0.0, 0.0, 1.0]),
+        0.0, 0.0, 0.0, 0.0,
+    )  # fmt: skip
+    chain = Chain(
+        np.stack([joint.T_parent_child for joint in arm]),
+        np.stack([joint.axis for joint in arm]),
+        np.array([joint.lower for joint in arm]),
+        np.array([joint.upper for joint in arm]),
+        (T_palm @ description.hand.T_palm_tcp)[:3, 3],
+    )
+    return tuple(arm), palm, chain
+
+
+def _scale_for(
+    description: RobotDescription, tree: Tree, clusters: list[_Cluster], extension_m: float, reach_m: float
+) -> float:
+    """The scale at which the arm reaches so far, by the secant method: reach is nearly linear in it."""
+
+    def reach_at(scale: float) -> float:
+        return largest_reach_m(_joints(description, tree, clusters, scale, extension_m)[2])
+
+    low, high = 0.1, 1.0
+    at_low, at_high = reach_at(low), reach_at(high)
+    for _ in range(20):
+        guess = low + (reach_m - at_low) * (high - low) / (at_high - at_low)
+        at_guess = reach_at(guess)
+        if abs(at_guess - reach_m) < _REACH_TOLERANCE_M:
+            return guess
+        low, at_low, high, at_high = high, at_high, guess, at_guess
+    raise _wrong(tree.path, "joints", f"no scale gives a reach of {reach_m} m")
+
+
+def _body(path: Path, name: str, cluster: _Cluster, scale: float) -> Body:
+    shapes = [
+        (replace(shape, T_link_shape=T @ shape.T_link_shape), scale)
+        for link, T in cluster.values()
+        for shape in link.collisions
+    ]
+    if not shapes:
+        raise _wrong(path, f"link {name}", "has no collision shape")
+    visuals = tuple(
+        (replace(shape, T_link_shape=T @ shape.T_link_shape), scale)
+        for link, T in cluster.values()
+        for shape in link.visuals
+    )
+    inertial = _combined([(link.inertial, T) for link, T in cluster.values() if link.inertial])
+    if inertial is not None:
+        inertial = scaled_inertial(inertial, scale)
+    return Body(name, inertial, tuple(shape_part(shape, scale) for shape, scale in shapes), visuals)
+
+
+def _combined(inertials: list[tuple[Inertial, F64]]) -> Inertial | None:
+    """One body of several that are fixed together, in the head's frame (parallel axis theorem)."""
+    if not inertials:
+        return None
+    mass = sum(i.mass_kg for i, _ in inertials)
+    centres = [T[:3, :3] @ i.centre_m + T[:3, 3] for i, T in inertials]
+    centre = np.sum([i.mass_kg * c for (i, _), c in zip(inertials, centres, strict=True)], axis=0) / mass
+    inertia = np.zeros((3, 3))
+    for (i, T), c in zip(inertials, centres, strict=True):
+        d = c - centre
+        R = T[:3, :3]
+        inertia += R @ i.inertia_kgm2 @ R.T + i.mass_kg * (d @ d * np.eye(3) - np.outer(d, d))
+    return Inertial(mass, centre, inertia)
+
+
+def _tube(T_flange: F64, length_m: float, radius_m: float) -> F32:
+    angle = 2 * np.pi * (np.arange(_TUBE_SIDES) + 0.5) / _TUBE_SIDES
+    outer = radius_m / np.cos(np.pi / _TUBE_SIDES)  # the prism's sides touch the tube from outside
+    ring = np.stack([outer * np.cos(angle), outer * np.sin(angle), np.zeros(_TUBE_SIDES)], axis=1)
+    points = np.concatenate([ring, ring + (0.0, 0.0, length_m)])
+    return (points @ T_flange[:3, :3].T + T_flange[:3, 3]).astype(np.float32)
+
+
+def _fingers(hand: Tree, description: HandDescription) -> tuple[Joint, Joint]:
+    left, right = (hand.joint(name) for name in description.finger_joints)
+    R = description.T_palm_tcp[:3, :3]
+    for joint, side in ((left, 1.0), (right, -1.0)):
+        where = f"joint {joint.name}"
+        if joint.kind != "prismatic" or joint.parent != description.palm_link:
+            raise _wrong(hand.path, where, f"does not slide on {description.palm_link}")
+        if joint.lower > 0.0 or joint.upper < 1e-3:
+            raise _wrong(
+                hand.path, where, f"its range {joint.lower} to {joint.upper} m does not open the hand"
+            )
+        if not np.allclose(R.T @ joint.T_parent_child[:3, :3] @ joint.axis, (0.0, side, 0.0), atol=1e-6):
+            raise _wrong(hand.path, where, "does not move along y of the TCP")
+    if abs(left.upper - right.upper) > 1e-9:
+        raise _wrong(hand.path, f"joint {right.name}", "opens less or more than the other finger")
+    return left, right
+
+
+def gripper_of(name: str, pad_size_m: tuple[float, float], assembly: Assembly) -> Gripper:
+    """The hand alone, in its TCP frame."""
+    from_palm = inverse(assembly.T_palm_tcp)
+    palm, *fingers = assembly.bodies[-3:]
+    palm_parts = tuple(_moved(part, from_palm) for part in palm.parts_m)
+    left, right = (
+        tuple(_moved(part, from_palm @ joint.T_parent_child) for part in body.parts_m)
+        for body, joint in zip(fingers, assembly.fingers, strict=True)
+    )
+    opening = 2 * assembly.fingers[0].upper
+    depth = -max(float(part[:, 2].max()) for part in palm_parts)
+    parts = [part.tolist() for part in (*palm_parts, *left, *right)]
+    digest = digest_of([name, opening, list(pad_size_m), depth, parts])
+    return Gripper(name, digest, opening, pad_size_m, depth, palm_parts, (left, right))
+
+
+def _moved(part: F32, T: F64) -> F32:
+    return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+
+def _scaled_pose(T: F64, scale: float) -> F64:
+    out = T.copy()
+    out[:3, 3] *= scale
+    return out
+
+
+def _wrong(path: Path, field: str, problem: str) -> InputError:
+    return InputError(path, field, problem, "Use the URDF that ManiSkill brings, or mend the file")

@@ -1,0 +1,82 @@
+"""What the file of one robot states: constants alone, so that limits can be read without a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F64
+
+
+@dataclass(frozen=True)
+class RobotLimits:
+    """What may be asked of a robot. A range whose ends are equal is a single value."""
+
+    reach_m: tuple[float, float]
+    base_height_m: tuple[float, float] | None  # None: a pedestal of any height
+    base_radius_m: float | None  # of its own mobile base; None stands on a pedestal
+
+
+@dataclass(frozen=True, eq=False)
+class HandDescription:
+    """A parallel hand: a palm and two fingers on prismatic joints, from a URDF."""
+
+    name: str
+    urdf: str  # below ManiSkill's folder of robots
+    palm_link: str
+    finger_joints: tuple[str, str]  # that on the side of +y of the TCP first
+    T_palm_tcp: F64  # (4, 4)
+    pad_size_m: tuple[float, float]  # along x and along z of the TCP
+
+
+@dataclass(frozen=True)
+class WristExtension:
+    """A tube between flange and hand: full at the shortest reach, none from `none_from_reach_m` on."""
+
+    longest_m: float
+    radius_m: float
+    none_from_reach_m: float
+
+
+@dataclass(frozen=True)
+class TorsoLift:
+    """A prismatic joint that sets the height of the arm's mount."""
+
+    joint: str
+    mount_at_zero_m: float  # height of the mount above the floor with the joint at 0
+
+
+@dataclass(frozen=True, eq=False)
+class RobotDescription:
+    """An arm from a URDF and the hand on its flange."""
+
+    name: str
+    urdf: str  # below ManiSkill's folder of robots
+    root_link: str  # what lies above it in the URDF is left out
+    arm_joints: tuple[str, ...]  # (A,), from the base on
+    flange_link: str
+    T_flange_palm: F64  # (4, 4)
+    hand: HandDescription
+    homes_rad: tuple[tuple[float, ...], ...]  # (H, A)
+    stiffness: float
+    damping: float
+    force_limit_n: float
+    limits: RobotLimits
+    extension: WristExtension | None = None  # a robot that has one is scaled to its reach
+    lift: TorsoLift | None = None
+    held: dict[str, float] = field(default_factory=dict[str, float])  # other joints, where they are held
+
+
+def robots_folder() -> Path:
+    """The folder of robots in the installed mani_skill package, which is found and not imported.
+
+    Raises InputError where the package is missing.
+    """
+    spec = find_spec("mani_skill")
+    folders = list(spec.submodule_search_locations or []) if spec else []
+    if not folders:
+        mend = "Install the extra that brings it: pip install 'datagen[sim]'"
+        raise InputError("--robot", "mani_skill", "the package is not installed", mend)
+    return Path(folders[0]) / "assets" / "robots"

@@ -1,0 +1,48 @@
+"""Inverse kinematics: damped least squares from one seed, with clamped steps inside the limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from workers.geometry.mesh import F64
+
+POSITION_TOLERANCE_M = 0.0005
+ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
+_MAX_STEPS = 40
+_LONGEST_STEP_RAD = 0.6  # of any joint
+_DAMPING = 1e-4
+# Given up when the best error has not fallen to this share within so many steps.
+_PATIENCE, _PROGRESS = 8, 0.7
+
+
+def solve(model: pin.Model, data: pin.Data, frame: int, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
+    """Joints (A,) within the model's limits that put the frame at the pose (4, 4), or None.
+
+    Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error
+    as a twist in the frame itself; a joint at its limit stays there while the step pushes it out.
+    """
+    low, high = model.lowerPositionLimit, model.upperPositionLimit
+    goal = pin.SE3(T_base_tcp)
+    q = np.clip(q_seed_rad, low, high)
+    identity = np.eye(6)
+    best, best_at = np.inf, 0
+    for step in range(_MAX_STEPS):
+        pin.computeJointJacobians(model, data, q)
+        here = pin.updateFramePlacement(model, data, frame)
+        error = pin.log6(here.actInv(goal)).vector
+        distance, angle = float(error[:3] @ error[:3]), float(error[3:] @ error[3:])
+        if distance < POSITION_TOLERANCE_M**2 and angle < ANGLE_TOLERANCE_RAD**2:
+            return q
+        squared = distance + angle
+        if squared < _PROGRESS**2 * best:
+            best, best_at = squared, step
+        elif step - best_at >= _PATIENCE:
+            return None
+        J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
+        dq = J.T @ np.linalg.solve(J @ J.T + (_DAMPING + 0.01 * squared) * identity, error)
+        longest = float(np.abs(dq).max())
+        if longest > _LONGEST_STEP_RAD:
+            dq *= _LONGEST_STEP_RAD / longest
+        q = np.minimum(np.maximum(q + dq, low), high)
+    return None
