@@ -53,9 +53,7 @@ def label_with_trials(
     return columns, trials
 
 
-def _write(
-    columns: Columns, row: int, at: ArmInScene, candidates: Candidates, trial: CandidateTrial
-) -> None:
+def _write(columns: Columns, row: int, at: ArmInScene, candidates: Candidates, trial: CandidateTrial) -> None:
     columns["outcome"][row] = _CODES[trial.outcome]
     if trial.report is not None:
         columns["grasps_free"][row] = trial.report.grasps_free
