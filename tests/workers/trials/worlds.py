@@ -1,0 +1,97 @@
+"""Settled scenes made by hand, and plans for them by inverse kinematics along straight lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.workers.worlds import ROOM_M, TABLE_TOP_M, on_table, table_house
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse, translation, yaw_pose
+from workers.houses.house import Body
+from workers.motion.plan import MotionPlan
+from workers.objects.model import ObjectModel
+from workers.rendering.rays import RayStage, object_rays
+from workers.robots.robot import Robot
+from workers.world import PreparedHouse
+
+PREGRASP_M, LIFT_M = 0.08, 0.10
+# The fingers come from above, closing along the world's y.
+DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class HandMade:
+    """A `SettledScene` of given objects at given poses."""
+
+    models: tuple[ObjectModel, ...]
+    T_world_object: F64
+    house: PreparedHouse
+    index: int = 0
+    retry: int = 0
+
+    @property
+    def rays(self) -> RayStage:
+        radii_m = np.array([model.radius_m for model in self.models])
+        return RayStage(self.house.rays, [object_rays(m) for m in self.models], radii_m, self.T_world_object)
+
+    @property
+    def target_center_m(self) -> F64:
+        return self.T_world_object[0, :3, 3]
+
+
+def scene_with(
+    models: Sequence[ObjectModel], offsets_m: Sequence[tuple[float, float]], furniture: Sequence[Body] = ()
+) -> HandMade:
+    """Objects upright on the table, each off its middle by its (dx, dy)."""
+    poses = [on_table(m, dx, dy) for m, (dx, dy) in zip(models, offsets_m, strict=True)]
+    return HandMade(tuple(models), np.stack(poses), PreparedHouse(table_house(furniture)))
+
+
+def base_before(robot: Robot, distance_m: float) -> F64:
+    """The mount (4, 4) on the table's -x side, facing its middle from so far away."""
+    return yaw_pose(ROOM_M[0] / 2 - distance_m, ROOM_M[1] / 2, robot.base_height_m, 0.0)
+
+
+def plan_from_above(
+    robot: Robot, T_world_base: F64, grasp_m: F64, opening_m: float, T_turn: F64 | None = None
+) -> MotionPlan:
+    """A plan that grasps at a world position (3,) from above."""
+    T_grasp = inverse(T_world_base) @ translation(*grasp_m) @ DOWN
+    if T_turn is not None:
+        T_grasp = T_grasp @ T_turn
+    for k, home in enumerate(robot.homes_rad):
+        q_grasp = robot.ik(T_grasp, home)
+        if q_grasp is None:
+            continue
+        down = _line(
+            robot, q_grasp, [translation(0, 0, PREGRASP_M * s) @ T_grasp for s in np.linspace(0, 1, 9)]
+        )
+        up = _line(robot, q_grasp, [translation(0, 0, LIFT_M * s) @ T_grasp for s in np.linspace(0, 1, 11)])
+        if down is None or up is None:
+            continue
+        approach = down[::-1]
+        reach = np.stack([home, approach[0]])
+        length_rad = sum(
+            float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in (reach, approach)
+        )
+        return MotionPlan(0, k, reach, approach, up, opening_m, length_rad, 0.05)
+    raise AssertionError("no such grasp: choose a base that reaches it")
+
+
+def _line(robot: Robot, q_start: F64, poses: Sequence[F64]) -> F64 | None:
+    rows = [q_start]
+    for T in poses[1:]:
+        q = robot.ik(T, rows[-1])
+        if q is None or np.abs(q - rows[-1]).max() > 0.6:
+            return None
+        rows.append(q)
+    return np.stack(rows)
+
+
+def on_top_m(scene: HandMade, depth_m: float) -> F64:
+    """The point (3,) so far below the target's top, over its middle."""
+    x, y, _ = scene.target_center_m
+    return np.array([x, y, TABLE_TOP_M + scene.models[0].size_m[2] - depth_m])

@@ -1,0 +1,231 @@
+"""One trial's world in SAPIEN's PhysX on the CPU: built anew for every trial, needs no render device."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.specification import TrialParams
+from workers.geometry.mesh import F32, F64
+from workers.robots.robot import Robot
+from workers.settling.sapien_bodies import add_object, convex_shape, pose_of, sapien_pose
+from workers.trials.articulation import Articulation
+
+with warnings.catch_warnings():
+    # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
+    warnings.simplefilter("ignore")
+    import sapien
+    from sapien import physx
+
+# Collision groups [kinds it is, kinds it meets, -, -]: two shapes meet where one meets what the other is.
+# Things meet all. The arm meets things and what stands still, never itself: the planner has seen to that.
+# What carries the arm meets things alone; the shoulder, which turns on the pedestal, not the pedestal.
+_THING, _STILL, _PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
+_ARM, _SHOULDER, _CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
+
+# Drives of the fingers: N/m and N s/m. Stiff, so that an object's weight along the closing axis moves
+# it by a millimetre or two against the hand.
+FINGER_STIFFNESS, FINGER_DAMPING = 4000.0, 200.0
+POSITION_ITERATIONS, VELOCITY_ITERATIONS = 15, 1
+# PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
+CONTACT_OFFSET_M = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The movable objects of a trial: object 0 is the target."""
+
+    parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
+    mass_kg: F64  # (K,)
+    T_world_object: F64  # (K, 4, 4)
+
+
+class TrialWorld:
+    """Robot, things and what stands still, with the steps and looks that a trial takes.
+
+    Nothing is shared with any other world: a physics scene that is used again makes outcomes depend
+    on what happened in it before.
+    """
+
+    def __init__(
+        self,
+        still_parts_m: Sequence[F32],  # each (V, 3), world frame
+        pedestal_m: F32 | None,  # (V, 3), world frame
+        things: Things,
+        robot: Robot,
+        articulation: Articulation,
+        T_world_base: F64,
+        friction: float,
+        params: TrialParams,
+    ) -> None:
+        self._system = physx.PhysxCpuSystem()
+        self._system.set_timestep(params.timestep_s)
+        self._scene = sapien.Scene([self._system])
+        material = physx.PhysxMaterial(friction, friction, 0.0)
+        self._add_still(still_parts_m, _STILL, material)
+        if pedestal_m is not None:
+            self._add_still([pedestal_m], _PEDESTAL, material)
+        self._things = [
+            add_object(self._scene, parts, float(mass), T, material)
+            for parts, mass, T in zip(things.parts_m, things.mass_kg, things.T_world_object, strict=True)
+        ]
+        for body in self._things:
+            _refine(body)
+            for shape in body.get_collision_shapes():
+                shape.set_contact_offset(CONTACT_OFFSET_M)
+                shape.set_collision_groups(_THING)
+        # PhysX takes the mean of a pair's frictions. A pair is as slippery as its more slippery side:
+        # rubber holds a soapy bottle no better than the soap allows.
+        grip = min(friction, params.finger_friction)
+        pads = physx.PhysxMaterial(grip, grip, 0.0)
+        self._links = self._add_robot(robot, articulation, T_world_base, material, pads, params.grip_force_n)
+        self._arm = self._links[0].articulation
+        _refine(self._arm)
+        names = (*robot.joint_names, *robot.finger_joint_names)
+        active = {joint.name: k for k, joint in enumerate(self._arm.get_active_joints())}
+        self._columns = np.array([active[name] for name in names])
+        self._joints = [self._arm.get_active_joints()[k] for k in self._columns]
+        self._fingers = [self._links[k] for k in articulation.order[-2:]]
+
+    # -- what moves ---------------------------------------------------------------------------------
+
+    def place_arm(self, q_rad: F64, opening_m: float) -> None:
+        """Puts the arm at joints (A,) at rest, and its drives' targets there."""
+        q = np.concatenate([q_rad, [opening_m / 2] * 2])
+        ordered = np.empty(len(q), np.float32)
+        ordered[self._columns] = q
+        self._arm.set_qpos(ordered)
+        self._arm.set_qvel(np.zeros_like(ordered))
+        self._drive(q.tolist())
+
+    def drive(self, steps: int, start: F64, end: F64) -> None:
+        """Takes `steps` steps while the targets (A + 2,) go evenly from `start` to `end`."""
+        if np.array_equal(start, end):
+            self._drive(end.tolist())
+            for _ in range(steps):
+                self._system.step()
+            return
+        shares = (np.arange(1, steps + 1) / steps)[:, None]
+        for targets in (start + (end - start) * shares).tolist():
+            self._drive(targets)
+            self._system.step()
+
+    def rest(self, rows: Sequence[int]) -> None:
+        """Puts objects to sleep until something touches them."""
+        for k in rows:
+            self._things[k].put_to_sleep()
+
+    def _drive(self, targets: list[float]) -> None:
+        for joint, target in zip(self._joints, targets, strict=True):
+            joint.set_drive_target(target)
+
+    # -- what is seen -------------------------------------------------------------------------------
+
+    @property
+    def joints(self) -> F64:
+        """(A + 2,): the arm's joints, then the two fingers' in metres."""
+        return np.asarray(self._arm.get_qpos(), np.float64)[self._columns]
+
+    @property
+    def T_world_object(self) -> F64:
+        """(K, 4, 4)."""
+        return np.stack([pose_of(body) for body in self._things])
+
+    def positions_m(self) -> F64:
+        """(K, 3) of the objects' frames."""
+        return np.array([body.entity_pose.p for body in self._things], np.float64)
+
+    def speeds_mps(self) -> F64:
+        """(K,) of the objects."""
+        velocities = np.array([body.linear_velocity for body in self._things], np.float64)
+        return np.linalg.norm(velocities, axis=1)
+
+    def finger_impulses(self) -> F64:
+        """(2, 3): what each finger gave the target in the last step, in newton seconds, world frame."""
+        impulses = np.zeros((2, 3))
+        target = self._things[0]
+        for contact in self._system.get_contacts():
+            first, second = contact.bodies
+            if first is target or second is target:
+                other, sign = (second, 1.0) if first is target else (first, -1.0)
+                for k, finger in enumerate(self._fingers):
+                    if other is finger:
+                        for point in contact.points:
+                            impulses[k] += np.multiply(sign, point.impulse)
+        return impulses
+
+    # -- building -----------------------------------------------------------------------------------
+
+    def _add_still(self, parts_m: Sequence[F32], groups: list[int], material: physx.PhysxMaterial) -> None:
+        body = physx.PhysxRigidStaticComponent()
+        for part in parts_m:
+            # PhysX wants hulls near their own origin: cooking loses precision far from it.
+            centre_m = part.mean(axis=0)
+            shape = convex_shape(part - centre_m, material)
+            shape.set_local_pose(sapien.Pose(centre_m.tolist()))
+            shape.set_collision_groups(groups)
+            shape.set_contact_offset(CONTACT_OFFSET_M)
+            body.attach(shape)
+        entity = sapien.Entity()
+        entity.add_component(body)
+        self._scene.add_entity(entity)
+
+    def _add_robot(
+        self,
+        robot: Robot,
+        articulation: Articulation,
+        T_world_base: F64,
+        material: physx.PhysxMaterial,
+        pads: physx.PhysxMaterial,
+        grip_force_n: float,
+    ) -> list[physx.PhysxArticulationLinkComponent]:
+        links: list[physx.PhysxArticulationLinkComponent] = []
+        entities: list[sapien.Entity] = []
+        fingers = articulation.order[-2:]
+        shoulder = articulation.order[0]
+        patch_m = sum(robot.gripper.pad_size_m) / 4
+        for k, body in enumerate(articulation.bodies):
+            link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
+            groups = _CARRIER if k == 0 else _SHOULDER if k == shoulder else _ARM
+            for part in body.parts_m:
+                shape = convex_shape(part, pads if k in fingers else material)
+                shape.set_collision_groups(groups)
+                shape.set_contact_offset(CONTACT_OFFSET_M)
+                if k in fingers:
+                    # A soft pad resists turning about its normal, as points do not.
+                    shape.set_patch_radius(patch_m)
+                    shape.set_min_patch_radius(patch_m)
+                link.attach(shape)
+            link.set_mass(body.mass_kg)
+            link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
+            link.set_inertia(body.inertia_kgm2.tolist())
+            # As ManiSkill's agents: a real arm's controller carries its own weight.
+            link.set_disable_gravity(True)
+            joint = link.joint
+            if body.parent < 0:
+                joint.type = "fixed"
+            else:
+                joint.name, joint.type = body.joint, body.kind
+                joint.set_pose_in_parent(sapien_pose(body.T_parent_joint))
+                joint.set_pose_in_child(sapien_pose(body.T_body_joint))
+                joint.set_limits([[body.lower, body.upper]])
+                if k in fingers:
+                    joint.set_drive_properties(FINGER_STIFFNESS, FINGER_DAMPING, grip_force_n, "force")
+                else:
+                    joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n, "force")
+            entity = sapien.Entity()
+            entity.add_component(link)
+            links.append(link)
+            entities.append(entity)
+        entities[0].set_pose(sapien_pose(T_world_base @ articulation.T_base_root))
+        for entity in entities:
+            self._scene.add_entity(entity)
+        return links
+
+
+def _refine(body: physx.PhysxRigidDynamicComponent | physx.PhysxArticulation) -> None:
+    body.set_solver_position_iterations(POSITION_ITERATIONS)
+    body.set_solver_velocity_iterations(VELOCITY_ITERATIONS)
