@@ -24,8 +24,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from datagen.specify import specify
-from datagen.submit import JobSettings, manifest_of, run_job
+from datagen.job import JobSettings, run_job
+from datagen.specify import layout_of, specify
+from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Commit
@@ -67,7 +68,9 @@ def run(options: argparse.Namespace, n: int, workers: int, per_scene: int | str)
     spec = specify("heuristic", houses, objects, fields, None)
     with tempfile.TemporaryDirectory(dir=options.folder, prefix="datagen-throughput-") as folder:
         out = f"{folder}/run"
-        manifest = manifest_of(spec, n, {"houses": options.houses, "objects": options.objects})
+        manifest = manifest_of(
+            spec, layout_of(spec, n), {"houses": options.houses, "objects": options.objects}
+        )
         made = Run.create_or_open(open_storage(out), manifest, n)
         settings = JobSettings(absolute(options.houses), absolute(options.objects), workers, "local", False)
         started_s = time.perf_counter()

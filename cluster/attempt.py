@@ -13,6 +13,7 @@ from cluster.task import JobCannotGoOn, Product, ShardTask
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Commit
+from schemas.scene_rows import read_scenes
 from schemas.shard_files import encode_shard
 from schemas.storage import storage_error
 from workers.run_shard import run_shard
@@ -32,9 +33,11 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     spec_hash = task.spec.hash()
     with _ends_job(every_input_error=True):
         run, world = _open(task.run, spec_hash, task.houses, task.objects)
+        source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
     with _ends_job():
         run.start_attempt(task.attempt, task.shard)
-    made = run_shard(task.spec, world, task.scene_indices)
+    stored = None if source is None else read_scenes(source, task.scene_indices)
+    made = run_shard(task.spec, world, task.scene_indices, stored)
     with _ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files)
@@ -80,3 +83,12 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
     if run.manifest.spec_hash != spec_hash:
         raise InputError(place, "spec_hash", "the run now has another specification", "Submit to a new --out")
     return run, open_world(run.manifest.spec, houses, objects)
+
+
+@lru_cache(maxsize=1)
+def _open_source(place: str, scenes_hash: str) -> Run:
+    source = Run.open(place)
+    if source.manifest.spec.scenes_hash != scenes_hash:
+        mend = "Give --scenes-from the run that this one was started with"
+        raise InputError(place, "spec_hash", "the run now has other scenes", mend)
+    return source

@@ -48,6 +48,7 @@ class ShardTask:
     deadline_s: float
     memory_factor: float = 1.0
     notes: str = ""
+    scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" draws new ones
 
     @property
     def scene_indices(self) -> range:

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from datagen.arms import (
+    ARM_PACKAGES,
+    arm_versions,
+    complete_arm,
+    narrow_candidates,
+    refuse_unsuited,
+    robot_of,
+)
 from schemas.errors import InputError, choices
 from schemas.run_records import Layout
 from schemas.specification import Source, Specification
@@ -18,6 +27,8 @@ from workers.objects.model import ObjectSource
 from workers.rendering import RENDERERS, load_renderer
 from workers.scenes import VERSION as SCENES_VERSION
 from workers.settling import SETTLERS, first_settler, load_settler
+
+Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
 
 _MAX_CONFIG_BYTES = 1 << 20
 # Distributions whose version can move bits of a sample, by the engine that needs them.
@@ -30,20 +41,19 @@ def specify(
     label_source: str,
     houses: HouseSource,
     objects: ObjectSource,
-    options: dict[str, Any],
+    options: Options,
     config: Path | None,
+    robot: str | None = None,
+    repeats: int | None = None,
 ) -> Specification:
     """The specification that the options (dotted names, None where not given) and the file ask for.
 
-    An option wins over the file, the file over the default. Raises InputError naming the option or
-    the file and the field, or an engine that cannot be imported here.
+    An option wins over the file, the file over the default. `robot` and `repeats` are --robot and
+    --perturb. Raises InputError naming the option or the file and the field, or an engine that
+    cannot be imported here.
     """
-    fields = _read_config(config) if config else {}
-    for reserved in ("label_source", "houses", "objects", "engines"):
-        if reserved in fields:
-            raise InputError(
-                config or "", reserved, "is not set in this file", "Give it on the command line instead"
-            )
+    place = str(config) if config else "options"
+    fields = read_fields(config)
     for name, value in options.items():
         if value is not None:
             _put(fields, name, value, config)
@@ -51,18 +61,54 @@ def specify(
     if isinstance(settle, dict):
         # SAPIEN where its libraries are, else what works here; the choice is recorded.
         settle.setdefault("engine", first_settler())
-    candidates = fields.get("candidates")
-    if isinstance(candidates, dict) and candidates.get("per_scene") == "grid":
-        # The cells of a whole grid are ranked against each other, so one robot stands on all.
-        candidates.setdefault("robots_per_scene", 1)
+    complete_arm(label_source, fields, robot, repeats, place)
+    chosen = robot_of(fields, robot)
+    if chosen is not None:
+        narrow_candidates(fields, chosen)
+    candidates = fields.setdefault("candidates", {})
+    if isinstance(candidates, dict):
+        if label_source in ARM_PACKAGES and "within" not in candidates:
+            candidates.setdefault("per_scene", "grid")
+        if candidates.get("per_scene") == "grid":
+            # The cells of a whole grid are ranked against each other, so one robot stands on all.
+            candidates.setdefault("robots_per_scene", 1)
     fields |= {
         "label_source": label_source,
         "houses": Source(kind=houses.kind, digest=houses.digest),
         "objects": Source(kind=objects.kind, digest=objects.digest),
     }
-    place = str(config) if config else "options"
+    spec = validated(fields, place)
+    if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
+        problem = f"a whole grid is not only {spec.candidates.within}"
+        raise InputError("--candidates", spec.candidates.within, problem, "Give --candidates-per-scene 60")
+    if chosen is not None:
+        refuse_unsuited(spec, chosen, place, "Correct the values, or take another --robot")
+    for field, name, registry in (
+        ("settle.engine", spec.settle.engine, SETTLERS),
+        ("observation.renderer", spec.observation.renderer, RENDERERS),
+    ):
+        if name not in registry:
+            raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
+    load_settler(spec.settle.engine)
+    load_renderer(spec.observation.renderer)
+    return spec.model_copy(update={"engines": _scene_engines(spec) | label_engines(spec.label_source)})
+
+
+def read_fields(config: Path | None) -> dict[str, Any]:
+    """The fields that the file sets. Raises InputError for those that are not set there."""
+    fields = _read_config(config) if config else {}
+    for reserved in ("label_source", "houses", "objects", "engines", "scenes_from"):
+        if reserved in fields:
+            raise InputError(
+                config or "", reserved, "is not set in this file", "Give it on the command line instead"
+            )
+    return fields
+
+
+def validated(fields: dict[str, Any], place: str) -> Specification:
+    """The specification of these fields. Raises InputError naming the first that is wrong."""
     try:
-        spec = Specification.model_validate(fields)
+        return Specification.model_validate(fields)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
@@ -72,15 +118,6 @@ def specify(
             else "Correct the value"
         )
         raise InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend) from None
-    for field, name, registry in (
-        ("settle.engine", spec.settle.engine, SETTLERS),
-        ("observation.renderer", spec.observation.renderer, RENDERERS),
-    ):
-        if name not in registry:
-            raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
-    load_settler(spec.settle.engine)
-    load_renderer(spec.observation.renderer)
-    return spec.model_copy(update={"engines": _engines(spec)})
 
 
 def layout_of(spec: Specification, n: int) -> Layout:
@@ -94,14 +131,26 @@ def layout_of(spec: Specification, n: int) -> Layout:
     return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
 
 
-def _engines(spec: Specification) -> dict[str, str]:
-    names = {"embree", spec.settle.engine, spec.observation.renderer}
-    engines = {_ENGINE_PACKAGES[name]: version(_ENGINE_PACKAGES[name]) for name in sorted(names)}
-    # numpy may change what a generator draws between feature releases, never between patches.
-    engines["numpy"] = ".".join(version("numpy").split(".")[:2])
-    engines["scenes"] = str(SCENES_VERSION)
-    engines["labels"] = str(load_label_source(spec.label_source).version)
-    return engines
+def scene_engine_names(spec: Specification) -> set[str]:
+    """Names in `engines` of what moves bits of the scenes and candidates of this specification."""
+    used = (spec.settle.engine, spec.observation.renderer)
+    return {"scenes", *(_ENGINE_PACKAGES[name] for name in used)}
+
+
+def label_engines(label_source: str) -> dict[str, str]:
+    """Versions of what moves bits of labels, and of the random streams that scenes and labels draw from."""
+    return {
+        _ENGINE_PACKAGES["embree"]: version(_ENGINE_PACKAGES["embree"]),
+        # numpy may change what a generator draws between feature releases, never between patches.
+        "numpy": ".".join(version("numpy").split(".")[:2]),
+        "labels": str(load_label_source(label_source).version),
+        **arm_versions(label_source),
+    }
+
+
+def _scene_engines(spec: Specification) -> dict[str, str]:
+    packages = sorted(scene_engine_names(spec) - {"scenes"})
+    return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 
 
 def _read_config(path: Path) -> dict[str, Any]:

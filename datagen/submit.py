@@ -2,62 +2,59 @@
 
 from __future__ import annotations
 
-import os
 import platform
-import shlex
-import sys
-import tempfile
-from collections import Counter
-from contextlib import ExitStack
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from cluster.attempt import run_attempt
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.executor import Executor
-from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy, too_many_quarantined
-from cluster.progress import progress
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster, refuse_unreachable
-from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary, Tally
-from cluster.task import ShardTask
+from cluster.ray_executor import refuse_unreachable
 from datagen import __version__
-from datagen.console import print_rows, seconds
+from datagen.arms import arm_versions, refuse_missing_packages
 from datagen.doctor.engines import probe_render_device
+from datagen.job import JobSettings, finish, run_job
 from datagen.specify import layout_of, specify
+from datagen.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.record_files import now
 from schemas.run import Run
-from schemas.run_records import Manifest
-from schemas.seal import seal
+from schemas.run_records import Layout, Manifest
 from schemas.specification import Specification
 from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.labels import load_label_source
 from workers.objects import open_objects
 from workers.scenes.draw import draw_scene
-from workers.world import World, assemble_world
+from workers.world import World, assemble_world, open_world
 
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 
 
 def submit(
-    label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic.")],
+    label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic, plan or sim.")],
     /,
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number later extends the run.")],
     out: Annotated[str, Parameter(help="The run's folder.")],
-    houses: Annotated[str, Parameter(help="builtin, procthor:DIR or ai2thor:DIR.")] = "builtin",
-    objects: Annotated[str, Parameter(help="builtin or ycb:DIR.")] = "builtin",
+    houses: Annotated[str | None, Parameter(help="builtin, procthor:DIR or ai2thor:DIR [builtin].")] = None,
+    objects: Annotated[str | None, Parameter(help="builtin or ycb:DIR [builtin].")] = None,
+    scenes_from: Annotated[
+        str | None, Parameter(help="A run whose scenes and candidates are labelled again.")
+    ] = None,
+    robot: Annotated[
+        str | None, Parameter(help="The arm, and what its candidates are: panda-scaled, panda, ... .")
+    ] = None,
+    perturb: Annotated[
+        int | None, WHOLE_NUMBER, Parameter(help="Execute each plan so often in disturbed worlds (sim).")
+    ] = None,
+    candidates: Annotated[
+        Literal["grid", "clear", "in-range"] | None,
+        Parameter(help="All cells, or some where the base is clear, or in reach too [plan, sim: grid]."),
+    ] = None,
     candidates_per_scene: Annotated[
         str | None, Parameter(help="60 drawn from the 25x25 grid, another number, or grid for all 625.")
     ] = None,
@@ -95,6 +92,7 @@ def submit(
     specification is refused with the fields that differ. Ctrl-C once finishes what is in flight,
     twice ends it at once; nothing that is committed is lost.
     """
+    refuse_missing_packages(label_source)
     load_label_source(label_source)  # refuses an unknown one
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
@@ -104,26 +102,48 @@ def submit(
         )
     if workers != 0:
         refuse_unreachable(address)
-    per_scene = _per_scene(candidates_per_scene)
+    decide_scenes = {
+        "--seed": seed,
+        "--split": split,
+        "--candidates": candidates,
+        "--candidates-per-scene": candidates_per_scene,
+        "--robots-per-scene": robots_per_scene,
+        "--settler": settler,
+        "--renderer": renderer,
+        "--noise": noise,
+    }
     options = {
         "seed": seed,
         "split": split,
-        "candidates.per_scene": per_scene,
+        **_candidate_options(candidates, candidates_per_scene),
         "candidates.robots_per_scene": robots_per_scene,
         "settle.engine": settler,
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
     }
-    house_source, object_source = open_houses(houses), open_objects(objects)
-    spec = specify(label_source, house_source, object_source, options, config)
-    world = assemble_world(spec, house_source, object_source, houses, objects)
-    if address == "local" and spec.observation.renderer == "sapien":
-        _refuse_no_render_device()
-    if not (Path(out) / "manifest.json").exists():
-        _refuse_no_scene(world, houses)
-    manifest = manifest_of(spec, n, {"houses": _absolute(houses), "objects": _absolute(objects)})
-    run = Run.create_or_open(open_storage(out), manifest, n)
-    settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json)
+    if scenes_from is None:
+        houses, objects = houses or "builtin", objects or "builtin"
+        house_source, object_source = open_houses(houses), open_objects(objects)
+        spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
+        world = assemble_world(spec, house_source, object_source, houses, objects)
+        if address == "local" and spec.observation.renderer == "sapien":
+            _refuse_no_render_device()
+        if not (Path(out) / "manifest.json").exists():
+            _refuse_no_scene(world, houses)
+        source_url, layout = "", layout_of(spec, n)
+    else:
+        stored = open_stored_scenes(scenes_from, houses, objects, decide_scenes)
+        spec = specify_again(label_source, stored, config, robot, perturb)
+        houses, objects = stored.houses, stored.objects
+        open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
+        existing = Run.open(out).layout if (Path(out) / "manifest.json").exists() else None
+        source_url, layout = stored.run.storage.url, existing or layout_again(spec, stored, n)
+        refuse_too_few(stored, layout, n)
+    settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json, source_url)
+    sources = {"houses": settings.houses, "objects": settings.objects}
+    if source_url:
+        sources["scenes_from"] = source_url
+    run = Run.create_or_open(open_storage(out), manifest_of(spec, layout, sources), n)
     summary = run_job(run, settings)
     return finish(run, summary, out)
 
@@ -136,134 +156,21 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 
 
-@dataclass(frozen=True)
-class JobSettings:
-    """Where a job runs and finds its sources; nothing of this changes a sample."""
-
-    houses: str
-    objects: str
-    workers: int | None
-    address: str
-    json: bool
-
-
-def manifest_of(spec: Specification, n: int, sources: dict[str, str]) -> Manifest:
-    """The manifest of a new run of n labels."""
+def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) -> Manifest:
+    """The manifest of a new run in shards of this layout."""
     source = load_label_source(spec.label_source)
     return Manifest(
         spec=spec,
         spec_hash=spec.hash(),
         schema_name=source.schema,
         schema_version=SCHEMAS[source.schema].version,
-        layout=layout_of(spec, n),
+        layout=layout,
         code_version=__version__,
-        libraries={name: version(name) for name in _LIBRARIES},
+        libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
         platform=platform.platform(),
         created=now(),
         sources=sources,
     )
-
-
-def run_job(run: Run, settings: JobSettings) -> JobSummary:
-    """Make every missing shard of the run, here or on a Ray cluster."""
-    missing = run.missing()
-    layout, spec = run.layout, run.manifest.spec
-    done = len(run.planned()) - len(missing)
-    if not missing:
-        close_lost_attempts(run)
-        given_up, shards = run.quarantined() & set(run.planned()), len(run.planned())
-        failed = too_many_quarantined(Policy(), len(given_up), shards)
-        return JobSummary("failed" if failed else "complete", "", Tally(0), 0.0)
-    stop = StopRequest()
-    with ExitStack() as stack:
-        # Local paths travel to workers of this machine; on a cluster they are shared by all nodes.
-        notes = stack.enter_context(tempfile.TemporaryDirectory(prefix="datagen-notes-"))
-
-        def make_task(order: Order) -> ShardTask:
-            return ShardTask(
-                run=run.storage.url,
-                spec=spec,
-                layout=layout,
-                shard=order.shard,
-                attempt=order.attempt,
-                houses=settings.houses,
-                objects=settings.objects,
-                deadline_s=order.deadline_s,
-                memory_factor=order.memory_factor,
-                notes=notes,
-            )
-
-        executor = _executor(settings, len(missing), stack)
-        stack.enter_context(stop_on_signals(stop, interrupt=settings.workers == 0))
-        display = stack.enter_context(
-            progress(layout.samples_per_shard, len(missing), done, True if settings.json else None)
-        )
-        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
-    # What a killed driver left open is closed last: its workers may outlive it and still commit.
-    close_lost_attempts(run)
-    return summary
-
-
-def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[ShardTask]:
-    if settings.workers == 0:
-        return InProcessExecutor(run_attempt)
-    cores = len(os.sched_getaffinity(0))
-    workers = min(settings.workers or cores, shards)  # Ray starts them all at once
-    ray_settings = RaySettings(address=settings.address, workers=workers)
-    return RayExecutor(run_attempt, ray_settings, stack.enter_context(ray_cluster(ray_settings)))
-
-
-def finish(run: Run, summary: JobSummary, out: str) -> int:
-    """Seal what there is, say how it went and how to go on; return the exit code."""
-    tally = summary.tally
-    n, given_up = run.n, sorted(run.quarantined())
-    if tally.shards:
-        labels = f"{tally.labels:,} new, {n:,} wanted"
-    elif given_up:
-        labels = f"nothing to do: the shards of {n:,} labels are made or given up"
-    else:
-        labels = f"nothing to do: all {n:,} labels are there"
-    rows = [
-        ("labels", labels),
-        ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
-        ("time", f"{seconds(summary.elapsed_s)}" + _rate(summary)),
-        ("retries", str(tally.retries)),
-    ]
-    if given_up:
-        shown = (
-            f"{len(given_up)} shards, {given_up[:10]}: remove {shlex.quote(f'{out}/quarantine')} to try again"
-        )
-        rows.append(("quarantined", shown))
-    if summary.end in ("complete", "failed") and run.committed():
-        sealed = seal(run)
-        rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
-    print_rows(f"{summary.end}: {out}", rows)
-    if summary.end == "aborted":
-        raise InputError(
-            out, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume_command()}"
-        )
-    if summary.end == "failed":
-        causes = Counter(record.causes[-1] for record in run.quarantine_records() if record.causes)
-        most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
-        sys.stderr.write(
-            f"error: {out}: too many shards failed{most}. See: datagen status {shlex.quote(out)}\n"
-        )
-    if summary.end == "interrupted":
-        sys.stderr.write(
-            f"interrupted with {summary.remaining} shards to go. Resume with:\n  {resume_command()}\n"
-        )
-    return summary.exit_code
-
-
-def resume_command() -> str:
-    """The command line that goes on with this run: the one that began it."""
-    return shlex.join(["datagen", *sys.argv[1:]])
-
-
-def _rate(summary: JobSummary) -> str:
-    if not summary.tally.labels or summary.elapsed_s <= 0:
-        return ""
-    return f", {summary.tally.labels / summary.elapsed_s:,.0f} labels/s"
 
 
 def _refuse_no_render_device() -> None:
@@ -276,6 +183,21 @@ def _refuse_no_render_device() -> None:
             f"no render device here ({device.text})",
             "Take embree, or see `datagen doctor`",
         )
+
+
+def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:
+    """What --candidates and --candidates-per-scene say, by dotted name."""
+    number = _per_scene(per_scene)
+    if kind == "grid":
+        if number not in (None, "grid"):
+            mend = "Give --candidates clear or in-range to draw some, or leave the number out"
+            raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", mend)
+        number = "grid"
+    elif kind is not None and number == "grid":
+        problem = f"a whole grid is not only {kind}"
+        raise InputError("--candidates", kind, problem, "Give --candidates-per-scene 60")
+    within = kind if kind != "grid" else None
+    return {"candidates.per_scene": number, "candidates.within": within}
 
 
 def _per_scene(text: str | None) -> int | str | None:

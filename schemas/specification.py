@@ -138,8 +138,11 @@ class MotionParams(_Frozen):
     max_joint_jump_rad: float = Field(default=0.6, gt=0, le=6.3)
     # Spacing of the configurations at which a path is checked against the scene.
     check_step_rad: float = Field(default=0.05, gt=0, le=1.0)
-    # A count, never a time: labels must not depend on how fast a machine is.
-    path_iterations: int = Field(default=2000, ge=1, le=1_000_000)
+    # Counts, never a time: labels must not depend on how fast a machine is. Both are of one candidate.
+    max_grasps_tried: int = Field(default=12, ge=1, le=10_000)
+    path_iterations: int = Field(default=200, ge=1, le=1_000_000)
+    # Distance that the arm keeps from everything, and the hand up to the pregrasp.
+    margin_m: Metres = 0.005
 
 
 class TrialParams(_Frozen):
@@ -197,7 +200,7 @@ class ArmParams(_Frozen):
 
 
 class ScenesFrom(_Frozen):
-    """The run whose stored scenes and candidates are labelled again."""
+    """The run that drew the scenes and candidates which are labelled again."""
 
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -258,3 +261,8 @@ class Specification(_Frozen):
         What is None is left out, so that a later section, None by default, leaves older hashes alone.
         """
         return digest_of(self.model_dump(mode="json", exclude_none=True))
+
+    @property
+    def scenes_hash(self) -> str:
+        """What names the scenes and candidates: equal for runs that label the same ones."""
+        return self.scenes_from.spec_hash if self.scenes_from else self.hash()

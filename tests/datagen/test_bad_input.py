@@ -100,7 +100,7 @@ def test_no_render_device_is_said_before_there_is_a_run(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("source", ["plan", "Heuristic", "", "--n"])
+@pytest.mark.parametrize("source", ["planned", "Heuristic", "", "--n"])
 def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(["submit", source, "--n", "16", "--out", str(tmp_path / "out"), "--workers", "0"], capsys)
     assert list(tmp_path.iterdir()) == []

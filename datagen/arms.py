@@ -1,0 +1,119 @@
+"""The arm of a specification: which robot `plan` and `sim` label for, and where that robot can stand."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from schemas.errors import InputError
+from schemas.specification import ArmParams, CandidateParams, Range, Specification
+from workers.robots import robot_limits
+
+# Label sources that move an arm, and the distributions whose version can move bits of their labels.
+ARM_PACKAGES: dict[str, tuple[str, ...]] = {
+    "plan": ("coal", "mani_skill", "ompl", "pin", "sapien"),
+    "sim": ("coal", "mani_skill", "ompl", "pin", "sapien"),
+}
+# Sections of the arm that only some label sources have.
+_NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial", "disturbance"), "sim": ()}
+# Reaches are stated in whole millimetres.
+_STEP_M = 0.001
+
+Fields = dict[str, Any]
+
+
+def refuse_missing_packages(label_source: str) -> None:
+    """Raise InputError where the label source needs libraries that are not installed."""
+    for name in ARM_PACKAGES.get(label_source, ()):
+        try:
+            version(name)
+        except PackageNotFoundError:
+            problem = f"needs {name}, which is not installed"
+            raise InputError(
+                "label source", label_source, problem, "Run `pip install datagen[sim]`"
+            ) from None
+
+
+def arm_versions(label_source: str) -> dict[str, str]:
+    """Versions of what moves the arm of this label source, by distribution; none for one without an arm."""
+    return {name: version(name) for name in ARM_PACKAGES.get(label_source, ())}
+
+
+def complete_arm(
+    label_source: str, fields: Fields, robot: str | None, repeats: int | None, place: str
+) -> None:
+    """Fill in the section `arm` of a specification's fields, as this label source has it.
+
+    `robot` and `repeats` are the options --robot and --perturb, and win over the section that came
+    from `place`. Raises InputError for what contradicts the label source.
+    """
+    if repeats is not None and label_source != "sim":
+        mend = "Take it out, or submit sim"
+        raise InputError("--perturb", str(repeats), f"nothing is executed by {label_source}", mend)
+    if label_source not in ARM_PACKAGES:
+        if "arm" in fields:
+            raise InputError(place, "arm", f"{label_source} has no arm", "Take the section out")
+        return
+    arm = fields.setdefault("arm", {})
+    if not isinstance(arm, dict):
+        return  # the specification refuses it
+    for section in _NOT_FOR[label_source]:
+        if section in arm:
+            problem = f"nothing is executed by {label_source}"
+            raise InputError(place, f"arm.{section}", problem, "Take the section out, or submit sim")
+    if robot is not None:
+        arm["robot"] = robot
+    if label_source == "sim":
+        arm.setdefault("trial", {})
+        if repeats is not None:
+            disturbance = arm.setdefault("disturbance", {})
+            if isinstance(disturbance, dict):
+                disturbance["repeats"] = repeats
+
+
+def robot_of(fields: Fields, robot: str | None) -> str | None:
+    """The robot that candidates must suit: --robot, or that of the arm; None where any will do."""
+    arm = fields.get("arm")
+    if robot is not None or not isinstance(arm, dict):
+        return robot
+    named = arm.get("robot", ArmParams().robot)
+    return named if isinstance(named, str) else None
+
+
+def narrow_candidates(fields: Fields, robot: str) -> None:
+    """Leave of the candidates' ranges what the robot has, where the fields do not set them.
+
+    Raises InputError naming --robot for an unknown robot.
+    """
+    limits, defaults = robot_limits(robot), CandidateParams()
+    candidates = fields.setdefault("candidates", {})
+    if not isinstance(candidates, dict):
+        return
+    candidates.setdefault("arm_reach_m", _narrowed(defaults.arm_reach_m, limits.reach_m))
+    if limits.base_height_m is not None:
+        candidates.setdefault("base_height_m", _narrowed(defaults.base_height_m, limits.base_height_m))
+    if limits.base_radius_m is not None:
+        candidates.setdefault("base_radius_m", limits.base_radius_m)
+
+
+def refuse_unsuited(spec: Specification, robot: str, place: str, mend: str) -> None:
+    """Raise InputError where candidates of this specification ask for what the robot is not."""
+    limits, candidates = robot_limits(robot), spec.candidates
+    for field, asked, limit in (
+        ("arm_reach_m", candidates.arm_reach_m, limits.reach_m),
+        ("base_height_m", candidates.base_height_m, limits.base_height_m),
+    ):
+        if limit is not None and not limit[0] - _STEP_M <= asked.low <= asked.high <= limit[1] + _STEP_M:
+            has = f"{limit[0]:g} to {limit[1]:g} m" if limit[0] < limit[1] else f"{limit[0]:g} m"
+            problem = f"{asked.low:g} to {asked.high:g} m, and robot {robot} has {has}"
+            raise InputError(place, f"candidates.{field}", problem, mend)
+    own_m = limits.base_radius_m
+    if own_m is not None and candidates.base_radius_m < own_m - _STEP_M:
+        problem = f"{candidates.base_radius_m:g} m, and the base of robot {robot} has {own_m:g} m"
+        raise InputError(place, "candidates.base_radius_m", problem, mend)
+
+
+def _narrowed(default: Range, limit: tuple[float, float]) -> dict[str, float]:
+    """What default and limit share, or the limit where they share nothing."""
+    low, high = max(default.low, limit[0]), min(default.high, limit[1])
+    return {"low": low, "high": high} if low <= high else {"low": limit[0], "high": limit[1]}
