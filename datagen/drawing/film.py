@@ -1,0 +1,208 @@
+"""One trial as pictures: the recorded poses, seen from far and from near, without any render device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from datagen.drawing.film_camera import Shot, Subject, choose_shot, nothing, scaled_camera
+from datagen.drawing.posed_robot import RobotBodies
+from workers.geometry.mesh import F64, U8
+from workers.rendering.embree_renderer import cast_pixels
+from workers.rendering.frame import Camera
+from workers.rendering.rays import RayMesh, RayStage
+from workers.scenes.recall import RecalledScene
+from workers.trials.trial import Recording
+
+Rows = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+_WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the middle of what it shows
+_LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
+_OUTLINE_RGB = (255, 45, 111)  # the target's, as in the frame of every scene's picture
+
+# Moments that tell a trial: phase, share of it, words.
+_MOMENTS = (
+    ("reach", 0.0, "start"),
+    ("reach", 0.5, "on the way"),
+    ("reach", 1.0, "before the grasp"),
+    ("approach", 1.0, "at the grasp"),
+    ("close", 1.0, "fingers closed"),
+    ("lift", 0.5, "lifting"),
+    ("lift", 1.0, "lift ends"),
+    ("hold", 1.0, "hold ends"),
+)
+_PHASE_WORDS = {
+    "reach": "moving",
+    "approach": "approaching",
+    "close": "closing",
+    "lift": "lifting",
+    "hold": "holding",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A trial that is ready to be looked at."""
+
+    recalled: RecalledScene
+    bodies: RobotBodies
+    T_world_base: F64
+    recording: Recording
+    wide: Shot
+    near: Shot
+
+    def stage(self, moment: int) -> RayStage:
+        """Objects, then the robot's bodies, as they stand at a moment; no house."""
+        return _stage(self.recalled, self.bodies, self.T_world_base, self.recording, moment)
+
+    def rise_m(self, moment: int) -> float:
+        """How far the target is above where it lay."""
+        z = self.recording.T_world_object[:, 0, 2, 3]
+        return float(z[moment] - z[0])
+
+    def words(self, moment: int) -> str:
+        """The phase at a moment, in a word."""
+        return _PHASE_WORDS.get(self.recording.phase[moment], self.recording.phase[moment])
+
+
+def film_of(
+    recalled: RecalledScene,
+    bodies: RobotBodies,
+    T_world_base: F64,
+    recording: Recording,
+    wide_px: tuple[int, int],
+    near_px: tuple[int, int],
+) -> Film:
+    """Choose both views of a trial; sizes are (width, height)."""
+    told = {words: moment for moment, words in told_moments(recording)}
+    shown = sorted({0, told.get("at the grasp", len(recording.phase) // 2), len(recording.phase) - 1})
+    moments = [_stage(recalled, bodies, T_world_base, recording, m) for m in shown]
+    n_objects = len(recalled.models)
+    hand = tuple(n_objects + k for k in bodies.hand)
+    arm = tuple(n_objects + k for k in range(len(bodies.rays)) if bodies.link[k] >= 0)
+    origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in moments])
+    target_m = recording.T_world_object[shown, 0, :3, 3]
+    forward = T_world_base[:3, 0]
+    house = recalled.house.house
+    wide = Subject(
+        moments, ((arm, 1.0), (hand, 1.0), ((0,), 1.0)),
+        np.concatenate([_around(origins_m, _LINK_M), _around(target_m, _LINK_M)]), forward,
+    )  # fmt: skip
+    grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
+    half_m = max(_NEAR_HALF_M, float(recalled.models[0].radius_m) + 0.03)
+    near = Subject(moments[1:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
+    return Film(
+        recalled, bodies, T_world_base, recording,
+        choose_shot(house, wide, _WIDE_M, *wide_px), choose_shot(house, near, _NEAR_M, *near_px),
+    )  # fmt: skip
+
+
+def told_moments(recording: Recording) -> list[tuple[int, str]]:
+    """The eight moments that tell a trial, as (row, words); fewer in a shorter recording.
+
+    Where the trial ended early, the gaps between what there was are filled.
+    """
+    phase = np.array(recording.phase)
+    told: dict[int, str] = {}
+    for name, share, words in _MOMENTS:
+        rows = np.flatnonzero(phase == name)
+        if len(rows):
+            told.setdefault(int(rows[round(share * (len(rows) - 1))]), words)
+    last = len(phase) - 1
+    told.setdefault(last, _PHASE_WORDS.get(str(phase[last]), str(phase[last])))
+    while len(told) < min(len(_MOMENTS), len(phase)):
+        rows = sorted(told)
+        gaps = np.diff(rows)
+        middle = rows[int(np.argmax(gaps))] + int(gaps.max()) // 2
+        told[middle] = _PHASE_WORDS.get(str(phase[middle]), str(phase[middle]))
+    return sorted(told.items())
+
+
+class Lens:
+    """One view at one resolution; the house, which stands still, is seen once."""
+
+    def __init__(self, shot: Shot, sharpness: int, outlined: bool) -> None:
+        self.sharpness, self.outlined = sharpness, outlined
+        self.camera = scaled_camera(shot.camera, sharpness)
+        empty = RayStage(shot.house, [], np.zeros(0), np.zeros((0, 4, 4)))
+        self.house = cast_pixels(empty, self.camera, np.arange(self.camera.width_px * self.camera.height_px))
+        self.nothing: RayMesh = nothing()
+
+    def picture(self, stage: RayStage) -> U8:
+        """The house with the stage's bodies in it, (height, width, 3)."""
+        rgb, depth_m = self.house.rgb.copy(), self.house.depth_m.copy()
+        depth_m[depth_m == 0] = np.inf
+        target = np.zeros(len(rgb), np.bool_)
+        for k, T in enumerate(stage.T_world_object):
+            # Each body is looked for only where it can be: most cover a small part of the picture.
+            rows = _window(self.camera, T[:3, 3], float(stage.radii_m[k]))
+            alone = RayStage(self.nothing, [stage.objects[k]], stage.radii_m[k : k + 1], T[None])
+            front = cast_pixels(alone, self.camera, rows)
+            nearer = (front.depth_m > 0) & (front.depth_m < depth_m[rows])
+            seen = rows[nearer]
+            rgb[seen], depth_m[seen], target[seen] = front.rgb[nearer], front.depth_m[nearer], k == 0
+        if self.outlined:
+            rgb[self._border(target)] = _OUTLINE_RGB
+        h, w, s = self.camera.height_px, self.camera.width_px, self.sharpness
+        fine = rgb.reshape(h // s, s, w // s, s, 3).astype(np.uint16)
+        return (fine.sum((1, 3)) // (s * s)).astype(np.uint8)
+
+    def _border(self, mask: Bools) -> Rows:
+        """Flat pixels at the border of a flat mask, inside it."""
+        s = self.sharpness
+        padded = np.pad(mask.reshape(self.camera.height_px, self.camera.width_px), s)
+        inner = padded.copy()
+        for axis in (0, 1):
+            for step in (-s, s):
+                inner &= np.roll(padded, step, axis)
+        return np.flatnonzero((padded & ~inner)[s:-s, s:-s])
+
+
+def pictures(film: Film, moments: Sequence[int], sharpness: int) -> Iterator[tuple[U8, U8]]:
+    """The far and the near view of each moment."""
+    wide, near = Lens(film.wide, sharpness, outlined=True), Lens(film.near, sharpness, outlined=False)
+    for moment in moments:
+        stage = film.stage(moment)
+        yield wide.picture(stage), near.picture(stage)
+
+
+def _stage(
+    recalled: RecalledScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
+) -> RayStage:
+    robot = bodies.poses(T_world_base, recording.q_rad[moment], float(recording.opening_m[moment]))
+    return RayStage(
+        nothing(),
+        [*recalled.rays.objects, *bodies.rays],
+        np.concatenate([recalled.rays.radii_m, bodies.radii_m]),
+        np.concatenate([recording.T_world_object[moment], robot]),
+    )
+
+
+def _around(centres_m: F64, half_m: float) -> F64:
+    """The corners (8 N, 3) of cubes around points (N, 3)."""
+    corners = ((np.arange(8)[:, None] >> np.arange(3)) & 1) * 2.0 - 1.0
+    return (centres_m[:, None, :] + half_m * corners).reshape(-1, 3)
+
+
+def _window(camera: Camera, centre_m: F64, radius_m: float) -> Rows:
+    """Flat pixels of a rectangle that holds the picture of a sphere."""
+    T = camera.T_world_camera
+    x, y, z = (float(v) for v in (centre_m - T[:3, 3]) @ T[:3, :3])
+    w, h = camera.width_px, camera.height_px
+    if z < radius_m + 0.05:  # beside or behind the camera: no bound
+        return np.arange(w * h)
+    # The sphere lies in its bounding cube, whose near and far faces bound what it covers.
+    ends = [
+        (v + side * radius_m) / (z + depth * radius_m)
+        for v in (x, y)
+        for side in (-1, 1)
+        for depth in (-1, 1)
+    ]
+    u, v = np.array(ends[:4]) * camera.fx_px + camera.cx_px, np.array(ends[4:]) * camera.fy_px + camera.cy_px
+    columns = np.arange(max(int(u.min()), 0), min(int(u.max()) + 1, w))
+    lines = np.arange(max(int(v.min()), 0), min(int(v.max()) + 1, h))
+    return (lines[:, None] * w + columns).ravel()

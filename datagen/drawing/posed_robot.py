@@ -1,0 +1,79 @@
+"""A robot as bodies that rays can meet: its links at given joints, the hand's opening, the pedestal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workers.geometry.mesh import F64, I32, Mesh
+from workers.geometry.transforms import inverse, translation
+from workers.houses.solids import frustum, join
+from workers.rendering.rays import RayMesh, ray_mesh
+from workers.robots.robot import Robot
+from workers.robots.urdf import read_urdf
+
+_PEDESTAL_RGB, _PEDESTAL_SIDES = (196, 205, 216), 24
+_FINGER_RGB = (240, 120, 30)  # so that one sees them close
+
+
+@dataclass(frozen=True, eq=False)
+class RobotBodies:
+    """B bodies: the links that have a mesh, and the pedestal where the robot stands on one."""
+
+    robot: Robot
+    rays: tuple[RayMesh, ...]  # (B,)
+    radii_m: F64  # (B,), around the bodies' origins
+    link: I32  # (B,), row of the link; -1 for the pedestal
+    finger_side: I32  # (B,), +1 and -1 for what moves with finger 0 and 1, 0 for all else
+
+    def poses(self, T_world_base: F64, q_rad: F64, opening_m: float) -> F64:
+        """Poses (B, 4, 4) in the world with the arm at the joints (A,) and the pads so far apart."""
+        T_base_link = self.robot.T_base_link(q_rad)
+        T_base_tcp = self.robot.T_base_tcp(q_rad)
+        out = np.empty((len(self.rays), 4, 4))
+        for k, (link, side) in enumerate(zip(self.link, self.finger_side, strict=True)):
+            T = np.eye(4) if link < 0 else T_base_link[link]
+            if side:
+                # Links are posed with the hand fully open; fingers slide along y of the TCP.
+                slide_m = float(side) * (opening_m - self.robot.gripper.max_opening_m) / 2
+                T = T_base_tcp @ translation(0.0, slide_m, 0.0) @ inverse(T_base_tcp) @ T
+            out[k] = T_world_base @ T
+        return out
+
+    @property
+    def hand(self) -> tuple[int, ...]:
+        """Rows of the fingers."""
+        return tuple(int(k) for k in np.flatnonzero(self.finger_side))
+
+
+def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
+    """The robot's bodies; the pedestal is drawn under robots that have no base of their own."""
+    tree = read_urdf(robot.urdf)
+    sides = {
+        tree.joint(name).child: side for name, side in zip(robot.finger_joint_names, (1, -1), strict=True)
+    }
+    meshes, links, fingers = [], [], []
+    for k, (name, mesh) in enumerate(zip(robot.link_names, robot.link_meshes(), strict=True)):
+        if len(mesh.faces):
+            meshes.append(_coloured(mesh, _FINGER_RGB) if name in sides else mesh)
+            links.append(k)
+            fingers.append(sides.get(name, 0))
+    if robot.base_radius_m is None:
+        r, height_m = (pedestal_radius_m, pedestal_radius_m), robot.base_height_m
+        column = frustum((0.0, 0.0), (-height_m, 0.0), r, r, _PEDESTAL_RGB, _PEDESTAL_SIDES)
+        meshes.append(join([column])[0])
+        links.append(-1)
+        fingers.append(0)
+    radii_m = np.array([float(np.linalg.norm(m.vertices_m, axis=1).max()) for m in meshes])
+    return RobotBodies(
+        robot,
+        tuple(ray_mesh(m) for m in meshes),
+        radii_m,
+        np.array(links, np.int32),
+        np.array(fingers, np.int32),
+    )
+
+
+def _coloured(mesh: Mesh, rgb: tuple[int, int, int]) -> Mesh:
+    return Mesh(mesh.vertices_m, mesh.faces, np.tile(np.array(rgb, np.uint8), (len(mesh.faces), 1)))
