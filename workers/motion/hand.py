@@ -1,0 +1,127 @@
+"""The gripper alone in a scene: which grasps of the target it can come to, and lift from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.specification import MotionParams
+from workers.geometry.mesh import F32, F64
+from workers.motion.collision import Bools, Hulls, Ints, Placed, hits, hulls_of
+from workers.robots.robot import Gripper
+
+# Poses found by inverse kinematics are this near to the asked ones: 0.5 mm, and 0.5 degrees at the palm.
+IK_SLACK_M = 0.0015
+# What the hand keeps from everything but the target while it is at the grasp.
+HAND_MARGIN_M = 0.002
+# Depth to which hand and target may overlap on the last way: convex parts are thicker than the object.
+TOUCH_M = 0.002
+LINE_STEP_M = 0.02
+# The target leaves what it stands on within this rise; only beyond it are contacts counted.
+LIFT_OFF_M = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """A gripper's parts: owners 0, 1 and 2 are the palm, the finger towards +y and the one towards -y."""
+
+    hulls: Hulls
+
+    def poses(self, T_tcp: F64, opening_m: F64) -> F64:
+        """Poses (M, 3, 4, 4) of the owners, in the frame of the TCP's poses (M, 4, 4); openings (M,)."""
+        T = np.repeat(T_tcp[:, None], 3, axis=1)
+        shift = T_tcp[:, :3, 1] * (opening_m / 2)[:, None]
+        T[:, 1, :3, 3] += shift
+        T[:, 2, :3, 3] -= shift
+        return T
+
+
+def hand_of(gripper: Gripper) -> Hand:
+    """The gripper's parts, ready for contacts."""
+    return Hand(hulls_of([gripper.palm_parts_m, *gripper.finger_parts_m]))
+
+
+def line_offsets_m(length_m: float) -> F64:
+    """Distances from 0 to `length_m`, both included, at most `LINE_STEP_M` apart."""
+    return np.linspace(0.0, length_m, 1 + int(np.ceil(length_m / LINE_STEP_M - 1e-9)))
+
+
+def backed(T_tcp: F64, back_m: float) -> F64:
+    """TCP poses (..., 4, 4) drawn back against their direction of approach."""
+    T = T_tcp.copy()
+    T[..., :3, 3] -= T[..., :3, 2] * back_m
+    return T
+
+
+def raised(T_world: F64, rise_m: float) -> F64:
+    """World poses (..., 4, 4) moved straight up."""
+    T = T_world.copy()
+    T[..., 2, 3] += rise_m
+    return T
+
+
+def free_grasps(
+    hand: Hand, T_world_tcp: F64, opening_m: F64, around: Placed, target: Placed, params: MotionParams
+) -> Bools:
+    """Grasps (G,) that the hand can come to along the line from the pregrasp, and lift from.
+
+    `around` is all but the target: the hand keeps `HAND_MARGIN_M` from it, and `margin_m` at the
+    pregrasp, where the arm's path ends. Fingers may touch the target on the way in.
+    """
+    free = np.ones(len(T_world_tcp), np.bool_)
+
+    def keep(T: F64, still: Placed, margin_m: float) -> None:
+        rows = np.flatnonzero(free)
+        free[rows[hits(hand.hulls, hand.poses(T[rows], opening_m[rows]), still, margin_m)]] = False
+
+    keep(T_world_tcp, around, HAND_MARGIN_M)
+    keep(T_world_tcp, target, -TOUCH_M)
+    for back_m in line_offsets_m(params.pregrasp_m)[:0:-1]:
+        T, is_end = backed(T_world_tcp, float(back_m)), back_m == params.pregrasp_m
+        keep(T, around, params.margin_m + IK_SLACK_M if is_end else HAND_MARGIN_M)
+        keep(T, target, params.margin_m + IK_SLACK_M if is_end else -TOUCH_M)
+    for rise_m in line_offsets_m(params.lift_m)[1:]:
+        keep(raised(T_world_tcp, float(rise_m)), around, HAND_MARGIN_M)
+    return free
+
+
+def can_be_lifted(target: Hulls, T_world_target: F64, static: Placed, lift_m: float) -> bool:
+    """Whether the target, moved straight up, stays clear of the house.
+
+    The first `LIFT_OFF_M`, in which it parts from its support, is left out, and so are the other objects,
+    which it may push aside.
+    """
+    rises = line_offsets_m(lift_m)
+    T = np.repeat(T_world_target[None, None], len(rises), axis=0)
+    T[:, 0, 2, 3] += rises
+    return not hits(target, T[rises > LIFT_OFF_M], static, -TOUCH_M, first_only=True).any()
+
+
+def varied(T_tcp: F64, score: F32, count: int) -> Ints:
+    """Rows of at most `count` grasps, best first, that differ from each other.
+
+    In turns of a finer and finer distance: the best grasp left is taken unless it lies near one already
+    taken. A turn by half about the direction of approach, which changes nothing, is no difference.
+    """
+    order = np.argsort(-score, kind="stable")
+    features = np.concatenate(
+        [
+            T_tcp[:, :3, 3] / 0.02,
+            T_tcp[:, :3, 2] / 0.35,
+            # The closing axis as a line: its outer product is the same for both of its directions.
+            (T_tcp[:, :3, 1, None] * T_tcp[:, None, :3, 1]).reshape(-1, 9) / 0.7,
+        ],
+        axis=1,
+    )
+    taken: list[int] = []
+    left = [int(k) for k in order]
+    for apart in (2.0, 1.0, 0.5, 0.0):
+        rest: list[int] = []
+        for k in left:
+            if len(taken) == count:
+                break
+            near = taken and np.linalg.norm(features[taken] - features[k], axis=1).min() < apart
+            (rest if near else taken).append(k)
+        left = rest
+    return np.array(taken, np.int64)
