@@ -27,7 +27,7 @@ from workers.labels import load_label_source
 from workers.labels.source import LabelSource
 from workers.rendering.frame import Camera
 from workers.scenes.draw import draw_scene
-from workers.scenes.recall import recall_scene
+from workers.scenes.recall import recall_candidates, recall_scene
 from workers.scenes.scene import Scene, SettledScene
 from workers.world import World
 
@@ -101,16 +101,7 @@ def _recall(world: World, index: int, rows: SceneRows, clock: StageClock) -> _St
     if scene.index != index:
         problem = f"scene {scene.index} is stored where scene {index} belongs"
         raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
-    columns = rows.samples
-    candidates = Candidates(
-        base_xy_m=columns["base_xy_m"],
-        robot_index=columns["robot_index"],
-        camera_height_m=columns["camera_height_m"],
-        base_height_m=columns["base_height_m"],
-        arm_reach_m=columns["arm_reach_m"],
-        clearance_m=columns["base_clearance_m"],
-    )
-    return _Staged(scene, candidates, rows.record, {})
+    return _Staged(scene, recall_candidates(rows.samples), rows.record, {})
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

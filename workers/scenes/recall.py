@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import InputError
+from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64
 from workers.objects.model import ObjectModel
 from workers.rendering.frame import Camera, Stage
 from workers.rendering.rays import RayStage
 from workers.world import PreparedHouse, World
 
-Record = Mapping[str, Any]  # one row of the scene table, by field name
+Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,18 @@ def recall_scene(world: World, record: Record) -> RecalledScene:
     rays = world.stage(house, names, T_world_object)
     index, retry = int(record["scene_index"]), int(record["retry"])
     return RecalledScene(index, retry, house, models, T_world_object, rays, camera)
+
+
+def recall_candidates(columns: Record) -> Candidates:
+    """The candidates of a scene from their stored columns, by field name."""
+    return Candidates(
+        base_xy_m=columns["base_xy_m"],
+        robot_index=columns["robot_index"],
+        camera_height_m=columns["camera_height_m"],
+        base_height_m=columns["base_height_m"],
+        arm_reach_m=columns["arm_reach_m"],
+        clearance_m=columns["base_clearance_m"],
+    )
 
 
 def _same(name: str, found: str, stored: str) -> None:
