@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from schemas.fields import REDRAW_CAUSES, SCHEMAS, Field, RecordSchema
+from schemas.fields import OUTCOMES, REDRAW_CAUSES, SCHEMAS, Field, RecordSchema
 from schemas.run_records import FORMAT_VERSION
 from schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
 
@@ -38,7 +38,8 @@ Every array lies at the root of its group. The first dimension is `scene` or `sa
 the rows of one shard, or an equal part of them where a shard's rows exceed {MAX_CHUNK_BYTES // 2**20} MiB.
 Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written,
 so a missing file is damage, and a fill value never stands for rows that were not stored.
-Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`.
+Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`,
+and `flag_meanings`: the words that the codes 0, 1, ... stand for.
 
 `data.zarr` has consolidated metadata, and the specification in its root's attributes:
 
@@ -49,17 +50,35 @@ xarray.open_zarr("RUN/data.zarr")
 ```
 """
 
+_OUTCOME_HEAD = (
+    "## Outcomes",
+    "",
+    "Codes of `outcome`, and the stage that decides each. Where several grasps failed, the one that came",
+    "furthest counts.",
+    "",
+    "| code | outcome | stage |",
+    "| --- | --- | --- |",
+)
+_OUTCOMES = tuple(enumerate(OUTCOMES.items()))
+
+Fields = tuple[Field, ...]
+
 
 def page() -> str:
     """The whole page as Markdown."""
-    parts = [_HEAD, *(_section(schema) for schema in SCHEMAS.values())]
+    parts, seen = [_HEAD], list[RecordSchema]()
+    for schema in SCHEMAS.values():
+        parts.append(_section(schema, seen))
+        seen.append(schema)
     parts.append(
         "## Redraw causes\n\nAxis `redraw_cause`, in order: " + ", ".join(f"`{c}`" for c in REDRAW_CAUSES)
     )
+    parts.append("\n".join([*_OUTCOME_HEAD, *(f"| {k} | `{o}` | {s} |" for k, (o, s) in _OUTCOMES)]))
     return "\n".join(part.rstrip() + "\n" for part in parts)
 
 
-def _section(schema: RecordSchema) -> str:
+def _section(schema: RecordSchema, seen: list[RecordSchema]) -> str:
+    """A schema's tables; what an earlier one has just so is named and not repeated."""
     sizes = ", ".join(f"{name} {size}" for name, size in schema.sizes.items())
     return "\n".join(
         [
@@ -67,24 +86,32 @@ def _section(schema: RecordSchema) -> str:
             "",
             f"Axis lengths (points and objects follow the specification): {sizes}.",
             "",
-            *_table("scene", schema.scene_fields),
+            *_table("scene", schema.scene_fields, [(other.name, other.scene_fields) for other in seen]),
             "",
-            *_table("sample", schema.sample_fields),
+            *_table("sample", schema.sample_fields, [(other.name, other.sample_fields) for other in seen]),
         ]
     )
 
 
-def _table(title: str, fields: tuple[Field, ...]) -> list[str]:
-    head = [
-        f"### One row a {title}",
-        "",
+def _table(title: str, fields: Fields, earlier: list[tuple[str, Fields]]) -> list[str]:
+    like, shared = max(
+        ((name, len(known)) for name, known in earlier if fields[: len(known)] == known),
+        key=lambda found: found[1],
+        default=("", 0),
+    )
+    head = [f"### One row a {title}", ""]
+    if shared == len(fields):
+        return [*head, f"As in `{like}`."]
+    if shared:
+        head += [f"The arrays of `{like}`, and:", ""]
+    head += [
         "| array | type | dimensions | unit | frame | range | fill | meaning |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     return head + [
         f"| `{f.name}` | {f.dtype} | {', '.join((title, *f.dims))} | {f.unit} | {f.frame} "
         f"| {_range(f)} | {fill_value(f)!r} | {f.doc} |"
-        for f in fields
+        for f in fields[shared:]
     ]
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import re
 import tomllib
 
-from schemas.specification import Source, Specification
+from schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    Source,
+    Specification,
+    TrialParams,
+)
 from schemas.specification_page import page
 from tests.conftest import REPOSITORY
 
@@ -22,3 +29,13 @@ def test_its_example_is_the_defaults() -> None:
     fields = tomllib.loads(example.group(1))
     assert Specification.model_validate(SOURCES | fields) == Specification.model_validate(SOURCES)
     assert fields["candidates"]["per_scene"] == 60
+
+
+def test_what_it_comments_out_are_the_defaults_of_what_is_absent() -> None:
+    example = re.search(r"```toml\n(.*?)```", page(), re.DOTALL)
+    assert example is not None
+    fields = tomllib.loads(re.sub(r"^# ", "", example.group(1), flags=re.MULTILINE))
+    spec = Specification.model_validate(SOURCES | fields)
+    assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
+    assert set(fields["arm"]) == set(ArmParams.model_fields)
+    assert spec.candidates == CandidateParams(within="clear")
