@@ -1,0 +1,171 @@
+"""Executed trials make physical sense: what holds, what slips, what blocks, and what is recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
+
+from schemas.specification import TrialParams
+from tests.workers.trials.worlds import HandMade, base_before, on_top_m, plan_from_above, scene_with
+from tests.workers.worlds import TABLE_TOP_M, box_body, box_model
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import translation, yaw_pose
+from workers.motion.plan import MotionPlan
+from workers.robots import open_robot
+from workers.trials.execute import prepare_trials, run_trial
+from workers.trials.trial import Disturbance, TrialResult
+
+PARAMS = TrialParams()
+ROBOT = open_robot("panda-scaled", 0.8, 0.8)
+BASE = base_before(ROBOT, 0.5)
+PHASES = ("reach", "approach", "close", "lift", "hold")
+
+
+def box(mass_kg: float = 0.3) -> HandMade:
+    """A box on the table, one more beside it."""
+    return scene_with([box_model("target", (0.05, 0.05, 0.12), mass_kg), box_model("other", (0.06, 0.06, 0.1))],
+                      [(0.0, 0.0), (0.0, 0.25)])  # fmt: skip
+
+
+def trial(
+    scene: HandMade,
+    disturbance: Disturbance | None = None,
+    params: TrialParams = PARAMS,
+    base: F64 = BASE,
+    plan: MotionPlan | None = None,
+    record: bool = False,
+) -> TrialResult:
+    prepared = prepare_trials(scene, ROBOT, params, 0.1)
+    plan = plan or plan_from_above(ROBOT, BASE, on_top_m(scene, 0.03), 0.07)
+    return run_trial(prepared, base, plan, disturbance or Disturbance.none(params.object_friction), record)
+
+
+def moved(T_target: F64 | None = None, T_base: F64 | None = None) -> Disturbance:
+    identity = np.eye(4)
+    return Disturbance(
+        identity if T_target is None else T_target, identity if T_base is None else T_base, 0.6, 1.0
+    )
+
+
+def test_a_box_is_lifted_and_held() -> None:
+    result = trial(box(), record=True)
+    assert result.outcome == "success"
+    assert result.lift_m == pytest.approx(0.1, abs=0.005)
+    assert result.slip_m < 0.003
+    assert result.disturbed_m == 0.0
+    assert result.recording is not None
+    T_world_tcp = BASE @ ROBOT.T_base_tcp(result.recording.q_rad[-1])
+    top_m = result.recording.T_world_object[-1, 0, :3, 3] + [0.0, 0.0, 0.06 - 0.03]
+    assert np.linalg.norm(T_world_tcp[:3, 3] - top_m) < 0.005
+
+
+def test_the_recording_tells_the_phases_in_order() -> None:
+    recording = trial(box(), record=True).recording
+    assert recording is not None
+    assert (np.diff(recording.time_s) > 0).all()
+    order = [PHASES.index(phase) for phase in recording.phase]
+    assert order == sorted(order) and set(order) == set(range(5))
+    n = len(recording.time_s)
+    assert recording.q_rad.shape == (n, 7) and recording.opening_m.shape == (n,)
+    assert recording.T_world_object.shape == (n, 2, 4, 4)
+    assert recording.opening_m[0] == pytest.approx(0.07, abs=1e-3)
+    assert recording.opening_m[-1] == pytest.approx(0.05, abs=2e-3)
+    np.testing.assert_array_equal(recording.T_world_object[0], box().T_world_object.astype(np.float32))
+
+
+def test_what_is_as_heavy_as_rock_stays() -> None:
+    result = trial(box(mass_kg=1000.0))
+    assert result.outcome in ("slipped", "missed", "not_reached")
+    assert abs(result.lift_m) < 0.005
+
+
+def test_it_takes_friction() -> None:
+    scene = box(mass_kg=0.6)
+    outcomes = [trial(scene, Disturbance.none(friction)).outcome for friction in (0.02, 0.6)]
+    assert outcomes == ["slipped", "success"]
+
+
+def test_it_takes_force() -> None:
+    scene = box(mass_kg=0.3)
+    outcomes = [
+        trial(scene, params=PARAMS.model_copy(update={"grip_force_n": force})).outcome
+        for force in (1.0, 40.0)
+    ]
+    assert outcomes == ["slipped", "success"]
+
+
+def test_mass_decides_where_friction_barely_holds() -> None:
+    scene = box(mass_kg=1.0)
+    light, heavy = (Disturbance(np.eye(4), np.eye(4), 0.3, scale) for scale in (0.5, 5.0))
+    assert trial(scene, light).outcome == "success"
+    assert trial(scene, heavy).outcome == "slipped"
+
+
+def test_beside_the_target_nothing_is_held() -> None:
+    scene = box()
+    aside = on_top_m(scene, 0.03) + [0.0, -0.15, 0.0]
+    result = trial(scene, plan=plan_from_above(ROBOT, BASE, aside, 0.07))
+    assert result.outcome == "missed"
+    assert result.lift_m == result.slip_m == 0.0
+
+
+def test_a_target_that_was_moved_away_is_missed() -> None:
+    result = trial(box(), moved(T_target=translation(0.0, 0.12, 0.0)))
+    assert result.outcome == "missed"
+
+
+def test_a_base_that_stands_elsewhere_takes_the_hand_along() -> None:
+    assert trial(box(), moved(T_base=translation(0.0, -0.15, 0.0))).outcome == "missed"
+    assert trial(box(), moved(T_base=yaw_pose(0.01, 0.0, 0.0, 0.01))).outcome == "success"
+
+
+def test_small_errors_are_forgiven() -> None:
+    result = trial(box(), moved(T_target=yaw_pose(0.005, 0.006, 0.0, 0.05)))
+    assert result.outcome == "success"
+
+
+def test_a_target_moved_into_the_table_starts_on_it() -> None:
+    result = trial(box(), moved(T_target=translation(0.0, 0.0, -0.03)), record=True)
+    assert result.recording is not None
+    assert result.recording.T_world_object[0, 0, 2, 3] == pytest.approx(TABLE_TOP_M + 0.0605, abs=1e-4)
+    assert result.outcome == "success"
+
+
+def test_an_arm_that_meets_a_wall_does_not_arrive() -> None:
+    (x, y, _), half = box().target_center_m, 0.02
+    board = box_body("board|1", "furniture", "Board", (half, 0.6, 1.0), (x - 0.2, y, TABLE_TOP_M + 0.5))
+    scene = scene_with(box().models, [(0.0, 0.0), (0.0, 0.25)], [board])
+    result = trial(scene)
+    assert result.outcome == "not_reached"
+    assert result.simulated_s < 3.0
+
+
+def test_what_stands_in_the_way_is_pushed_and_measured() -> None:
+    models = [box_model("target", (0.05, 0.05, 0.12)), box_model("tall", (0.04, 0.04, 0.3))]
+    scene = scene_with(models, [(0.0, 0.0), (0.0, 0.07)])
+    assert trial(scene).disturbed_m > 0.02
+
+
+@pytest.mark.parametrize("place", ["T_target_moved", "T_base_moved"])
+def test_poses_that_are_no_poses_are_unstable_and_no_exception(place: str) -> None:
+    broken = np.eye(4)
+    broken[0, 3] = np.nan
+    result = trial(box(), dataclasses.replace(moved(), **{place: broken}))
+    assert result.outcome == "unstable"
+    assert np.isfinite([result.lift_m, result.slip_m, result.disturbed_m, result.simulated_s]).all()
+
+
+def test_two_things_in_one_place_leave_a_result() -> None:
+    scene = scene_with(box().models, [(0.0, 0.0), (0.001, 0.0)])
+    result = trial(scene)
+    assert np.isfinite([result.lift_m, result.slip_m, result.disturbed_m, result.simulated_s]).all()
+
+
+def test_an_arm_and_no_clutter() -> None:
+    scene = scene_with([box_model("target", (0.05, 0.05, 0.12))], [(0.0, 0.0)])
+    result = trial(scene)
+    assert (result.outcome, result.disturbed_m) == ("success", 0.0)

@@ -1,0 +1,70 @@
+"""The same trial is the same bits: in any order, in any process, beside any other work."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
+
+from schemas.specification import SettleParams, TrialParams
+from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
+from tests.workers.worlds import ball_model, box_model, cylinder_model
+from workers.geometry.transforms import translation, yaw_pose
+from workers.robots import open_robot
+from workers.settling.sapien_settler import settle_sapien
+from workers.trials.execute import prepare_trials, run_trial
+from workers.trials.trial import Disturbance
+
+PARAMS = TrialParams()
+COUNT = 6
+
+MODELS = [
+    box_model("box", (0.05, 0.05, 0.12)),
+    cylinder_model("can", 0.033, 0.1),
+    ball_model("ball", 0.03),
+    cylinder_model("tin", 0.03, 0.04, sides=16),
+]
+SPOTS = [(0.0, 0.0), (-0.04, 0.09), (0.08, -0.02), (0.0, -0.11)]
+
+
+def digest(k: int) -> str:
+    """Outcome, numbers and every recorded pose of trial `k` of a few that touch a lot."""
+    robot = open_robot("panda-scaled", 0.8, 0.8)
+    base = base_before(robot, 0.5)
+    scene = scene_with(MODELS, SPOTS)
+    prepared = prepare_trials(scene, robot, PARAMS, 0.1)
+    # Off to the side, so that the hand pushes the neighbours about.
+    plan = plan_from_above(robot, base, on_top_m(scene, 0.05) + [0.0, 0.004 * k, 0.0], 0.08)
+    disturbance = Disturbance(yaw_pose(0.002 * k, 0.0, 0.0, 0.03 * k), translation(0, 0.003 * k, 0), 0.4, 1.1)
+    result = run_trial(prepared, base, plan, disturbance, record=True)
+    assert result.recording is not None
+    numbers = np.array([result.lift_m, result.slip_m, result.disturbed_m, result.simulated_s])
+    parts = (numbers, result.recording.q_rad, result.recording.opening_m, result.recording.T_world_object)
+    return hashlib.sha256(result.outcome.encode() + b"".join(part.tobytes() for part in parts)).hexdigest()
+
+
+def test_order_and_other_work_change_no_bit() -> None:
+    forwards = [digest(k) for k in range(COUNT)]
+    assert len(set(forwards)) == COUNT
+    order = np.random.default_rng(0).permutation(COUNT).tolist()
+    found = {}
+    for k in order:
+        settle_sapien(
+            (),
+            MODELS[1:3],
+            np.stack([translation(0, 0, 1), translation(1, 0, 1)]),
+            SettleParams(max_steps=10),
+        )
+        found[k] = digest(k)
+    assert [found[k] for k in range(COUNT)] == forwards
+
+
+def test_processes_agree() -> None:
+    here = [digest(k) for k in range(3)]
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        there = pool.map(digest, [2, 0, 1], chunksize=1)
+    assert [there[1], there[2], there[0]] == here
