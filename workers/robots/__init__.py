@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 ROBOTS: dict[str, str] = {
     "panda-scaled": "workers.robots.panda:PANDA_SCALED",
     "panda": "workers.robots.panda:PANDA",
+    "xarm7": "workers.robots.xarm7:XARM7",
+    "fetch": "workers.robots.fetch:FETCH",
 }
 
 # Reaches are stated in whole millimetres.

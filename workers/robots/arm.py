@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pinocchio as pin
+import pinocchio
 
 from workers.geometry.mesh import F64, Mesh
 from workers.geometry.transforms import inverse
@@ -17,6 +18,9 @@ from workers.robots.looks import body_mesh
 from workers.robots.robot import Gripper, Parts
 from workers.robots.self_collision import SelfCollision
 from workers.robots.written import hull_of, write_urdf
+
+# Its binary modules have no types.
+pin: Any = pinocchio
 
 
 class Arm:
@@ -34,6 +38,7 @@ class Arm:
         self.base_radius_m = description.limits.base_radius_m
         self.gripper: Gripper = gripper_of(description.hand.name, description.hand.pad_size_m, assembly)
         self.T_base_root: F64 = inverse(assembly.T_root_mount)
+        self.shoulder_m: F64 = (self.T_base_root @ assembly.arm[0].T_parent_child)[:3, 3]
         self.joint_names = tuple(joint.name for joint in assembly.arm)
         self.finger_joint_names = (assembly.fingers[0].name, assembly.fingers[1].name)
         self.fixed_joints: dict[str, float] = {}
@@ -101,7 +106,7 @@ class Arm:
         return tuple(body_mesh(body) for body in self._assembly.bodies)
 
 
-def _model_of(assembly: Assembly, T_base_root: F64) -> pin.Model:
+def _model_of(assembly: Assembly, T_base_root: F64) -> Any:
     """Joints of the arm alone; then a frame for every body, fingers open, and one for the TCP."""
     model = pin.Model()
     at = 0

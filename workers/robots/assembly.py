@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import inverse, translation
 from workers.robots.chain import Chain, largest_reach_m
 from workers.robots.description import HandDescription, RobotDescription, robots_folder
-from workers.robots.hulls import shape_part
+from workers.robots.hulls import shape_parts
 from workers.robots.robot import Gripper, Parts
 from workers.robots.urdf import Inertial, Joint, Link, Shape, Tree, read_urdf, scaled_inertial
 
@@ -28,7 +29,9 @@ class Body:
     name: str
     inertial: Inertial | None
     parts_m: Parts  # link frame
-    visuals: tuple[tuple[Shape, float], ...]  # shapes in the link frame before the scale beside each
+    visuals: tuple[Shape, ...]  # meshes to look at, link frame, before the scale
+    scale: float
+    drawn_m: Parts  # parts to look at where no visual shows them
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +69,21 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         extension_m = rule.longest_m * min(max(share, 0.0), 1.0)
         scale = _scale_for(description, tree, clusters, extension_m, reach_m)
     arm, palm, chain = _joints(description, tree, clusters, scale, extension_m)
-    links = [_body(tree.path, heads[k], clusters[k], scale) for k in range(len(heads))]
+    for name in description.shapeless:
+        clusters[0][name] = (replace(tree.link(name), collisions=(), visuals=()), np.eye(4))
+    links = [
+        _body(tree.path, head, cluster, scale, description.cuts_m)
+        for head, cluster in zip(heads, clusters, strict=True)
+    ]
     if extension_m > 0.0:
         assert description.extension is not None
         T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
         tube = _tube(T_flange, extension_m, description.extension.radius_m)
-        links[-1] = replace(links[-1], parts_m=(*links[-1].parts_m, tube))
+        last = links[-1]
+        links[-1] = replace(last, parts_m=(*last.parts_m, tube), drawn_m=(*last.drawn_m, tube))
     fingers = _fingers(hand, description.hand)
     names = (description.hand.palm_link, *(joint.child for joint in fingers))
-    links += [_body(hand.path, name, {name: (hand.link(name), np.eye(4))}, 1.0) for name in names]
+    links += [_body(hand.path, name, {name: (hand.link(name), np.eye(4))}, 1.0, {}) for name in names]
     mount = tree.joint(description.arm_joints[0])
     T_root_mount = np.eye(4)
     if description.lift:
@@ -175,23 +184,28 @@ def _scale_for(
     raise _wrong(tree.path, "joints", f"no scale gives a reach of {reach_m} m")
 
 
-def _body(path: Path, name: str, cluster: _Cluster, scale: float) -> Body:
-    shapes = [
-        (replace(shape, T_link_shape=T @ shape.T_link_shape), scale)
-        for link, T in cluster.values()
-        for shape in link.collisions
-    ]
-    if not shapes:
+def _body(
+    path: Path, name: str, cluster: _Cluster, scale: float, cuts_m: Mapping[str, tuple[float, ...]]
+) -> Body:
+    parts: list[F32] = []
+    visuals: list[Shape] = []
+    for link, T in cluster.values():
+        for shape in link.collisions:
+            parts += shape_parts(_placed(shape, T), scale, cuts_m.get(link.name, ()))
+        visuals += (_placed(shape, T) for shape in link.visuals)
+    if not parts:
         raise _wrong(path, f"link {name}", "has no collision shape")
-    visuals = tuple(
-        (replace(shape, T_link_shape=T @ shape.T_link_shape), scale)
-        for link, T in cluster.values()
-        for shape in link.visuals
-    )
     inertial = _combined([(link.inertial, T) for link, T in cluster.values() if link.inertial])
     if inertial is not None:
         inertial = scaled_inertial(inertial, scale)
-    return Body(name, inertial, tuple(shape_part(shape, scale) for shape, scale in shapes), visuals)
+    # Other formats than glTF are not read to look at; the hulls stand in for them.
+    if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
+        visuals = []
+    return Body(name, inertial, tuple(parts), tuple(visuals), scale, drawn_m=() if visuals else tuple(parts))
+
+
+def _placed(shape: Shape, T: F64) -> Shape:
+    return replace(shape, T_link_shape=T @ shape.T_link_shape)
 
 
 def _combined(inertials: list[tuple[Inertial, F64]]) -> Inertial | None:

@@ -66,7 +66,17 @@ class RobotDescription:
     limits: RobotLimits
     extension: WristExtension | None = None  # a robot that has one is scaled to its reach
     lift: TorsoLift | None = None
+    # Meshes far from convex, by link: heights along z between which each slab gets a hull of its own.
+    cuts_m: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
+    shapeless: tuple[str, ...] = ()  # links whose shapes are left out
     held: dict[str, float] = field(default_factory=dict[str, float])  # other joints, where they are held
+
+
+def turned_homes(
+    folds_rad: tuple[tuple[float, ...], ...], turns_rad: tuple[float, ...]
+) -> tuple[tuple[float, ...], ...]:
+    """Every fold of the joints after the first, with the first joint at every turn; the first fold first."""
+    return tuple((turn, *fold) for fold in folds_rad for turn in turns_rad)
 
 
 def robots_folder() -> Path:

@@ -2,46 +2,63 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from schemas.errors import InputError
-from workers.geometry.mesh import F32, F64
+from workers.geometry.mesh import F64
+from workers.robots.robot import Parts
 from workers.robots.urdf import Shape
 
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
-# Faces, edges and corners of a cube: 26 directions from which a hull is cut first.
+_PUSHES = 50
+_TOUCHING_M = 1e-6
+# Faces, edges and corners of a cube.
 _DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _DIRECTIONS = _DIRECTIONS[np.abs(_DIRECTIONS).sum(axis=1) > 0]
 _DIRECTIONS = _DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 
 
-def shape_part(shape: Shape, scale: float) -> F32:
-    """Corners (V, 3) of a convex body around a shape, in its link's frame, all lengths times `scale`.
+def shape_parts(shape: Shape, scale: float, cuts_m: tuple[float, ...] = ()) -> Parts:
+    """Corners (V, 3) each of convex bodies around a shape, in its link's frame, all lengths times `scale`.
 
-    Boxes are exact. Raises InputError naming the mesh that is missing, broken or flat.
+    Boxes are exact. A mesh gives one hull, or one for each slab between the heights `cuts_m` along its z
+    axis. Raises InputError naming the mesh that is missing, broken or flat.
     """
     if shape.box_m is not None:
-        corners = (_BOX_BITS - 0.5) * shape.box_m
+        hulls = ((_BOX_BITS - 0.5) * shape.box_m,)
     else:
         assert shape.mesh is not None
-        corners = mesh_hull(shape.mesh) * shape.scale
+        hulls = tuple(hull * shape.scale for hull in mesh_hulls(shape.mesh, cuts_m))
     T = shape.T_link_shape
-    return ((corners @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32)
+    return tuple(((hull @ T[:3, :3].T + T[:3, 3]) * scale).astype(np.float32) for hull in hulls)
 
 
 @lru_cache(maxsize=256)
-def mesh_hull(path: Path) -> F64:
-    """Corners (V, 3), at most `MAX_CORNERS`, of a convex body that contains the mesh's hull."""
+def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
+    """Corners (V, 3), at most `MAX_CORNERS`, of convex bodies that contain the mesh between the cuts."""
+    points, edges = read_points(path)
+    bounds = (-np.inf, *cuts_m, np.inf)
+    try:
+        return tuple(outer_hull(_slab(points, edges, low, high)) for low, high in itertools.pairwise(bounds))
+    except (QhullError, ValueError) as error:
+        raise _wrong(path, "is flat") from error
+
+
+def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
+    """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
     try:
         mesh = trimesh.load_mesh(path, process=False)
         points = np.asarray(mesh.vertices, np.float64)
+        edges = np.asarray(mesh.edges, np.int64)
     except OSError as error:
         raise _wrong(path, f"cannot be read: {error.strerror or error}") from error
     # Broken meshes surface in the reader in all of these ways.
@@ -49,35 +66,52 @@ def mesh_hull(path: Path) -> F64:
         raise _wrong(path, f"is not a mesh ({type(error).__name__})") from error
     if len(points) < 4 or not np.isfinite(points).all():
         raise _wrong(path, "has fewer than four corners, or one that is not finite")
-    try:
-        return outer_hull(points)
-    except QhullError as error:
-        raise _wrong(path, "is flat") from error
+    return points, edges
+
+
+def _slab(points: F64, edges: npt.NDArray[np.int64], low: float, high: float) -> F64:
+    """The vertices between two heights and the points where edges cross them."""
+    found = [points[(points[:, 2] >= low) & (points[:, 2] <= high)]]
+    for height in (low, high):
+        start, end = points[edges[:, 0]], points[edges[:, 1]]
+        crosses = (start[:, 2] < height) != (end[:, 2] < height)
+        start, end = start[crosses], end[crosses]
+        share = (height - start[:, 2]) / (end[:, 2] - start[:, 2])
+        found.append(start + share[:, None] * (end - start))
+    return np.concatenate(found)
 
 
 def outer_hull(points: F64) -> F64:
-    """Corners (V, 3) of a polytope of few faces that contains all points.
+    """Corners (V, 3) of a polytope that contains all points; their hull itself where it has few corners.
 
-    Starts from the support planes in 26 directions. Then the corner that stands out furthest is cut off by
-    the hull's own face that it violates most, until no more fit. The hull itself is returned where it
-    has few corners already.
+    Takes the points furthest out in 26 directions, then again and again the one furthest outside of
+    the hull of those taken. What still stands out of a face pushes the face's corners along its
+    normal until nothing does.
     """
     hull = ConvexHull(points)
     if len(hull.vertices) <= MAX_CORNERS:
         return points[np.sort(hull.vertices)]
-    corners = points[hull.vertices]
-    inside = corners.mean(axis=0)
-    faces = hull.equations  # (F, 4): n . x + d <= 0 inside
-    planes = np.column_stack([_DIRECTIONS, -(corners @ _DIRECTIONS.T).max(axis=0)])
-    best = _meeting_points(planes, inside)
-    while True:
-        excess = best @ faces[:, :3].T + faces[:, 3]
-        worst = int(excess.max(axis=1).argmax())
-        planes = np.vstack([planes, faces[excess[worst].argmax()]])
-        cut = _meeting_points(planes, inside)
-        if len(cut) > MAX_CORNERS or excess[worst].max() < 1e-6:
-            return best
-        best = cut
+    points = points[np.sort(hull.vertices)]
+    taken = np.unique((points @ _DIRECTIONS.T).argmax(axis=0))
+    while len(taken) < MAX_CORNERS:
+        outside = _outside(points, ConvexHull(points[taken]))
+        taken = np.append(taken, outside.max(axis=1).argmax())
+    corners = points[taken]
+    for _ in range(_PUSHES):
+        hull = ConvexHull(corners)
+        outside = _outside(points, hull).max(axis=0)  # (F,)
+        if outside.max() < _TOUCHING_M:
+            break
+        pushed = np.zeros_like(corners)
+        # Faces that stand further back write last.
+        for face in np.argsort(outside):
+            if outside[face] > 0.0:
+                pushed[hull.simplices[face]] = hull.equations[face, :3] * outside[face]
+        corners = corners + pushed
+    middle = corners.mean(axis=0)
+    faces = ConvexHull(corners).equations
+    rest = ((points - middle) @ faces[:, :3].T / -(faces[:, :3] @ middle + faces[:, 3])).max()
+    return middle + (corners - middle) * max(1.0, float(rest))
 
 
 def excess_m(corners: F64, points: F64) -> float:
@@ -89,13 +123,9 @@ def excess_m(corners: F64, points: F64) -> float:
     return float((corners @ faces[:, :3].T + faces[:, 3]).max())
 
 
-def _meeting_points(planes: F64, inside: F64) -> F64:
-    found = HalfspaceIntersection(planes, inside).intersections
-    # Where more than three planes meet, the point is found once for each triple.
-    hull = ConvexHull(found, qhull_options="Qt")
-    points = found[np.sort(hull.vertices)]
-    rounded = np.unique(np.round(points, 9), axis=0, return_index=True)[1]
-    return points[np.sort(rounded)]
+def _outside(points: F64, hull: ConvexHull) -> F64:
+    """(N, F) distances of points to the planes of a hull's faces, positive outside."""
+    return points @ hull.equations[:, :3].T + hull.equations[:, 3]
 
 
 def _wrong(path: Path, problem: str) -> InputError:

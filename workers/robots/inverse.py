@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import pinocchio as pin
+import pinocchio
 
 from workers.geometry.mesh import F64
+
+# Its binary modules have no types.
+pin: Any = pinocchio
 
 POSITION_TOLERANCE_M = 0.0005
 ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
@@ -16,7 +21,7 @@ _DAMPING = 1e-4
 _PATIENCE, _PROGRESS = 8, 0.7
 
 
-def solve(model: pin.Model, data: pin.Data, frame: int, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
+def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
     """Joints (A,) within the model's limits that put the frame at the pose (4, 4), or None.
 
     Levenberg-Marquardt with damping that grows with the squared error (Sugihara 2011), on the pose error

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from workers.geometry.mesh import Mesh, concatenate
+from workers.geometry.mesh import F32, Mesh, concatenate
+from workers.houses.glb import read_glb
 from workers.robots.assembly import Body
 
-_GREY = 200
+_GREY = 190
 
 
 def body_mesh(body: Body) -> Mesh:
-    """The hulls of a body, link frame."""
+    """A body's visual meshes, else its hulls, in the link frame. Raises InputError naming a broken file."""
     meshes: list[Mesh] = []
-    for part in body.parts_m:
-        faces = ConvexHull(part).simplices.astype(np.int32)
-        meshes.append(Mesh(part, faces, np.full((len(faces), 3), _GREY, np.uint8)))
-    return concatenate(meshes)
+    for shape in body.visuals:
+        assert shape.mesh is not None
+        T = np.diag([body.scale] * 3 + [1.0]) @ shape.T_link_shape @ np.diag([*shape.scale, 1.0])
+        meshes.append(_glb(shape.mesh).transformed(T))
+    return concatenate([*meshes, *(_plain(part) for part in body.drawn_m)])
+
+
+@lru_cache(maxsize=64)
+def _glb(path: Path) -> Mesh:
+    return read_glb(path)
+
+
+def _plain(corners_m: F32) -> Mesh:
+    hull = ConvexHull(corners_m)
+    a, b, c = (corners_m[hull.simplices[:, k]] for k in range(3))
+    inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces = hull.simplices.astype(np.int32)
+    faces[inward] = faces[inward][:, ::-1]
+    return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))

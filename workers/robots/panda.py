@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import pi
 
 from workers.geometry.transforms import yaw_pose
-from workers.robots.description import RobotDescription, RobotLimits, WristExtension
+from workers.robots.description import RobotDescription, RobotLimits, WristExtension, turned_homes
 from workers.robots.franka_hand import FRANKA_HAND
 
 PANDA = RobotDescription(
@@ -17,13 +17,14 @@ PANDA = RobotDescription(
     flange_link="panda_link8",
     T_flange_palm=yaw_pose(0.0, 0.0, 0.0, -pi / 4),  # panda_hand_joint
     hand=FRANKA_HAND,
-    homes_rad=(
-        (0.0, -1.2, 0.0, -2.6, 0.0, 1.6, 0.785),
-        (pi / 2, -1.2, 0.0, -2.6, 0.0, 1.6, 0.785),
-        (-pi / 2, -1.2, 0.0, -2.6, 0.0, 1.6, 0.785),
-        (2.8, -1.2, 0.0, -2.6, 0.0, 1.6, 0.785),
-        (-2.8, -1.2, 0.0, -2.6, 0.0, 1.6, 0.785),
-        (0.0, -1.2, 0.0, -2.6, 0.0, 2.8, 0.785),
+    homes_rad=turned_homes(
+        (
+            # Folded, the elbow to the back.
+            (-1.6, 0.0, -2.5, 0.0, 1.7, pi / 4),
+            # Upright, no wider than a pedestal.
+            (-0.11, 0.0, -0.22, 0.0, 3.04, pi / 4),
+        ),
+        (0.0, pi / 2, -pi / 2, 2.8, -2.8),
     ),
     # Panda.arm_stiffness, arm_damping, arm_force_limit in mani_skill/agents/robots/panda/panda.py
     stiffness=1e3,

@@ -33,7 +33,7 @@ class Gripper:
 
     def parts_at(self, opening_m: float) -> Parts:
         """All convex parts of the hand, TCP frame, with the pads `opening_m` apart."""
-        shift = _Y * np.float32(opening_m / 2)
+        shift: F32 = (_Y * (opening_m / 2)).astype(np.float32)
         left, right = self.finger_parts_m
         return (*self.palm_parts_m, *(p + shift for p in left), *(p - shift for p in right))
 

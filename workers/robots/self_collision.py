@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import coal
 import numpy as np
-import pinocchio as pin
+import pinocchio
 
 from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Parts
+
+# Its binary modules have no types.
+pin: Any = pinocchio
+_coal: Any = coal
 
 _SAMPLES = 300
 _MOST = 0.5
 
 
-def convex_of(corners_m: F32) -> coal.ConvexBase:
+def convex_of(corners_m: F32) -> Any:
     """The convex hull of corners (V, 3) as coal sees it."""
-    points = coal.StdVec_Vec3s()
+    points = _coal.StdVec_Vec3s()
     for corner in corners_m.astype(np.float64):
         points.append(corner)
-    return coal.ConvexBase.convexHull(points, False, "Qt")
+    return _coal.ConvexBase.convexHull(points, False, "Qt")
 
 
 class SelfCollision:
@@ -33,7 +38,7 @@ class SelfCollision:
 
     def __init__(
         self,
-        model: pin.Model,
+        model: Any,
         parts_m: Sequence[Parts],  # one entry a body, body frame
         joint: Sequence[int],  # the model's joint that each body is fixed to
         T_joint_body: Sequence[F64],
