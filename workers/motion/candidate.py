@@ -12,7 +12,7 @@ from workers.motion.hand import backed, line_offsets_m, raised
 from workers.motion.lines import follow_line
 from workers.motion.plan import MotionPlan, PlanReport
 from workers.motion.reach_table import order_by_distance
-from workers.motion.rrt_connect import connect, dense, is_line_free, shortened
+from workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 from workers.motion.scene import PlanningScene
 from workers.motion.surroundings import Surroundings, surroundings
 
@@ -92,8 +92,8 @@ def _try_grasp(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tupl
     found = _reach(search, homes, q_pregrasp, opening_m)
     if found is None:
         return "no_path", None
-    home, corners = found
-    q_reach, q_approach = dense(corners, params.check_step_rad), approach[::-1]
+    home, q_reach = found
+    q_approach = approach[::-1]
     length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in (q_reach, q_approach))
     some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
     clearance_m = at.clearance_m(q_reach[some], opening_m)
@@ -125,7 +125,7 @@ def _ends(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tuple[str
 
 
 def _reach(search: _Search, homes: np.ndarray, q_pregrasp: F64, opening_m: float) -> tuple[int, F64] | None:
-    """A free path, as corners (K, A), and the tucked pose it starts from."""
+    """A free path (M, A), and the tucked pose it starts from."""
     scene = search.at.scene
     robot, step_rad = scene.robot, scene.params.check_step_rad
 
@@ -136,7 +136,7 @@ def _reach(search: _Search, homes: np.ndarray, q_pregrasp: F64, opening_m: float
     nearest = homes[np.argsort(gaps, kind="stable")]
     for home in nearest[:_STARTS].tolist():
         if is_line_free(robot.homes_rad[home], q_pregrasp, first_blocked, step_rad):
-            return home, np.stack([robot.homes_rad[home], q_pregrasp])
+            return home, straight(robot.homes_rad[home], q_pregrasp, step_rad)
     home = int(nearest[0])
     corners, used = connect(
         robot.homes_rad[home],
@@ -151,4 +151,4 @@ def _reach(search: _Search, homes: np.ndarray, q_pregrasp: F64, opening_m: float
     search.iterations_left -= used
     if corners is None:
         return None
-    return home, shortened(corners, first_blocked, step_rad, _SHORTCUTS, search.rng)
+    return home, shortened(dense(corners, step_rad), first_blocked, step_rad, _SHORTCUTS, search.rng)

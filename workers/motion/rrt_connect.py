@@ -22,7 +22,9 @@ _FIRST_LOOK = 8  # of a long line, one configuration in so many is looked at fir
 def straight(q_from: F64, q_to: F64, step_rad: float) -> F64:
     """Configurations (M, A) from one to the other, both included, evenly and at most `step_rad` apart."""
     count = max(1, int(np.ceil(np.linalg.norm(q_to - q_from) / step_rad - 1e-9)))
-    return q_from + np.linspace(0.0, 1.0, count + 1)[:, None] * (q_to - q_from)
+    q = q_from + np.linspace(0.0, 1.0, count + 1)[:, None] * (q_to - q_from)
+    q[-1] = q_to  # to the bit, so that lines join
+    return q
 
 
 def dense(corners_rad: F64, step_rad: float) -> F64:
@@ -117,26 +119,17 @@ def _advance(
 
 
 def shortened(
-    corners_rad: F64, first_blocked: FirstBlocked, step_rad: float, tries: int, rng: np.random.Generator
+    path_rad: F64, first_blocked: FirstBlocked, step_rad: float, tries: int, rng: np.random.Generator
 ) -> F64:
-    """The path (K, A) with detours cut off: straight lines between random points of it, where free.
+    """A dense path (M, A) with detours cut off: straight lines between random rows of it, where free.
 
-    Never longer than before. The same `rng` gives the same path.
+    Never longer than before, and every row of it was looked at. The same `rng` gives the same path.
     """
-    path = corners_rad
+    path = path_rad
     for _ in range(tries):
-        if len(path) == 2:
-            break
-        lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        ends = np.concatenate([[0.0], np.cumsum(lengths)])
-        low, high = np.sort(rng.uniform(0.0, ends[-1], 2))
-        i, j = (int(np.searchsorted(ends, s, side="right")) - 1 for s in (low, high))
-        j = min(j, len(lengths) - 1)
-        if i == j:
-            continue
-        a = path[i] + (path[i + 1] - path[i]) * ((low - ends[i]) / lengths[i])
-        b = path[j] + (path[j + 1] - path[j]) * ((high - ends[j]) / lengths[j])
-        if is_line_free(a, b, first_blocked, step_rad):
-            path = np.concatenate([path[: i + 1], [a, b], path[j + 1 :]])
-            path = path[np.concatenate([[True], np.abs(np.diff(path, axis=0)).max(axis=1) > 0])]
+        i, j = np.sort(rng.integers(len(path), size=2)).tolist()
+        way = float(np.linalg.norm(np.diff(path[i : j + 1], axis=0), axis=1).sum())
+        is_shorter = np.linalg.norm(path[j] - path[i]) < way - step_rad / 10
+        if is_shorter and is_line_free(path[i], path[j], first_blocked, step_rad):
+            path = np.concatenate([path[:i], straight(path[i], path[j], step_rad), path[j + 1 :]])
     return path

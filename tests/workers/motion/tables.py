@@ -1,0 +1,162 @@
+"""Scenes on the table of `table_house`, grasps of a box written by hand, a check of plans without coal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from schemas.specification import MotionParams
+from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse
+from workers.grasps.grasp import GraspSet
+from workers.houses.house import Body, House
+from workers.motion.plan import MotionPlan
+from workers.motion.scene import PlanningScene, pose_of_base, prepare
+from workers.objects.model import ObjectModel
+from workers.rendering.embree_renderer import ray_stage
+from workers.rendering.frame import Stage
+from workers.robots import open_robot
+from workers.robots.robot import Robot
+from workers.scenes.recall import RecalledScene
+from workers.scenes.scene import SettledScene
+from workers.world import PreparedHouse
+
+BOX_M = (0.05, 0.05, 0.12)
+TARGET_XY_M = (0.0, -0.2)  # off the table's middle: 20 cm from its front edge
+PEDESTAL_M = 0.2
+PARAMS = MotionParams()
+
+
+@cache
+def arm(reach_m: float = 0.85, height_m: float = 0.75) -> Robot:
+    return open_robot("panda-scaled", reach_m, height_m)
+
+
+def box_grasps() -> GraspSet:
+    """Of a box of `BOX_M`: from above with the fingers along both sides, and from four sides."""
+    poses, scores = [], []
+    for turn in (0.0, np.pi / 2):
+        c, s = np.cos(turn), np.sin(turn)
+        y = np.array([c, s, 0.0])
+        for deep in (0.02, 0.035):
+            poses.append(_grasp([0, 0, BOX_M[2] / 2 - deep], [0, 0, -1], y))
+            scores.append(1.0)
+    for turn in np.arange(4) * np.pi / 2:
+        z = np.array([np.cos(turn), np.sin(turn), 0.0])
+        for height in (0.0, 0.03):
+            poses.append(_grasp([0, 0, height], z, np.array([-z[1], z[0], 0.0])))
+            scores.append(0.8)
+    openings = np.full(len(poses), 0.064, np.float32)
+    return GraspSet(np.array(poses), openings, np.array(scores, np.float32))
+
+
+def _grasp(position_m: Sequence[float], approach: Sequence[float] | F64, closing: F64) -> F64:
+    z, y = np.asarray(approach, np.float64), np.asarray(closing, np.float64)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([np.cross(y, z), y, z])
+    T[:3, 3] = position_m
+    return T
+
+
+def scene_of(
+    house: House, objects: Sequence[ObjectModel], poses: Sequence[F64], index: int = 0
+) -> SettledScene:
+    T = np.stack(poses)
+    rays = ray_stage(Stage(house, tuple(objects), T))
+    return RecalledScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
+
+
+def table_scene(
+    furniture: Sequence[Body] = (),
+    clutter: Sequence[tuple[ObjectModel, float, float]] = (),
+    target_xy_m: tuple[float, float] = TARGET_XY_M,
+) -> SettledScene:
+    """The box on the table, with clutter at places (dx, dy) off the table's middle."""
+    box = box_model("box", BOX_M)
+    objects = [box, *(model for model, _, _ in clutter)]
+    poses = [on_table(box, *target_xy_m), *(on_table(m, dx, dy) for m, dx, dy in clutter)]
+    return scene_of(table_house(furniture), objects, poses)
+
+
+def over_target(
+    body_id: str, size_m: tuple[float, float, float], low_m: float, shift_y_m: float = 0.0
+) -> Body:
+    """A static board whose underside is `low_m` above the table, over the target."""
+    x, y = ROOM_M[0] / 2 + TARGET_XY_M[0], ROOM_M[1] / 2 + TARGET_XY_M[1] + shift_y_m
+    return box_body(body_id, "furniture", "Shelf", size_m, (x, y, TABLE_TOP_M + low_m + size_m[2] / 2))
+
+
+def prepared(
+    scene: SettledScene,
+    robot: Robot | None = None,
+    grasps: GraspSet | None = None,
+    params: MotionParams = PARAMS,
+) -> PlanningScene:
+    return prepare(scene, robot or arm(), box_grasps() if grasps is None else grasps, params, 40, PEDESTAL_M)
+
+
+def front_base(
+    scene: SettledScene, robot: Robot | None = None, dx_m: float = 0.0, away_m: float = 0.5
+) -> F64:
+    """A base pose in front of the table, `away_m` from the target along y."""
+    center = scene.target_center_m
+    xy = np.array([center[0] + dx_m, center[1] - away_m])
+    return pose_of_base(xy, (robot or arm()).base_height_m, center)
+
+
+class HalfSpaces:
+    """Convex parts as half-spaces and points: says whether two sets of parts overlap, by points alone."""
+
+    def __init__(self, parts: Sequence[np.ndarray], rng: np.random.Generator) -> None:
+        self.faces = [ConvexHull(p.astype(np.float64)).equations for p in parts]
+        self.points = [_points(p.astype(np.float64), rng) for p in parts]
+
+    def deepest_m(self, T: F64, other: HalfSpaces, T_other: F64) -> float:
+        """How deep a point of any part lies in a part of the other; both ways, negative where free."""
+        here_there = inverse(T_other) @ T
+        return max(
+            self._depth(other, here_there, self.points), other._depth(self, inverse(here_there), other.points)
+        )
+
+    def _depth(self, other: HalfSpaces, T: F64, points: Sequence[F64]) -> float:
+        moved = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p in points])
+        return max(float(-(moved @ f[:, :3].T + f[:, 3]).max(axis=1).min()) for f in other.faces)
+
+
+def _points(corners: F64, rng: np.random.Generator) -> F64:
+    """Corners, and points spread over the edges and faces between them."""
+    triangles = ConvexHull(corners).simplices
+    weights = rng.dirichlet(np.ones(3), (len(triangles), 12))  # (F, 12, 3)
+    inner = np.einsum("fws,fsx->fwx", weights, corners[triangles]).reshape(-1, 3)
+    return np.concatenate([corners, inner])
+
+
+def deepest_in_plan_m(scene: SettledScene, robot: Robot, plan: MotionPlan, T_world_base: F64) -> float:
+    """How deep the robot enters the house, the clutter or, on the way to the pregrasp, the target."""
+    rng = np.random.default_rng(0)
+    static = HalfSpaces([p for b in scene.house.house.bodies for p in b.convex_parts_m], rng)
+    objects = [HalfSpaces(m.convex_parts_m, rng) for m in scene.models]
+    hand_names = {n for n in robot.link_names if "hand" in n or "finger" in n}
+    links = [
+        (k, HalfSpaces(parts, rng))
+        for k, (name, parts) in enumerate(zip(robot.link_names, robot.link_parts_m, strict=True))
+        if parts and name not in hand_names
+    ]
+    hand = HalfSpaces(robot.gripper.parts_at(plan.opening_m), rng)
+    deepest = -np.inf
+    phases = ((plan.q_reach_rad, True), (plan.q_approach_rad, False), (plan.q_lift_rad, False))
+    for rows, with_target in phases:
+        for q in rows[:: max(1, len(rows) // 8)]:
+            T_links = T_world_base @ robot.T_base_link(q)
+            bodies = [(shape, T_links[k]) for k, shape in links]
+            T_hand = T_world_base @ robot.T_base_tcp(q)
+            for shape, T in [*bodies, (hand, T_hand)]:
+                deepest = max(deepest, shape.deepest_m(T, static, np.eye(4)))
+                for k, thing in enumerate(objects):
+                    if k > 0 or with_target:
+                        deepest = max(deepest, shape.deepest_m(T, thing, scene.T_world_object[k]))
+    return deepest
