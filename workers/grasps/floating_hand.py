@@ -1,0 +1,203 @@
+"""Does a grasp hold? A hand without an arm closes on the object and is pulled about, by SAPIEN's PhysX."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from workers.geometry.mesh import F32, F64
+from workers.geometry.transforms import inverse, rotation_of, translation
+from workers.robots.robot import Gripper, Parts
+from workers.settling.sapien_bodies import add_object, convex_shape, pose_of, sapien_pose
+
+with warnings.catch_warnings():
+    # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
+    warnings.simplefilter("ignore")
+    import sapien
+    from sapien import physx
+
+Bools = npt.NDArray[np.bool_]
+
+_GRAVITY_MPS2 = 9.81
+# A finger's joint: its x axis, along which it moves, is the hand's y for finger 0 and -y for finger 1.
+_JOINT_AXES = (
+    np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+    np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+)
+_FINGER_MASS_KG = 0.05
+_FINGER_INERTIA_KGM2 = 1e-4
+
+
+@dataclass(frozen=True)
+class HandTest:
+    """How one trial goes: close without gravity, then pull the object, the hand standing still.
+
+    In the hand's frame a lift is a pull: gravity and the acceleration of the lift. The object is off the
+    pose that was meant by a normal draw, as an arm would have it.
+    """
+
+    grip_force_n: float = 40.0  # of each finger
+    closing_mps: float = 0.1  # of each finger
+    object_friction: float = 0.6
+    finger_friction: float = 2.0
+    close_s: float = 0.25
+    pull_s: float = 0.2
+    pull_mps2: float = 1.25 * _GRAVITY_MPS2
+    max_slip_m: float = 0.03
+    position_error_m: float = 0.002
+    turn_error_rad: float = 0.035
+    timestep_s: float = 1 / 240
+    position_iterations: int = 20
+    velocity_iterations: int = 2
+    contact_offset_m: float = 0.002
+    hands_at_once: int = 64
+
+
+# Down for an object that stands upright, out of the hand, and along its pads.
+PULLS = ("down", "out", "across")
+
+
+def held_trials(
+    parts_m: Sequence[F32],
+    mass_kg: float,
+    gripper: Gripper,
+    T_object_tcp: F64,
+    opening_m: F64,
+    rng: np.random.Generator,
+    test: HandTest,
+) -> Bools:
+    """Whether the grasps (N, 4, 4) hold the object in each of `PULLS`; (N, 3).
+
+    Held means that the object's frame moves by less than `max_slip_m` in the hand while it is pulled.
+    Physics that ends in NaN holds nothing. Trials stand side by side in scenes of their own, far
+    enough apart that none meets another.
+    """
+    n = len(T_object_tcp)
+    held = np.zeros((n, len(PULLS)), bool)
+    for pull, name in enumerate(PULLS):
+        meant = [inverse(T) for T in T_object_tcp]
+        pulls = _pull_directions(name, T_object_tcp) * test.pull_mps2
+        errors = [_error(rng, test) for _ in range(n)]
+        T_tcp_object = np.array([T @ error for T, error in zip(meant, errors, strict=True)]).reshape(n, 4, 4)
+        for start in range(0, n, test.hands_at_once):
+            some = slice(start, start + test.hands_at_once)
+            slip_m = _slips(parts_m, mass_kg, gripper, T_tcp_object[some], opening_m[some], pulls[some], test)
+            held[some, pull] = slip_m < test.max_slip_m
+    return held
+
+
+def _pull_directions(name: str, T_object_tcp: F64) -> F64:
+    """Unit directions (N, 3) in the TCP frame."""
+    n = len(T_object_tcp)
+    if name == "down":
+        return -T_object_tcp[:, 2, :3]
+    if name == "out":
+        return np.tile([0.0, 0.0, 1.0], (n, 1))
+    return np.where(np.arange(n) % 2 == 0, 1.0, -1.0)[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+def _error(rng: np.random.Generator, test: HandTest) -> F64:
+    """A small motion (4, 4) of the object."""
+    T = translation(*(test.position_error_m * rng.standard_normal(3)).tolist())
+    half = test.turn_error_rad / 2 * rng.standard_normal(3)
+    T[:3, :3] = rotation_of(np.array([1.0, *half]))
+    return T
+
+
+def _slips(
+    parts_m: Sequence[F32],
+    mass_kg: float,
+    gripper: Gripper,
+    T_tcp_object: F64,
+    opening_m: F64,
+    pull_mps2: F64,
+    test: HandTest,
+) -> F64:
+    """How far (N,) the objects move in their hands while pulled, metres; inf where physics broke."""
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    scene.set_timestep(test.timestep_s)
+    rubber = physx.PhysxMaterial(test.finger_friction, test.finger_friction, 0.0)
+    skin = physx.PhysxMaterial(test.object_friction, test.object_friction, 0.0)
+    n = len(T_tcp_object)
+    across = int(np.ceil(np.sqrt(n)))
+    largest_m = max(float(np.linalg.norm(part, axis=1).max()) for part in parts_m)
+    spacing_m = 1.0 + 2 * largest_m
+    bodies: list[physx.PhysxRigidDynamicComponent] = []
+    for k in range(n):
+        T_world_tcp = translation(spacing_m * (k % across), spacing_m * (k // across), 0.0)
+        _add_hand(scene, gripper, T_world_tcp, float(opening_m[k]), rubber, test)
+        body = add_object(scene, parts_m, mass_kg, T_world_tcp @ T_tcp_object[k], skin)
+        _tune(body, test)
+        bodies.append(body)
+    for _ in range(round(test.close_s / test.timestep_s)):
+        scene.step()
+    before_m = np.array([pose_of(body)[:3, 3] for body in bodies])
+    forces_n = (mass_kg * pull_mps2).astype(np.float32)
+    no_torque = np.zeros(3, np.float32)
+    for _ in range(round(test.pull_s / test.timestep_s)):
+        for body, force_n in zip(bodies, forces_n, strict=True):
+            body.add_force_torque(force_n, no_torque)
+        scene.step()
+    after_m = np.array([pose_of(body)[:3, 3] for body in bodies])
+    slip_m = np.linalg.norm(after_m - before_m, axis=1)
+    return np.where(np.isfinite(slip_m), slip_m, np.inf)
+
+
+def _add_hand(
+    scene: sapien.Scene,
+    gripper: Gripper,
+    T_world_tcp: F64,
+    opening_m: float,
+    rubber: physx.PhysxMaterial,
+    test: HandTest,
+) -> None:
+    """A hand whose palm stands still, its fingers `opening_m` apart and closing.
+
+    As an articulation: free bodies on drives hold next to nothing. A finger is driven by force =
+    damping x (speed wanted - speed), with no spring: against an object that is `grip_force_n`
+    exactly, and an object off the middle is not carried away, as in a hand whose fingers are coupled.
+    """
+    builder = scene.create_articulation_builder()
+    palm = builder.create_link_builder()
+    for axes in _JOINT_AXES:
+        finger = builder.create_link_builder(palm)
+        T = np.eye(4)
+        T[:3, :3] = axes
+        finger.set_joint_properties(
+            "prismatic", [[0.0, gripper.max_opening_m / 2]], sapien_pose(T), sapien_pose(T)
+        )
+    hand = builder.build(fix_root_link=True)
+    for link, parts in zip(hand.links, (gripper.palm_parts_m, *gripper.finger_parts_m), strict=True):
+        _attach(link, parts, rubber)
+        _tune(link, test)
+    for finger in hand.links[1:]:
+        finger.set_mass(_FINGER_MASS_KG)
+        finger.set_inertia([_FINGER_INERTIA_KGM2] * 3)
+    hand.set_solver_position_iterations(test.position_iterations)
+    hand.set_solver_velocity_iterations(test.velocity_iterations)
+    hand.set_root_pose(sapien_pose(T_world_tcp))
+    hand.set_qpos(np.full(2, opening_m / 2, np.float32))
+    for joint in hand.active_joints:
+        joint.set_friction(0.0)
+        joint.set_drive_properties(0.0, test.grip_force_n / test.closing_mps)
+        joint.set_drive_velocity_target(-test.closing_mps)
+
+
+def _attach(link: physx.PhysxArticulationLinkComponent, parts: Parts, rubber: physx.PhysxMaterial) -> None:
+    for part in parts:
+        link.attach(convex_shape(part, rubber))
+
+
+def _tune(body: physx.PhysxRigidBodyComponent, test: HandTest) -> None:
+    body.set_disable_gravity(True)
+    for shape in body.collision_shapes:
+        # The default of a centimetre makes contacts of everything near a finger.
+        shape.set_contact_offset(test.contact_offset_m)
+    if isinstance(body, physx.PhysxRigidDynamicComponent):
+        body.set_solver_position_iterations(test.position_iterations)
+        body.set_solver_velocity_iterations(test.velocity_iterations)
+        body.set_sleep_threshold(0.0)

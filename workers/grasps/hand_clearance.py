@@ -1,0 +1,82 @@
+"""Whether a hand that comes in straight touches the object, or what the object stands on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import coal as _library
+import numpy as np
+import numpy.typing as npt
+
+from workers.geometry.mesh import F32, F64
+from workers.robots.robot import Gripper
+
+# coal's module fills itself at import time, which type checkers do not see.
+coal: Any = _library
+
+Bools = npt.NDArray[np.bool_]
+
+# The last way of the hand, along its approach: it is checked as one swept body.
+APPROACH_M = 0.08
+
+
+class HandClearance:
+    """One object's convex parts in a bounding-box tree, asked about many poses of one hand."""
+
+    def __init__(self, parts_m: Sequence[F32], gripper: Gripper) -> None:
+        self._tree = coal.DynamicAABBTreeCollisionManager()
+        # The tree keeps pointers only.
+        self._object = [coal.CollisionObject(_polyhedron(part)) for part in parts_m]
+        for part in self._object:
+            self._tree.registerObject(part)
+        self._tree.setup()
+        left, right = gripper.finger_parts_m
+        self._hand = [
+            (coal.CollisionObject(_polyhedron(swept(part))), side)
+            # Fingers first: they are the ones that touch.
+            for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0))
+            for part in parts
+        ]
+
+    def free(self, T_object_tcp: F64, opening_m: F64 | F32) -> Bools:
+        """Which poses (N, 4, 4) keep the hand, also on its way in, free of the object; (N,)."""
+        return np.array(
+            [self._is_free(T, float(o)) for T, o in zip(T_object_tcp, opening_m, strict=True)], bool
+        )
+
+    def _is_free(self, T: F64, opening_m: float) -> bool:
+        R, p, y = T[:3, :3], T[:3, 3], T[:3, 1]
+        answer = coal.CollisionCallBackDefault()
+        for part, side in self._hand:
+            part.setRotation(R)
+            part.setTranslation(p + side * opening_m * y)
+            part.computeAABB()
+            self._tree.collide(part, answer)
+            if answer.data.result.isCollision():
+                return False
+        return True
+
+
+def swept(part_m: F32) -> F32:
+    """Corners (2V, 3) whose hull is the part (V, 3) together with its last `APPROACH_M` of way."""
+    return np.concatenate([part_m, part_m - np.array([0, 0, APPROACH_M], np.float32)])
+
+
+def lowest_m(gripper: Gripper, T_object_tcp: F64, opening_m: F64 | F32) -> F64:
+    """Lowest z (N,) of the hand in the object's frame, at the poses (N, 4, 4) and openings (N,)."""
+    down = T_object_tcp[:, 2, :3]  # the object's z axis in the TCP frame
+    left, right = gripper.finger_parts_m
+    lowest = np.full(len(down), np.inf)
+    for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0)):
+        shift = side * np.asarray(opening_m, np.float64) * down[:, 1]
+        for part in parts:
+            lowest = np.minimum(lowest, (down @ swept(part).T.astype(np.float64)).min(axis=1) + shift)
+    return lowest + T_object_tcp[:, 2, 3]
+
+
+def _polyhedron(points_m: F32) -> Any:
+    corners = coal.StdVec_Vec3s()
+    for point in points_m.astype(np.float64):
+        corners.append(point)
+    return coal.ConvexBase.convexHull(corners, True, "Qt")
