@@ -1,48 +1,143 @@
-"""`datagen audit`: what labels cost, and what the paper's schedule would cost here."""
+"""`datagen audit`: what labels cost, what the paper's schedule would cost here, and how they agree."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from datagen.accounts import Account, Books, account_for
-from datagen.console import print_json, print_rows, seconds, size
+from datagen.agreement import common_candidates, compare, outcome_report
+from datagen.audit_tables import print_pair, print_ratios, print_source
+from datagen.console import print_json
+from datagen.labelled import join_labelled, read_labelled
 from schemas.cost import STAGES
 from schemas.errors import InputError
 from schemas.run import Run
+from schemas.specification import Specification
 
-# GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000.
+# GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
+# for as many simulated ones.
 PAPER_LABELS = 180_000
-PAPER_HEURISTIC_DAYS = 3.0
+PAPER_DAYS = {"heuristic": 3.0, "sim": 21.0}
+
+# The farther along, the closer to the truth: it is what the others are held against.
+_FIDELITY = ("heuristic", "plan", "sim")
 
 
 def audit(
-    runs: Annotated[list[str], Parameter(negative=(), help="Runs of one label source.")],
+    runs: Annotated[list[str], Parameter(negative=(), help="Runs, of one label source or of several.")],
     *,
+    candidates: Annotated[
+        Literal["grid", "clear", "in-range"],
+        Parameter(help="Candidates whose outcomes and agreement are counted; grid takes all there are."),
+    ] = "grid",
     json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
 ) -> int:
-    """What labels cost: seconds per label by stage, waste, and a projection to 180,000.
+    """What labels cost: seconds per label by stage, waste, and a projection to 180,000; how they agree.
 
-    Seconds are summed over workers: two workers that are busy for a minute cost two minutes.
+    Seconds are summed over workers: two workers that are busy for a minute cost two minutes. Runs that
+    labelled the same candidates (--scenes-from) are compared pair by pair.
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "no run is named", "Name one or more run folders")
     opened = [Run.open(place) for place in runs]
-    sources = sorted({run.manifest.spec.label_source for run in opened})
-    if len(sources) > 1:
-        raise InputError(
-            "datagen audit",
-            "RUN",
-            f"runs of several label sources ({', '.join(sources)})",
-            "Audit each alone",
-        )
-    report = audit_report(account_for(opened), sources[0])
+    by_source: dict[str, list[Run]] = {}
+    for run in sorted(opened, key=lambda run: _fidelity(run.manifest.spec)):
+        by_source.setdefault(run.manifest.spec.label_source, []).append(run)
+    sources = [
+        audit_report(account_for(group), source) | _outcomes(group, candidates)
+        for source, group in by_source.items()
+    ]
+    costs = ratios(sources)
+    compared = pairs([run for group in by_source.values() for run in group], candidates)
     if json:
-        print_json(report)
-    else:
-        _print(report)
+        print_json({"candidates": candidates, "sources": sources, "ratios": costs, "pairs": compared})
+        return 0
+    for source in sources:
+        print_source(source, candidates)
+    if costs:
+        print_ratios(costs)
+    for pair in compared:
+        print_pair(pair)
     return 0
+
+
+def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """For every two label sources, how many times as much a label of the second costs."""
+    return [
+        {
+            "source": second["label_source"],
+            "over": first["label_source"],
+            "cost_ratio": second["wall_s_per_label"] / first["wall_s_per_label"],
+        }
+        for first, second in combinations(sources, 2)
+        if first["wall_s_per_label"] and second["wall_s_per_label"]
+    ]
+
+
+def pairs(runs: Sequence[Run], candidates: str) -> list[dict[str, Any]]:
+    """How every two runs that labelled the same candidates agree; the later one counts as the truth.
+
+    A correct label of the first costs its label's time over its accuracy, of the second its own.
+    """
+    found: list[dict[str, Any]] = []
+    for first, second in combinations(runs, 2):
+        specs = first.manifest.spec, second.manifest.spec
+        if specs[0].scenes_hash != specs[1].scenes_hash or specs[0] == specs[1]:
+            continue
+        labels = read_labelled(first), read_labelled(second)
+        if labels[0] is None or labels[1] is None:
+            continue
+        said, true = common_candidates(labels[0], labels[1])
+        rows = true.is_in(candidates)
+        compared = compare(said.at(rows), true.at(rows))
+        costs_s = [_wall_s_per_label(account_for([run])) for run in (first, second)]
+        accuracy = compared["accuracy"]
+        found.append(
+            {
+                "said_by": _who(first),
+                "true_by": _who(second),
+                "candidates": candidates,
+                **compared,
+                "wall_s_per_correct_label": {
+                    "said_by": costs_s[0] / accuracy if costs_s[0] and accuracy else None,
+                    "true_by": costs_s[1],
+                },
+            }
+        )
+    return found
+
+
+def _fidelity(spec: Specification) -> tuple[int, bool]:
+    known = spec.label_source in _FIDELITY
+    return (_FIDELITY.index(spec.label_source) if known else 0, _is_disturbed(spec))
+
+
+def _is_disturbed(spec: Specification) -> bool:
+    return spec.arm is not None and spec.arm.disturbance is not None
+
+
+def _who(run: Run) -> dict[str, Any]:
+    spec = run.manifest.spec
+    return {"run": run.storage.url, "label_source": spec.label_source, "disturbed": _is_disturbed(spec)}
+
+
+def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:
+    """The outcomes of runs whose labels have a cause; nothing for others."""
+    if not any(f.name == "outcome" for f in runs[0].schema.sample_fields):
+        return {}
+    read = [labelled for run in runs if (labelled := read_labelled(run)) is not None]
+    if not read:
+        return {}
+    labelled = join_labelled(read)
+    return {"outcomes": outcome_report(labelled.at(labelled.is_in(candidates)))}
+
+
+def _wall_s_per_label(books: Books) -> float | None:
+    return books.total_wall_s / books.labels if books.labels else None
 
 
 def audit_report(books: Books, source: str) -> dict[str, Any]:
@@ -58,7 +153,7 @@ def audit_report(books: Books, source: str) -> dict[str, Any]:
         "cpu_s": max(0.0, books.useful.cpu_s - sum(books.useful.stage_cpu_s.values())),
     }
     waste = {outcome: _account(account) for outcome, account in sorted(books.waste.items())}
-    per_label_s = books.total_wall_s / labels if labels else None
+    per_label_s = _wall_s_per_label(books)
     return {
         "label_source": source,
         "labels": labels,
@@ -76,7 +171,7 @@ def audit_report(books: Books, source: str) -> dict[str, Any]:
         "projection": {
             "labels": PAPER_LABELS,
             "worker_days": per_label_s * PAPER_LABELS / 86400 if per_label_s is not None else None,
-            "paper_days": PAPER_HEURISTIC_DAYS,
+            "paper_days": PAPER_DAYS.get(source),
             "bytes": books.useful.written_bytes / labels * PAPER_LABELS if labels else None,
         },
         "machines": dict(books.machines),
@@ -93,56 +188,3 @@ def _account(account: Account) -> dict[str, Any]:
         "written_bytes": account.written_bytes,
         "peak_rss_bytes": account.peak_rss_bytes,
     }
-
-
-def _print(report: dict[str, Any]) -> None:
-    labels, useful = report["labels"], report["useful"]
-    if not labels:
-        print_rows("audit", [("labels", "none committed yet")])
-        return
-    redraws = ", ".join(f"{cause} {count}" for cause, count in report["redraws"].items()) or "none"
-    print_rows(
-        f"audit of {report['label_source']} labels",
-        [
-            ("labels", f"{labels:,} in {report['scenes']:,} scenes"),
-            ("positive", f"{report['positives']:,} ({100 * report['positive_share']:.1f}%)"),
-            ("redraws", redraws),
-            ("worker time", f"{seconds(useful['wall_s'])} wall, {seconds(useful['cpu_s'])} CPU"),
-            (
-                "per label",
-                f"{1000 * report['wall_s_per_label']:.3f} ms, {report['bytes_per_label']:.0f} bytes",
-            ),
-            ("peak memory", size(useful["peak_rss_bytes"])),
-            ("machines", "; ".join(report["machines"])),
-        ],
-    )
-    whole = useful["wall_s"]
-    print_rows(
-        "where the time goes",
-        [
-            (
-                stage,
-                f"{1000 * spent['wall_s'] / labels:.3f}",
-                f"{1000 * spent['cpu_s'] / labels:.3f}",
-                f"{100 * spent['wall_s'] / whole:.1f}%",
-            )
-            for stage, spent in report["stages"].items()
-        ],
-        ("stage", "wall ms/label", "CPU ms/label", "share"),
-    )
-    waste = [
-        (outcome, str(account["attempts"]), seconds(account["wall_s"]), str(account["without_account"]))
-        for outcome, account in report["waste"].items()
-    ]
-    if waste:
-        print_rows("waste", waste, ("outcome", "attempts", "wall", "without account"))
-    projection = report["projection"]
-    print_rows(
-        f"projection to {projection['labels']:,} labels",
-        [
-            ("this machine", f"{projection['worker_days']:.4f} worker-days, {size(projection['bytes'])}"),
-            ("the paper", f"{projection['paper_days']:.0f} GPU-days (RTX A5000, an upper bound it states)"),
-            ("ratio", f"{projection['paper_days'] / projection['worker_days']:.0f} times fewer days"),
-            ("waste", f"{100 * report['waste_share']:.1f}% of the time paid"),
-        ],
-    )

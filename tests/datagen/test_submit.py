@@ -173,7 +173,7 @@ def test_status_tells_an_older_seal(
 
 
 def test_the_audit_adds_up(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = json_of(capsys, ["audit", str(finished)])
+    (report,) = json_of(capsys, ["audit", str(finished)])["sources"]
     run, arrays = Run.open(finished), arrays_of(finished)
     ledger = [e.cost for e in run.ledger() if e.cost is not None]
     paid_s = sum(cost.wall_s for cost in ledger)

@@ -1,0 +1,188 @@
+"""How labels of the same candidates agree, and of what kind they are: arrays in, plain values out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.fields import OUTCOMES
+
+Bools = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.float32]
+Rows = npt.NDArray[np.intp]
+
+# Which candidates are counted: on a whole grid most are far away or stand in a table, which any rule
+# gets right, so accuracy says little without the name of the set.
+CANDIDATE_SETS = ("grid", "clear", "in-range")
+
+_TENTHS = tuple(round(0.1 * k, 1) for k in range(11))
+DISTANCE_EDGES_M = (*_TENTHS, None)
+REACH_EDGES_M = (0.0, *_TENTHS[3:], None)
+HEIGHT_EDGES_M = (0.0, *_TENTHS[5:], None)
+# Those of the visibility score: hidden, partly seen, nearly free.
+VISIBILITY_EDGES = (0.0, 0.04, 0.2, 0.4, 0.6, 0.8, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """N candidates with a label, and what they are sorted by. Arrays are (N,)."""
+
+    scene: npt.NDArray[np.int64]
+    candidate: npt.NDArray[np.int32]
+    label: Bools
+    is_clear: Bools
+    distance_m: Floats
+    mount_distance_m: Floats
+    visibility: Floats
+    reach_m: Floats
+    height_m: Floats
+    target: npt.NDArray[Any]  # the object's name
+    outcome: npt.NDArray[np.uint8] | None  # code of OUTCOMES; None where the label has no cause
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def at(self, rows: Rows | Bools) -> Labelled:
+        """Some of the candidates."""
+        cut = {name: getattr(self, name)[rows] for name in ROWS}
+        return Labelled(**cut, outcome=None if self.outcome is None else self.outcome[rows])
+
+    def is_in(self, candidates: str) -> Bools:
+        """Which (N,) belong to a set of CANDIDATE_SETS."""
+        match candidates:
+            case "clear":
+                return self.is_clear
+            case "in-range":
+                return self.is_clear & (self.mount_distance_m <= self.reach_m)
+            case _:
+                return np.ones(len(self), np.bool_)
+
+
+# The arrays that every label has.
+ROWS = tuple(f.name for f in fields(Labelled) if f.name != "outcome")
+
+
+def common_candidates(a: Labelled, b: Labelled) -> tuple[Labelled, Labelled]:
+    """The candidates that both labelled, by scene and index, row by row the same."""
+    # No run has 2^32 candidates a scene.
+    keys = [side.scene * 2**32 + side.candidate for side in (a, b)]
+    _, rows_a, rows_b = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    return a.at(rows_a), b.at(rows_b)
+
+
+def confusion(said: Bools, true: Bools) -> dict[str, int]:
+    """Counts of right and wrong positives and negatives of `said` (N,) against `true` (N,)."""
+    return {
+        "true_positive": int((said & true).sum()),
+        "false_positive": int((said & ~true).sum()),
+        "false_negative": int((~said & true).sum()),
+        "true_negative": int((~said & ~true).sum()),
+    }
+
+
+def agreement(said: Bools, true: Bools) -> dict[str, Any]:
+    """Counts, shares and accuracies; None where nothing can be said.
+
+    Balanced accuracy is the mean of the shares of positives and of negatives that are found: 0.5 for
+    a rule that looks at nothing, however rare positives are.
+    """
+    n, positives = len(true), int(true.sum())
+    found = float(said[true].mean()) if positives else None
+    refused = float((~said)[~true].mean()) if positives < n else None
+    return {
+        "count": n,
+        "said_positive": int(said.sum()),
+        "true_positive_share": positives / n if n else None,
+        "accuracy": float((said == true).mean()) if n else None,
+        "balanced_accuracy": (found + refused) / 2 if found is not None and refused is not None else None,
+    }
+
+
+def bands(values: Floats, edges: Sequence[float | None]) -> list[tuple[float, float | None, Bools]]:
+    """Rows (N,) in each band [low, high) that holds any; an edge None is beyond all values."""
+    found: list[tuple[float, float | None, Bools]] = []
+    for low, high in pairwise(edges):
+        assert low is not None
+        # Stored numbers are float32: a reach of 0.7 m belongs to the band that begins at 0.7.
+        inside = values >= np.float32(low)
+        if high is not None:
+            inside &= values < np.float32(high)
+        if inside.any():
+            found.append((low, high, inside))
+    return found
+
+
+def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
+    """How the labels of `said` stand to those of `true`; both hold the same candidates, row by row."""
+
+    def by_band(values: Floats, edges: Sequence[float | None]) -> list[dict[str, Any]]:
+        return [
+            {"low": low, "high": high, **agreement(said.label[rows], true.label[rows])}
+            for low, high, rows in bands(values, edges)
+        ]
+
+    names = sorted({str(name) for name in true.target})
+    objects = [(name, true.target == name) for name in names]
+    return {
+        **agreement(said.label, true.label),
+        "confusion": confusion(said.label, true.label),
+        "by_distance": by_band(true.distance_m, DISTANCE_EDGES_M),
+        "by_visibility": by_band(true.visibility, VISIBILITY_EDGES),
+        "by_reach": by_band(true.reach_m, REACH_EDGES_M),
+        "by_object": [
+            {"object": name, **agreement(said.label[rows], true.label[rows])} for name, rows in objects
+        ],
+        "by_outcome": _by_outcome(said, true),
+    }
+
+
+def _by_outcome(said: Labelled, true: Labelled) -> list[dict[str, Any]]:
+    """For each outcome of `true`, how many there are and how many of them were said to be good."""
+    if true.outcome is None:
+        return []
+    return [
+        {"outcome": name, "count": int(rows.sum()), "said_positive": int(said.label[rows].sum())}
+        for code, name in enumerate(OUTCOMES)
+        if (rows := true.outcome == code).any()
+    ]
+
+
+def outcome_report(labelled: Labelled) -> dict[str, Any]:
+    """Outcomes and deciding stages with count and share, and the share of positives by band."""
+    assert labelled.outcome is not None
+    n = len(labelled)
+    counts = np.bincount(labelled.outcome, minlength=len(OUTCOMES))
+    outcomes: list[dict[str, Any]] = [
+        {"outcome": name, "stage": OUTCOMES[name], "count": int(count), "share": int(count) / n}
+        for name, count in zip(OUTCOMES, counts, strict=True)
+        if count
+    ]
+    # A success is decided last; what is left are failures, by the stage that found them.
+    stages = dict.fromkeys(OUTCOMES.values(), 0)
+    for row in outcomes:
+        if row["outcome"] != "success":
+            stages[row["stage"]] += row["count"]
+
+    def share_by(values: Floats, edges: Sequence[float | None]) -> list[dict[str, Any]]:
+        return [
+            {"low": low, "high": high, "count": int(rows.sum()), "positive": int(labelled.label[rows].sum())}
+            for low, high, rows in bands(values, edges)
+        ]
+
+    return {
+        "count": n,
+        "outcomes": outcomes,
+        "failures_by_stage": [
+            {"stage": s, "count": count, "share": count / n} for s, count in stages.items() if count
+        ],
+        "positive_by": {
+            "distance": share_by(labelled.distance_m, DISTANCE_EDGES_M),
+            "reach": share_by(labelled.reach_m, REACH_EDGES_M),
+            "height": share_by(labelled.height_m, HEIGHT_EDGES_M),
+        },
+    }
