@@ -1,64 +1,86 @@
-"""`datagen show`: a picture that explains one scene of a run."""
+"""`datagen show`: a picture that explains one scene of a run, or one trial in it."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.arms import refuse_missing_packages
 from datagen.console import print_rows
-from datagen.drawing.scene_picture import best_clear, draw_scene_picture
+from datagen.pictures import Shown, draw_arm, draw_heuristic
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
-from schemas.identity import Stream, generator
 from schemas.run import Run
 from schemas.scene_rows import read_scene
-from workers.scenes.draw import render_frame
 from workers.scenes.recall import recall_scene
 from workers.world import open_world
+
+_BEST = "best"
 
 
 def show(
     run: Annotated[str, Parameter(help="The run's folder.")],
     *,
-    out: Annotated[Path, Parameter(help="The picture to write, a .png file.")],
+    out: Annotated[Path, Parameter(help="The picture to write: a .png file, or a .gif of a trial.")],
     scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
+    trial: Annotated[
+        str | None, Parameter(help="A candidate's index, or best: show how its trial went (plan, sim).")
+    ] = None,
     houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
     objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
 ) -> int:
-    """A picture of one scene: the RGB-D frame, floor plans with the candidates, the cloud, numbers.
+    """A picture of one scene: the RGB-D frame, floor plans with the candidates, numbers.
 
-    The frame is rendered again from the stored poses; nothing is drawn at random or simulated.
+    For heuristic labels with the depth and the cloud; for plan and sim with the map of outcomes beside
+    that of scores, and with the grasps that succeeded. With --trial the candidate is tried again and
+    shown as a filmstrip, or in motion as a .gif. Scenes are rendered again from the stored poses.
     """
-    if out.suffix.lower() != ".png":
-        raise InputError(out, "--out", "is not a .png file", "Give a name that ends in .png")
-    if not out.parent.is_dir():
-        raise InputError(out, "--out", "its folder does not exist", "Make the folder first")
+    moving = _is_motion(out)
+    candidate = _candidate(trial)
     opened = Run.open(run)
-    rows = read_scene(opened, scene)
     spec, sources = opened.manifest.spec, opened.manifest.sources
+    of_trial = trial is not None or moving
+    if of_trial and spec.arm is None:
+        problem = f"{spec.label_source} labels come without trials"
+        mend = "Give a run of plan or sim, or --out FILE.png alone"
+        raise InputError(
+            run, "--trial" if trial else "--out", problem, "Give a run of plan or sim, or a .png"
+        )
+    refuse_missing_packages(spec.label_source)
+    rows = read_scene(opened, scene)
     world = open_world(
         spec, houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
     )
-    recalled = recall_scene(world, rows.record)
-    noise_rng = generator(spec.seed, Stream.NOISE, scene, int(rows.record["retry"]))
-    frame = render_frame(spec.observation, recalled.stage, recalled.camera, noise_rng)
-    draw_scene_picture(f"{run}, scene {scene}", recalled, frame, rows.record, rows.samples, out)
+    shown = Shown(run, spec, rows, recall_scene(world, rows.record))
+    if of_trial:
+        # Imported here, so that scenes can be seen without what plans and executes.
+        from datagen.trial_picture import draw_trial
 
-    score, label = rows.samples["heuristic_score"], rows.samples["label"]
-    best = best_clear(score, rows.samples["base_is_clear"])
-    x_y = "" if best is None else ", ".join(f"{v:.3f}" for v in rows.samples["base_xy_m"][best])
-    print_rows(
-        f"scene {scene} of {run}",
-        [
-            (
-                "target",
-                f"{recalled.models[0].name} on {rows.record['support_type']}, {rows.record['room_type']}",
-            ),
-            ("positive", f"{int(label.sum())} of {len(label)} candidates"),
-            ("best clear base", f"({x_y}) m, H = {score[best]:.3f}" if best is not None else "none is clear"),
-            ("picture", str(out)),
-        ],
-    )
+        lines = draw_trial(shown, candidate, out)
+    else:
+        lines = (draw_heuristic if spec.arm is None else draw_arm)(shown, out)
+    print_rows(f"scene {scene} of {run}", [("target", shown.target), *lines, ("picture", str(out))])
     return 0
+
+
+def _is_motion(out: Path) -> bool:
+    suffix = out.suffix.lower()
+    if suffix not in (".png", ".gif"):
+        mend = "Give a name that ends in .png, or in .gif for a trial in motion"
+        raise InputError(out, "--out", "is neither a .png nor a .gif file", mend)
+    if not out.parent.is_dir():
+        raise InputError(out, "--out", "its folder does not exist", "Make the folder first")
+    return suffix == ".gif"
+
+
+def _candidate(trial: str | None) -> int | None:
+    """The candidate that `--trial` names; None for the best success."""
+    if trial is None or trial == _BEST:
+        return None
+    if not re.fullmatch(r"[+-]?[0-9]{1,30}", trial):
+        mend = f"Give a candidate's index, or {_BEST}"
+        raise InputError("--trial", trial[:40], "is not a whole number", mend)
+    return int(trial)

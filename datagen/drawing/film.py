@@ -19,9 +19,11 @@ from workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Told = tuple[tuple[int, str], ...]  # rows of a recording, and what they are
 
 _WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the middle of what it shows
 _LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
+_FOLLOWED_M = 1.0  # a target that fell farther is not kept in the picture
 _OUTLINE_RGB = (255, 45, 111)  # the target's, as in the frame of every scene's picture
 
 # Moments that tell a trial: phase, share of it, words.
@@ -52,6 +54,7 @@ class Film:
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
+    told: Told  # the moments of a sheet
     wide: Shot
     near: Shot
 
@@ -74,18 +77,20 @@ def film_of(
     bodies: RobotBodies,
     T_world_base: F64,
     recording: Recording,
+    told: Told,
     wide_px: tuple[int, int],
     near_px: tuple[int, int],
 ) -> Film:
-    """Choose both views of a trial; sizes are (width, height)."""
-    told = {words: moment for moment, words in told_moments(recording)}
-    shown = sorted({0, told.get("at the grasp", len(recording.phase) // 2), len(recording.phase) - 1})
+    """Choose both views of a trial of which the moments `told` matter; sizes are (width, height)."""
+    named = {words: moment for moment, words in told}
+    shown = sorted({0, named.get("at the grasp", len(recording.phase) // 2), len(recording.phase) - 1})
     moments = [_stage(recalled, bodies, T_world_base, recording, m) for m in shown]
     n_objects = len(recalled.models)
     hand = tuple(n_objects + k for k in bodies.hand)
     arm = tuple(n_objects + k for k in range(len(bodies.rays)) if bodies.link[k] >= 0)
     origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in moments])
     target_m = recording.T_world_object[shown, 0, :3, 3]
+    target_m = target_m[np.linalg.norm(target_m - target_m[0], axis=1) < _FOLLOWED_M]
     forward = T_world_base[:3, 0]
     house = recalled.house.house
     wide = Subject(
@@ -94,14 +99,14 @@ def film_of(
     )  # fmt: skip
     grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
     half_m = max(_NEAR_HALF_M, float(recalled.models[0].radius_m) + 0.03)
-    near = Subject(moments[1:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
+    near = Subject(moments[1:] or moments, ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
     return Film(
-        recalled, bodies, T_world_base, recording,
+        recalled, bodies, T_world_base, recording, told,
         choose_shot(house, wide, _WIDE_M, *wide_px), choose_shot(house, near, _NEAR_M, *near_px),
     )  # fmt: skip
 
 
-def told_moments(recording: Recording) -> list[tuple[int, str]]:
+def told_moments(recording: Recording) -> Told:
     """The eight moments that tell a trial, as (row, words); fewer in a shorter recording.
 
     Where the trial ended early, the gaps between what there was are filled.
@@ -119,7 +124,7 @@ def told_moments(recording: Recording) -> list[tuple[int, str]]:
         gaps = np.diff(rows)
         middle = rows[int(np.argmax(gaps))] + int(gaps.max()) // 2
         told[middle] = _PHASE_WORDS.get(str(phase[middle]), str(phase[middle]))
-    return sorted(told.items())
+    return tuple(sorted(told.items()))
 
 
 class Lens:

@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from datagen.drawing.film import Film, pictures, told_moments
+from datagen.drawing.film import Film, pictures
 from workers.geometry.mesh import U8
 
 # Views on the sheet and in motion, (width, height).
@@ -40,11 +40,11 @@ class Title:
 
 def write_sheet(film: Film, title: Title, out: Path) -> None:
     """Moments in rows of four: the far view, below it the near one."""
-    told = told_moments(film.recording)
+    told = film.told
     (w, h), (_, near_h) = SHEET_WIDE_PX, SHEET_NEAR_PX
     top = _TITLE_PX + _LINE_PX * len(title.lines) + _GAP_PX
     band = _CAPTION_PX + h + near_h + 2 * _GAP_PX
-    columns = min(_COLUMNS, len(told))
+    columns = max(2, min(_COLUMNS, len(told)))  # two have room for the title
     width = _GAP_PX + columns * (w + _GAP_PX)
     sheet = Image.new("RGB", (width, top + band * -(-len(told) // _COLUMNS)), _PAPER)
     draw = ImageDraw.Draw(sheet)
@@ -115,6 +115,8 @@ def _write_title(draw: ImageDraw.ImageDraw, title: Title, x: int) -> None:
 
 def _state(film: Film, moment: int) -> str:
     recording = film.recording
+    if recording.time_s[-1] == recording.time_s[0]:  # poses, not a motion
+        return ""
     rise_cm = 100 * film.rise_m(moment)
     return (
         f"{recording.time_s[moment] - recording.time_s[0]:.1f} s   "

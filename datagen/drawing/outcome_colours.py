@@ -22,7 +22,7 @@ class Look:
 _BASE, _ARM, _PATH, _PHYSICS = "base", "hand and arm", "path", "execution"
 
 LOOKS: dict[str, Look] = {
-    "success": Look("success", "#0a9148", "o", "lifted and held; for plan: a whole plan"),
+    "success": Look("success", "#0a9148", "o", "the arm takes the target from there"),
     "base_collision": Look(_BASE, "#6b6b6b", "s", "the robot does not fit there"),
     "out_of_reach": Look(_BASE, "#c2c2c2", "s", "the arm is too short"),
     "no_grasp": Look(_ARM, "#86d3e3", "^", "no grasp is free for the hand alone"),

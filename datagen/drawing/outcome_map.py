@@ -12,7 +12,8 @@ from datagen.drawing.outcome_colours import LOOKS
 from schemas.fields import OUTCOMES
 from workers.geometry.mesh import F64
 
-_DOT, _FAINT_DOT, _LEGEND_DOT = 34, 12, 70  # areas in points^2; what is merely far away recedes
+_DOT, _LEGEND_DOT = 34, 70  # areas in points^2
+_RECEDING = {"out_of_reach": 12, "base_collision": 18}  # what fills most of a grid and says little
 _REACH_COLOUR = "#1b3a6b"
 
 
@@ -21,7 +22,7 @@ def draw_outcomes(axes: Axes, base_xy_m: F64, outcome: Any, clear: Any) -> None:
     _veil(axes)
     for code, name in enumerate(OUTCOMES):
         look = LOOKS[name]
-        size = _FAINT_DOT if name == "out_of_reach" else _DOT
+        size = _RECEDING.get(name, _DOT)
         for fits, face in ((True, look.colour), (False, "none")):
             rows = (outcome == code) & (clear == fits)
             axes.scatter(
@@ -63,7 +64,7 @@ def draw_outcome_legend(axes: Axes, outcome: Any) -> None:
     axes.set_axis_off()
     counts = np.bincount(np.asarray(outcome, np.int64), minlength=len(OUTCOMES))
     axes.set_xlim(0, 1)
-    axes.set_ylim(1, 0)
+    axes.set_ylim(1.07, -0.04)
     groups = list(dict.fromkeys(look.group for look in LOOKS.values()))
     rows = len(LOOKS) + len(groups)
     y, group = 0.0, ""

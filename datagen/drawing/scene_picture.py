@@ -36,7 +36,7 @@ def draw_scene_picture(
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3, width_ratios=(1.3, 1, 1.12))
     figure.suptitle(title, fontsize=14)
-    _draw_frame(axes[0, 0], frame)
+    draw_frame(axes[0, 0], frame)
     _draw_depth(figure, axes[1, 0], frame)
 
     centre = np.asarray(record["target_center_m"], np.float64)
@@ -80,7 +80,8 @@ def object_outlines(recalled: RecalledScene) -> list[F64]:
     return outlines
 
 
-def _draw_frame(axes: Axes, frame: Frame) -> None:
+def draw_frame(axes: Axes, frame: Frame) -> None:
+    """The RGB image with the target outlined."""
     axes.imshow(frame.rgb)
     target = frame.body == 1
     if target.any():
@@ -127,7 +128,7 @@ def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples
         f"room       {record['room_type']} ({record['room_id']})",
         f"support    {record['support_type']}, {height_m:.3f} m high",
         f"target     {target.name}, {1000 * target.mass_kg:.0f} g",
-        *_wrapped("clutter    ", clutter),
+        *wrapped("clutter    ", clutter),
         f"settled    {int(record['settle_steps'])} steps, then {speed_mm:.2f} mm/s, {depth_mm:.2f} mm deep",
         f"redraws    {redraws}",
         f"frame      sees {100 * float(record['target_visible_fraction']):.0f}% of the target",
@@ -140,7 +141,8 @@ def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples
     axes.text(0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=10, transform=axes.transAxes)
 
 
-def _wrapped(head: str, text: str, width: int = 62) -> list[str]:
+def wrapped(head: str, text: str, width: int = 62) -> list[str]:
+    """Text in lines of about `width` characters behind a head."""
     words, lines = text.split(" "), [head]
     for word in words:
         if len(lines[-1]) + len(word) > width:

@@ -1,0 +1,77 @@
+"""What `datagen show` can draw of one scene, each with the lines that go with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.drawing.arm_picture import best_success, draw_arm_picture, robots_of
+from datagen.drawing.scene_picture import best_clear, draw_scene_picture
+from schemas.fields import SceneRows
+from schemas.identity import Stream, generator
+from schemas.specification import Specification
+from workers.rendering.frame import Frame
+from workers.robots import open_robot
+from workers.scenes.draw import render_frame
+from workers.scenes.recall import RecalledScene
+
+Lines = list[tuple[str, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A stored scene that is to be drawn."""
+
+    run: str
+    spec: Specification
+    rows: SceneRows
+    recalled: RecalledScene
+
+    @property
+    def title(self) -> str:
+        return f"{self.run}, scene {self.recalled.index}"
+
+    @property
+    def frame(self) -> Frame:
+        """The RGB-D frame, rendered again."""
+        rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
+        return render_frame(self.spec.observation, self.recalled.stage, self.recalled.camera, rng)
+
+    def place(self, row: int) -> str:
+        """Where a candidate's base is."""
+        x, y = self.rows.samples["base_xy_m"][row]
+        return f"({x:.3f}, {y:.3f}) m"
+
+    @property
+    def target(self) -> str:
+        record = self.rows.record
+        return f"{self.recalled.models[0].name} on {record['support_type']}, {record['room_type']}"
+
+
+def draw_heuristic(shown: Shown, out: Path) -> Lines:
+    """Frame, depth, floor plans by label and by score, cloud, numbers."""
+    record, samples = shown.rows.record, shown.rows.samples
+    draw_scene_picture(shown.title, shown.recalled, shown.frame, record, samples, out)
+    score, label = samples["heuristic_score"], samples["label"]
+    best = best_clear(score, samples["base_is_clear"])
+    return [
+        ("positive", f"{int(label.sum())} of {len(label)} candidates"),
+        (
+            "best clear base",
+            "none is clear" if best is None else f"{shown.place(best)}, H = {score[best]:.3f}",
+        ),
+    ]
+
+
+def draw_arm(shown: Shown, out: Path) -> Lines:
+    """Frame, outcome map beside score map, grasps, numbers."""
+    record, samples = shown.rows.record, shown.rows.samples
+    assert shown.spec.arm is not None
+    name = shown.spec.arm.robot
+    robots = [open_robot(name, reach_m, height_m) for reach_m, height_m in robots_of(samples)]
+    draw_arm_picture(shown.title, shown.recalled, shown.frame, record, samples, robots, out)
+    label, best = samples["label"], best_success(samples)
+    return [
+        ("positive", f"{int(label.sum())} of {len(label)} candidates"),
+        ("best success", "none" if best is None else f"candidate {best} at {shown.place(best)}"),
+    ]

@@ -1,0 +1,146 @@
+"""One candidate of a stored scene, tried again as its label source tried it, with the poses kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from datagen.drawing.film import Told, told_moments
+from schemas.cost import StageClock
+from schemas.identity import Stream, generator
+from schemas.specification import Specification
+from workers.bases.candidates import Candidates
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse
+from workers.labels.trials import (
+    ArmInScene,
+    CandidateTrial,
+    arm_in_scene,
+    draw_disturbances,
+    try_candidate,
+)
+from workers.motion.plan import MotionPlan
+from workers.motion.scene import pose_of_base
+from workers.motion.surroundings import surroundings
+from workers.robots.robot import Robot
+from workers.scenes.scene import SettledScene
+from workers.trials.trial import Recording, TrialResult
+
+_STEP_S = 0.05  # between the moments of a plan that was not executed
+_STEP_RAD = 0.05  # that a plan advances meanwhile
+_TRIES = 7  # poses shown of an arm that found no plan
+
+
+@dataclass(frozen=True, eq=False)
+class Retrial:
+    """What happened to a candidate. `recording` holds a trial, a plan, or poses that were tried."""
+
+    robot: Robot
+    T_world_base: F64  # (4, 4), where the mount truly was
+    trial: CandidateTrial
+    shown: int | None  # row of `trial.results` that the recording is of; None where none was executed
+    recording: Recording
+    told: Told  # the moments that matter
+
+    @property
+    def moves(self) -> bool:
+        """Whether the recording is a motion, and not poses that were tried."""
+        return bool(self.recording.time_s[-1] > self.recording.time_s[0])
+
+    @property
+    def result(self) -> TrialResult | None:
+        """The execution that is shown."""
+        return None if self.shown is None else self.trial.results[self.shown]
+
+
+def try_again(scene: SettledScene, candidates: Candidates, row: int, spec: Specification) -> Retrial:
+    """Plan, and for `sim` execute, candidate `row`; the same outcome as stored, with its poses.
+
+    Of several executions the last that ended as the candidate did is shown.
+    """
+    at = arm_in_scene(scene, candidates, row, spec, StageClock())
+    trial = try_candidate(at, candidates, row, spec, record=True)
+    T_world_base = pose_of_base(
+        candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, scene.target_center_m
+    )
+    alike = [k for k, result in enumerate(trial.results) if result.outcome == trial.outcome]
+    shown = alike[-1] if alike else None
+    recording = None if shown is None else trial.results[shown].recording
+    if shown is not None and recording is not None:
+        disturbance = at.arm.disturbance
+        if disturbance is not None:
+            rng = generator(spec.seed, Stream.DISTURBANCE, scene.index, scene.retry, row)
+            drawn = draw_disturbances(disturbance, scene.T_world_object[0], rng)
+            T_world_base = T_world_base @ drawn[shown].T_base_moved
+        kept = _with_sense(recording)
+        return Retrial(at.robot, T_world_base, trial, shown, kept, told_moments(kept))
+    if trial.plan is not None:
+        planned = planned_motion(at.robot, trial.plan, T_world_base, scene.T_world_object)
+        return Retrial(at.robot, T_world_base, trial, None, planned, told_moments(planned))
+    poses, told = _tried_poses(at, trial, T_world_base)
+    return Retrial(at.robot, T_world_base, trial, None, poses, told)
+
+
+def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_object: F64) -> Recording:
+    """A plan as if it were executed without a flaw: the target goes with the hand once it is grasped."""
+    q, phases = [plan.q_reach_rad[:1]], ["reach"]
+    for phase, path in (
+        ("reach", plan.q_reach_rad),
+        ("approach", plan.q_approach_rad),
+        ("lift", plan.q_lift_rad),
+    ):
+        for start, end in pairwise(path):
+            steps = max(1, int(np.ceil(np.abs(end - start).max() / _STEP_RAD)))
+            q.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
+            phases += [phase] * steps
+    q_rad = np.concatenate(q)
+    poses = np.tile(T_world_object, (len(q_rad), 1, 1, 1))
+    T_tcp_target = inverse(T_world_base @ robot.T_base_tcp(plan.q_approach_rad[-1])) @ T_world_object[0]
+    for k, phase in enumerate(phases):
+        if phase == "lift":
+            poses[k, 0] = T_world_base @ robot.T_base_tcp(q_rad[k]) @ T_tcp_target
+    opening_m = np.full(len(q_rad), plan.opening_m)
+    return Recording(
+        np.arange(len(q_rad), dtype=np.float64) * _STEP_S, q_rad, opening_m, poses, tuple(phases)
+    )
+
+
+def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Told]:
+    """The tucked arm, and where planning failed later the arm at grasps that it could have taken."""
+    robot = at.robot
+    q_rad, opening_m, words = [robot.homes_rad[0]], [robot.gripper.max_opening_m], ["tucked"]
+    if trial.report is not None:
+        planning = at.planning
+        around = surroundings(planning, T_world_base)
+        T_base_tcp = np.matmul(inverse(T_world_base), planning.T_world_tcp)
+        distance, seeds = planning.moving.table.nearest(T_base_tcp, planning.params.ik_seeds)
+        for k in np.argsort(distance, kind="stable").tolist():
+            found = (robot.ik(T_base_tcp[k], seed) for seed in seeds[k])
+            q = next((q for q in found if q is not None), None)
+            if q is None:
+                continue
+            blocked = around.is_base_stuck or around.first_arm_blocked(q[None], is_target_held=False) == 0
+            q_rad.append(q)
+            opening_m.append(float(planning.opening_m[k]))
+            words.append("the arm collides here" if blocked else "the arm is free here")
+            if len(words) > _TRIES:
+                break
+    n = len(words)
+    poses = np.tile(at.scene.T_world_object, (n, 1, 1, 1))
+    recording = Recording(np.zeros(n), np.stack(q_rad), np.array(opening_m), poses, ("reach",) * n)
+    return recording, tuple(enumerate(words))
+
+
+def _with_sense(recording: Recording) -> Recording:
+    """The part before any number stopped being finite: physics that lost its sense cannot be drawn."""
+    finite = np.isfinite(recording.q_rad).all(1) & np.isfinite(recording.T_world_object).all((1, 2, 3))
+    n = int(np.argmin(np.append(finite, False)))
+    return Recording(
+        recording.time_s[:n],
+        recording.q_rad[:n],
+        recording.opening_m[:n],
+        recording.T_world_object[:n],
+        recording.phase[:n],
+    )
