@@ -9,7 +9,6 @@ import numpy as np
 
 from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import translation
-from workers.robots.hulls import shape_part
 from workers.robots.robot import Robot
 from workers.robots.urdf import Joint, Tree, read_urdf
 
@@ -90,13 +89,13 @@ def _body(
     T_parent_child: F64,
     robot: Robot,
 ) -> MovingBody:
+    shapes = dict(zip(robot.link_names, robot.link_parts_m, strict=True))
     parts: list[F32] = []
     mass, moment, about_origin = 0.0, np.zeros(3), np.zeros((3, 3))
     for name, T in rigid:
         link = tree.link(name)
-        for shape in link.collisions:
-            corners = shape_part(shape, 1.0)
-            parts.append((corners @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+        for part in shapes.get(name, ()):
+            parts.append((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
         if link.inertial is not None:
             centre = T[:3, :3] @ link.inertial.centre_m + T[:3, 3]
             mass += link.inertial.mass_kg

@@ -13,6 +13,7 @@ from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Robot
 from workers.settling.sapien_bodies import add_object, convex_shape, pose_of, sapien_pose
 from workers.trials.articulation import Articulation
+from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
@@ -26,9 +27,6 @@ with warnings.catch_warnings():
 _THING, _STILL, _PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
 _ARM, _SHOULDER, _CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
-# Drives of the fingers: N/m and N s/m. Stiff, so that an object's weight along the closing axis moves
-# it by a millimetre or two against the hand.
-FINGER_STIFFNESS, FINGER_DAMPING = 4000.0, 200.0
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 15, 1
 # PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
 CONTACT_OFFSET_M = 0.005

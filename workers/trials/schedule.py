@@ -2,41 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from schemas.specification import TrialParams
 from workers.geometry.mesh import F64
-from workers.motion.plan import MotionPlan
-from workers.robots.robot import Robot
 
-# Share of the joints' speed limits at which the arm travels: what arms are run at beside people and things.
-SPEED_SHARE = 0.5
 # From rest to that speed. A joint's speed may jump by what it gains in a control period.
 SPEED_UP_S = 0.25
 _GRID_RAD = 0.02  # spacing of the points at which speeds are decided
 _SAME_RAD = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Schedule:
-    """Joints at every control tick, from the first to the last of each motion."""
-
-    reach_rad: F64  # (N, A)
-    approach_rad: F64  # (N, A)
-    lift_rad: F64  # (N, A)
-
-
-def schedule_of(plan: MotionPlan, robot: Robot, params: TrialParams) -> Schedule:
-    """The plan in time: the reach within the limits, approach and lift in at least their seconds."""
-    speed = robot.speed_limit_radps * SPEED_SHARE
-    period_s = params.control_period_s
-    return Schedule(
-        timed(plan.q_reach_rad, speed, period_s, 0.0),
-        timed(plan.q_approach_rad, speed, period_s, params.approach_s),
-        timed(plan.q_lift_rad, speed, period_s, params.lift_s),
-    )
 
 
 def timed(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -> F64:

@@ -27,8 +27,8 @@ PHASES = ("reach", "approach", "close", "lift", "hold")
 
 def box(mass_kg: float = 0.3) -> HandMade:
     """A box on the table, one more beside it."""
-    return scene_with([box_model("target", (0.05, 0.05, 0.12), mass_kg), box_model("other", (0.06, 0.06, 0.1))],
-                      [(0.0, 0.0), (0.0, 0.25)])  # fmt: skip
+    target, other = box_model("target", (0.05, 0.05, 0.12), mass_kg), box_model("other", (0.06, 0.06, 0.1))
+    return scene_with([target, other], [(0.0, 0.0), (0.0, 0.25)])
 
 
 def trial(
