@@ -98,7 +98,8 @@ def surface_points(solid: Solid, n: int, rng: np.random.Generator) -> tuple[F64,
 def _outside(solid: Solid, points_m: F64) -> npt.NDArray[np.bool_]:
     """Which points (N, 3) lie in no part's interior."""
     height = points_m @ solid.planes[:, :3].T + solid.planes[:, 3]
-    return (np.maximum.reduceat(height, solid.first, axis=1) > -_ON_SURFACE_M).all(axis=1)
+    depth = -np.maximum.reduceat(height, solid.first, axis=1)  # (N, P) below each part's surface
+    return depth.max(axis=1) < _ON_SURFACE_M
 
 
 def cone_directions(normals: F64, rng: np.random.Generator) -> F64:
@@ -114,9 +115,10 @@ def cone_directions(normals: F64, rng: np.random.Generator) -> F64:
 def perpendicular(axes: F64) -> tuple[F64, F64]:
     """Two unit vectors (N, 3) each, at right angles to the unit axes (N, 3) and to one another."""
     other = np.eye(3)[np.abs(axes).argmin(axis=1)]
-    u = np.cross(axes, other)
+    u: F64 = np.cross(axes, other)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, np.cross(axes, u)
+    v: F64 = np.cross(axes, u)
+    return u, v
 
 
 def contact_pairs(solid: Solid, points_m: F64, directions: F64, max_width_m: float) -> Contacts:

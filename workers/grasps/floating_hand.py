@@ -137,10 +137,9 @@ def _slips(
         scene.step()
     before_m = np.array([pose_of(body)[:3, 3] for body in bodies])
     forces_n = (mass_kg * pull_mps2).astype(np.float32)
-    no_torque = np.zeros(3, np.float32)
     for _ in range(round(test.pull_s / test.timestep_s)):
         for body, force_n in zip(bodies, forces_n, strict=True):
-            body.add_force_torque(force_n, no_torque)
+            body.add_force_torque(force_n, [0.0, 0.0, 0.0])
         scene.step()
     after_m = np.array([pose_of(body)[:3, 3] for body in bodies])
     slip_m = np.linalg.norm(after_m - before_m, axis=1)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from schemas.specification import GraspParams
-from workers.grasps.library import scored_grasps
+from workers.grasps.keep import scored_grasps
 from workers.objects.convex import MAX_TARGET_MASS_KG
 from workers.objects.model import ObjectModel
 from workers.robots.robot import Gripper
