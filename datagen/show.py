@@ -46,9 +46,7 @@ def show(
     if of_trial and spec.arm is None:
         problem = f"{spec.label_source} labels come without trials"
         mend = "Give a run of plan or sim, or --out FILE.png alone"
-        raise InputError(
-            run, "--trial" if trial else "--out", problem, "Give a run of plan or sim, or a .png"
-        )
+        raise InputError(run, "--trial" if trial is not None else "--out", problem, mend)
     refuse_missing_packages(spec.label_source)
     rows = read_scene(opened, scene)
     world = open_world(

@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from datagen.drawing.film import Film, pictures
+from datagen.drawing.film_camera import Shot
 from workers.geometry.mesh import U8
 
-# Views on the sheet and in motion, (width, height).
+# Sizes of the far and the near view, (width, height), that suit a sheet and a film.
 SHEET_WIDE_PX, SHEET_NEAR_PX = (460, 345), (460, 276)
 MOTION_WIDE_PX, MOTION_NEAR_PX = (520, 400), (340, 400)
 
@@ -41,7 +42,7 @@ class Title:
 def write_sheet(film: Film, title: Title, out: Path) -> None:
     """Moments in rows of four: the far view, below it the near one."""
     told = film.told
-    (w, h), (_, near_h) = SHEET_WIDE_PX, SHEET_NEAR_PX
+    (w, h), (_, near_h) = _size(film.wide), _size(film.near)
     top = _TITLE_PX + _LINE_PX * len(title.lines) + _GAP_PX
     band = _CAPTION_PX + h + near_h + 2 * _GAP_PX
     columns = max(2, min(_COLUMNS, len(told)))  # two have room for the title
@@ -87,7 +88,7 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
 
 
 def _motion_frame(film: Film, title: Title, moment: int, wide: U8, near: U8) -> Image.Image:
-    (w, h), (near_w, _) = MOTION_WIDE_PX, MOTION_NEAR_PX
+    (w, h), (near_w, _) = _size(film.wide), _size(film.near)
     top = _TITLE_PX + _LINE_PX * len(title.lines) + _GAP_PX
     frame = Image.new("RGB", (w + near_w + 3 * _GAP_PX, top + h + _CAPTION_PX + 2 * _GAP_PX), _PAPER)
     draw = ImageDraw.Draw(frame)
@@ -111,6 +112,10 @@ def _write_title(draw: ImageDraw.ImageDraw, title: Title, x: int) -> None:
     draw.text((x + 32, 11), title.head, _INK, _font(22, bold=True))
     for k, line in enumerate(title.lines):
         draw.text((x, _TITLE_PX + 4 + k * _LINE_PX), line, _PALE, _font(15))
+
+
+def _size(shot: Shot) -> tuple[int, int]:
+    return shot.camera.width_px, shot.camera.height_px
 
 
 def _state(film: Film, moment: int) -> str:
