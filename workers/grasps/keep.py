@@ -61,12 +61,6 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> 
     return found
 
 
-def is_kept(model: ObjectModel, gripper: Gripper, params: GraspParams) -> bool:
-    """Whether `scored_grasps` will answer without physics."""
-    digest = content_digest(model, gripper, params)
-    return digest in _kept or (cache_folder() / "grasps" / f"{_file_digest(digest)}.npz").is_file()
-
-
 def content_digest(model: ObjectModel, gripper: Gripper, params: GraspParams) -> str:
     """sha256 over all that decides the grasps: it seeds their draws and names their file."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)

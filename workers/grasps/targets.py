@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from schemas.specification import GraspParams
 from workers.grasps.keep import scored_grasps
@@ -65,32 +68,68 @@ def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> G
     )
 
 
+class Targets:
+    """The objects of a source that can be targets of one gripper; each is worked out when first asked for.
+
+    Of a family of sizes at most `PER_FAMILY` are: the smallest and the largest that are graspable, and
+    so on inwards. What lies between is never worked out.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        load: Callable[[str], ObjectModel],
+        gripper: Gripper,
+        params: GraspParams,
+    ) -> None:
+        self._load, self._gripper, self._params = load, gripper, params
+        self._families: dict[str, list[str]] = {}
+        for name in sorted(names):
+            self._families.setdefault(_family(name), []).append(name)
+        self._known: dict[str, list[str]] = {}
+
+    def is_target(self, name: str) -> bool:
+        """Whether the object of that name can be a target. Raises KeyError for an unknown name."""
+        family = _family(name)
+        if family not in self._known:
+            self._known[family] = self._graspable(self._families[family])
+        return name in self._known[family]
+
+    def draw(self, rng: np.random.Generator) -> str | None:
+        """A target, each with the same chance; None where there is none.
+
+        Looks at objects in drawn order until one is a target, so that a short run pays for few.
+        """
+        names = [name for family in self._families.values() for name in family]
+        return next((names[k] for k in rng.permutation(len(names)) if self.is_target(names[k])), None)
+
+    def names(self) -> list[str]:
+        """All targets, sorted; works out every object.
+
+        Processes that start together begin at different places and find what the others have kept.
+        """
+        families = list(self._families.values())
+        begin = os.getpid() % max(len(families), 1)
+        found = [n for f in (*families[begin:], *families[:begin]) for n in f if self.is_target(n)]
+        return sorted(found)
+
+    def _graspable(self, names: Sequence[str]) -> list[str]:
+        sizes = sorted((self._load(name) for name in names), key=lambda model: (model.radius_m, model.name))
+        inwards = [sizes[k // 2] if k % 2 == 0 else sizes[-1 - k // 2] for k in range(len(sizes))]
+        found: list[str] = []
+        for model in inwards:
+            if len(found) < PER_FAMILY and graspability(model, self._gripper, self._params).is_target:
+                found.append(model.name)
+        return found
+
+
 def targets_of(
     names: Sequence[str], load: Callable[[str], ObjectModel], gripper: Gripper, params: GraspParams
 ) -> list[str]:
-    """The names, sorted, of the objects that can be targets of this gripper.
-
-    At most `PER_FAMILY` of each family of sizes: the smallest and the largest that are graspable, and
-    so on inwards. What lies between is not worked out.
-    """
-    families: dict[str, list[str]] = {}
-    for name in sorted(names):
-        match = _FAMILY.match(name)
-        families.setdefault(f"{match[1]} {match[2]}" if match else name, []).append(name)
-    # Workers that start together begin at different places, and find what the others have kept.
-    groups = list(families.values())
-    begin = os.getpid() % max(len(groups), 1)
-    chosen: list[str] = []
-    for group in (*groups[begin:], *groups[:begin]):
-        inwards = sorted((load(name) for name in group), key=lambda model: (model.radius_m, model.name))
-        ends = [inwards[k // 2] if k % 2 == 0 else inwards[-1 - k // 2] for k in range(len(inwards))]
-        chosen += _first_graspable(ends, gripper, params)
-    return sorted(chosen)
+    """The names, sorted, of the objects that can be targets of this gripper (`Targets`)."""
+    return Targets(names, load, gripper, params).names()
 
 
-def _first_graspable(models: Sequence[ObjectModel], gripper: Gripper, params: GraspParams) -> list[str]:
-    found: list[str] = []
-    for model in models:
-        if len(found) < PER_FAMILY and graspability(model, gripper, params).is_target:
-            found.append(model.name)
-    return found
+def _family(name: str) -> str:
+    match = _FAMILY.match(name)
+    return f"{match[1]} {match[2]}" if match else name

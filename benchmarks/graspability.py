@@ -1,0 +1,123 @@
+"""Which objects a gripper can take from a table: one line an object, and the list of targets.
+
+    python -m benchmarks.graspability [--objects ycb:DIR] [--robot panda] [--stability] [--cold]
+
+`free`: poses in which the open hand and its last 8 cm of way touch nothing of the object; `clear`: of
+these, poses that also keep above what the upright object stands on; `scored`: varied ones of them, with
+their flips, tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
+mean share of held trials. CPU seconds are those of this process; 0.0 where the grasps were kept from before.
+`--cold` works everything out anew. `--stability` also repeats the trials with half the timestep and counts
+those that end differently.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.specification import GraspParams
+from workers.grasps.floating_hand import HandTest, held_trials
+from workers.grasps.keep import scored_grasps
+from workers.grasps.targets import Graspability, Targets, graspability
+from workers.objects import open_objects
+from workers.objects.model import ObjectModel
+from workers.robots import open_robot, robot_limits
+from workers.robots.robot import Gripper
+
+_STABILITY_GRASPS = 24  # of each object
+_VARIANTS = {
+    "20 position and 2 velocity iterations, 1/240 s (as used)": HandTest(),
+    "10 and 1, 1/240 s": replace(HandTest(), position_iterations=10, velocity_iterations=1),
+    "40 and 8, 1/240 s": replace(HandTest(), position_iterations=40, velocity_iterations=8),
+    "20 and 2, 1/480 s": replace(HandTest(), timestep_s=1 / 480),
+}
+
+
+def main() -> None:
+    """Print the table, the targets, and how stable the trials are."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--objects", default="builtin")
+    parser.add_argument("--robot", default="panda")
+    parser.add_argument("--cold", action="store_true")
+    parser.add_argument("--stability", action="store_true")
+    options = parser.parse_args()
+    if options.cold:
+        os.environ["DATAGEN_CACHE"] = tempfile.mkdtemp(prefix="datagen-graspability-")
+    source = open_objects(options.objects)
+    heights_m = robot_limits(options.robot).base_height_m or (0.7, 0.7)
+    gripper = open_robot(options.robot, None, heights_m[0]).gripper
+    models = [source.load(name) for name in source.names()]
+    print_table(models, gripper, GraspParams())
+    targets = Targets(source.names(), source.load, gripper, GraspParams()).names()
+    print(f"\n{len(targets)} targets: {', '.join(targets)}")
+    if options.stability:
+        print_stability(models, gripper)
+
+
+def print_table(models: list[ObjectModel], gripper: Gripper, params: GraspParams) -> None:
+    """One line an object, as Markdown, and the totals."""
+    print("| object | parts | kg | free | clear | scored | good | held | verdict | CPU s |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    begin, wall = time.process_time(), time.perf_counter()
+    trials = 0
+    for model in models:
+        start = time.process_time()
+        row: Graspability = graspability(model, gripper, params)
+        spent_s = time.process_time() - start
+        trials += 3 * (row.n_scored + 1) // 2
+        print(
+            f"| {model.name} | {len(model.convex_parts_m)} | {model.mass_kg:.2f} | {row.n_free} "
+            f"| {row.n_clear} | {row.n_scored} | {row.n_clear_held} | {row.held_share:.2f} | {row.reason or 'target'} "
+            f"| {spent_s:.1f} |",
+            flush=True,
+        )
+    cpu_s, wall_s = time.process_time() - begin, time.perf_counter() - wall
+    print(f"\n{len(models)} objects: {cpu_s:.0f} CPU s, {wall_s:.0f} s, about {trials} trials")
+
+
+def print_stability(models: list[ObjectModel], gripper: Gripper) -> None:
+    """Share of trials, and of grasps' verdicts, that change when the timestep is halved."""
+    print("\n| physics | trials changed by half the step | verdicts changed | trials/CPU s |")
+    print("| --- | --- | --- | --- |")
+    for label, test in _VARIANTS.items():
+        changed: list[float] = []
+        verdicts: list[float] = []
+        trials, spent_s = 0, 0.0
+        for model in models:
+            scored = scored_grasps(model, gripper, GraspParams())
+            # Not the best ones only: evenly over a list that is sorted by score.
+            some = np.linspace(0, len(scored) - 1, min(_STABILITY_GRASPS, len(scored))).astype(int)
+            if len(some) == 0:
+                continue
+            T, opening_m = scored.T_object_tcp[some], scored.opening_m[some].astype(np.float64)
+            start = time.process_time()
+            held = [
+                held_trials(
+                    model.convex_parts_m,
+                    model.mass_kg,
+                    gripper,
+                    T,
+                    opening_m,
+                    np.random.Generator(np.random.PCG64(0)),
+                    replace(test, timestep_s=step_s),
+                )
+                for step_s in (test.timestep_s, test.timestep_s / 2)
+            ]
+            spent_s += (time.process_time() - start) / 3  # the halved step costs twice as much
+            trials += held[0].size
+            changed.append(float((held[0] != held[1]).mean()))
+            good = [h.mean(axis=1) >= GraspParams().min_score for h in held]
+            verdicts.append(float((good[0] != good[1]).mean()))
+        print(
+            f"| {label} | {np.mean(changed):.1%} | {np.mean(verdicts):.1%} | {trials / spent_s:.0f} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
