@@ -80,7 +80,7 @@ def specify(
     spec = validated(fields, place)
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
         problem = f"a whole grid is not only {spec.candidates.within}"
-        raise InputError("--candidates", spec.candidates.within, problem, "Give --candidates-per-scene 60")
+        raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
     if chosen is not None:
         refuse_unsuited(spec, chosen, place, "Correct the values, or take another --robot")
     for field, name, registry in (

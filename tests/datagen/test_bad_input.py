@@ -35,6 +35,13 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--candidates-per-scene ٣", ["--candidates-per-scene"]),
     ("--candidates-per-scene ²", ["--candidates-per-scene", "625"]),
     ("--robots-per-scene 0", ["robots_per_scene", "0"]),
+    ("--candidates all", ["--candidates", "all", "in-range"]),
+    ("--robot hal", ["--robot", "hal", "panda-scaled"]),
+    ("--perturb 3", ["--perturb", "3", "heuristic", "sim"]),
+    ("--perturb often", ["--perturb", "often"]),
+    ("--scenes-from {missing}", ["{missing}", "no such folder"]),
+    ("--scenes-from {file}", ["{file}"]),
+    ("--scenes-from {foreign}", ["{foreign}", "not a run"]),
     ("--houses castle", ["--houses", "castle", "builtin"]),
     ("--houses {empty}", ["--houses", "Write KIND:{empty}", "procthor"]),
     ("--objects {empty}", ["--objects", "Write KIND:{empty}", "ycb"]),
@@ -76,6 +83,17 @@ def test_a_bad_option(
     refused(arguments, capsys, *(word.format(**places) for word in words))
     assert files_of(places["out"].parent) == before
     assert not places["out"].exists() and not places["missing"].exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"), [("grid", "60"), ("clear", "grid"), ("in-range", "grid")], ids=str
+)
+def test_a_set_of_candidates_that_their_number_contradicts(
+    kind: str, number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = ["--candidates", kind, "--candidates-per-scene", number]
+    refused(["submit", "heuristic", "--n", "16", "--out", str(tmp_path / "out"), *chosen], capsys, kind)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -137,6 +155,10 @@ CONFIGS: list[tuple[str, list[str]]] = [
     ("seed = -1", ["seed"]),
     ("seed = true\nsplit = 'none'", ["split"]),
     ("seed = " + "1" * 5000, ["not TOML"]),
+    ("[candidates]\nwithin = 'near'", ["candidates.within", "in-range"]),
+    ("[candidates]\nper_scene = 'grid'\nwithin = 'clear'", ["--candidates-per-scene 60"]),
+    ("[arm]\nrobot = 'panda'", ["arm", "heuristic has no arm"]),
+    ("[scenes_from]\nspec_hash = 'a'", ["scenes_from", "command line"]),
     ("label_source = 'sim'", ["label_source", "command line"]),
     ("[houses]\nkind = 'builtin'", ["houses", "command line"]),
     ("[engines]\nsapien = '2'", ["engines", "command line"]),

@@ -1,0 +1,239 @@
+"""`--scenes-from`: the scenes and candidates of a run labelled again, and what is refused beside it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen import cli
+from schemas.run import Run
+from schemas.run_records import QuarantineRecord
+from tests.refusals import refused
+from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
+from tests.workers.objects.toy_set import write_bundle
+
+SCENES = 6
+N = SCENES * PER_SCENE
+OWN = ("sample_id", "label_source", "label_version")  # what a run says of itself
+OTHER_RULE = "[heuristic]\nmu = 0.7\ndistance = 'mount-over-reach'\n"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six scenes, one a shard. Tests only read it."""
+    return make_small_run(tmp_path_factory.mktemp("source") / "run", N)
+
+
+@pytest.fixture(scope="module")
+def again(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same candidates by another rule. Tests only read it."""
+    folder = tmp_path_factory.mktemp("again")
+    (folder / "rule.toml").write_text(OTHER_RULE)
+    assert cli.run(again_arguments(source, folder / "run", N, "--config", str(folder / "rule.toml"))) == 0
+    return folder / "run"
+
+
+def again_arguments(source: Path, out: Path, n: int, *more: str) -> list[str]:
+    return [
+        "submit", "heuristic", "--n", str(n), "--out", str(out), "--scenes-from", str(source),
+        "--workers", "0", *more,
+    ]  # fmt: skip
+
+
+def test_scene_and_candidate_rows_are_the_stored_ones_and_labels_are_new(source: Path, again: Path) -> None:
+    before, after = arrays_of(source), arrays_of(again)
+    assert before.keys() == after.keys()
+    for name in before.keys() - {*OWN, "heuristic_score", "label"}:
+        np.testing.assert_array_equal(before[name], after[name], err_msg=name)
+        assert before[name].dtype == after[name].dtype
+    assert (before["label"] != after["label"]).any()
+    ids = {row.tobytes() for arrays in (before, after) for row in arrays["sample_id"]}
+    assert len(ids) == 2 * N
+
+
+def test_the_specification_is_the_sources_with_another_rule(source: Path, again: Path) -> None:
+    before, after = Run.open(source).manifest.spec, Run.open(again).manifest.spec
+    assert after.scenes_from is not None and after.scenes_from.spec_hash == before.hash()
+    assert after.heuristic.mu == 0.7 and after.hash() != before.hash()
+    same = {"heuristic": before.heuristic, "scenes_from": None}
+    assert after.model_copy(update=same) == before  # equal engines among the rest
+    assert Run.open(again).manifest.sources["scenes_from"] == Run.open(source).storage.url
+
+
+def test_the_same_rule_gives_the_same_labels_whatever_the_shards(source: Path, tmp_path: Path) -> None:
+    long = make_small_run(tmp_path / "long", 16 * PER_SCENE)  # two scenes a shard, the first six the same
+    short = tmp_path / "short"
+    assert cli.run(again_arguments(long, short, N)) == 0
+    layouts = [Run.open(place).layout.scenes_per_shard for place in (long, short)]
+    assert layouts == [2, 1]
+    before, after = arrays_of(source), arrays_of(short)
+    for name in before.keys() - {"sample_id"}:
+        np.testing.assert_array_equal(before[name], after[name], err_msg=name)
+
+
+def test_a_run_of_stored_scenes_is_itself_a_source_of_the_same_scenes(again: Path, tmp_path: Path) -> None:
+    third = tmp_path / "third"
+    assert cli.run(again_arguments(again, third, 2 * PER_SCENE)) == 0
+    specs = [Run.open(place).manifest.spec for place in (again, third)]
+    assert specs[0].scenes_hash == specs[1].scenes_hash
+    assert specs[0].heuristic == specs[1].heuristic  # what is not given is as in the source
+    np.testing.assert_array_equal(arrays_of(third)["label"], arrays_of(again)["label"][: 2 * PER_SCENE])
+
+
+def test_it_resumes_and_extends_like_any_run(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert cli.run(again_arguments(source, out, 2 * PER_SCENE)) == 0
+    assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
+    (out / "commits/000001.json").unlink()
+    assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
+    np.testing.assert_array_equal(arrays_of(out)["label"], arrays_of(source)["label"][: 4 * PER_SCENE])
+
+
+def test_more_than_the_source_has_is_refused_with_how_many_there_are(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    refused(again_arguments(source, out, N + 1), capsys, "--n", str(N + 1), f"has {N} committed")
+    assert not out.exists()
+    # A gap ends what can be used.
+    holey = tmp_path / "holey"
+    shutil.copytree(source, holey)
+    (holey / "commits/000002.json").unlink()
+    refused(again_arguments(holey, out, N), capsys, f"has {2 * PER_SCENE} committed")
+    assert cli.run(again_arguments(holey, out, 2 * PER_SCENE)) == 0
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--seed", "3"),
+        ("--split", "val"),
+        ("--candidates", "clear"),
+        ("--candidates-per-scene", "9"),
+        ("--robots-per-scene", "2"),
+        ("--settler", "pybullet"),
+        ("--renderer", "pybullet"),
+        ("--noise",),
+    ],
+)
+def test_what_decides_scenes_is_refused_beside_it(
+    more: tuple[str, ...], source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = refused(again_arguments(source, tmp_path / "run", N, *more), capsys, more[0], "--scenes-from")
+    assert f"error: {more[0]}: " in told
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "section", ["[candidates]\nper_scene = 9", "seed = 3", "[observation]\nn_points = 64"]
+)
+def test_such_sections_of_a_configuration_are_refused_too(
+    section: str, source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text(section)
+    arguments = again_arguments(source, tmp_path / "run", N, "--config", str(config))
+    refused(arguments, capsys, str(config), "--scenes-from")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_robot_of_another_reach_is_refused_with_how_to_make_scenes_for_it(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = again_arguments(source, tmp_path / "run", N, "--robot", "panda")
+    refused(arguments, capsys, str(source), "arm_reach_m", "submit heuristic --robot panda")
+    fitting = make_small_run(tmp_path / "fitting", PER_SCENE, "--robot", "panda")
+    assert cli.run(again_arguments(fitting, tmp_path / "run", PER_SCENE, "--robot", "panda")) == 0
+
+
+def test_a_place_without_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(again_arguments(tmp_path / "none", tmp_path / "run", N), capsys, str(tmp_path / "none"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, moved, other = (tmp_path / name for name in ("first", "moved", "other"))
+    for folder, names in ((first, "abcdefgh"), (other, "bcdefghi")):
+        folder.mkdir()
+        write_bundle(folder, *(f"{k:03d}_{name}" for k, name in enumerate(names)))
+    source = make_small_run(tmp_path / "source", PER_SCENE, "--objects", f"ycb:{first}")
+    first.rename(moved)
+    out = tmp_path / "run"
+    refused(again_arguments(source, out, PER_SCENE), capsys, str(first), "no such folder")
+    arguments = again_arguments(source, out, PER_SCENE, "--objects", f"ycb:{other}")
+    refused(arguments, capsys, "--objects", "the run was made with")
+    assert not out.exists()
+    assert cli.run(again_arguments(source, out, PER_SCENE, "--objects", f"ycb:{moved}")) == 0
+    assert Run.open(out).manifest.sources["objects"] == f"ycb:{moved}"
+
+
+def test_a_damaged_source_gives_its_shard_up_and_no_label(source: Path, tmp_path: Path) -> None:
+    damaged, out = tmp_path / "damaged", tmp_path / "run"
+    shutil.copytree(source, damaged, ignore=shutil.ignore_patterns("data.zarr"))
+    commit = Run.open(damaged).commit_of(3)
+    file = damaged / f"shards/000003/{commit.attempt}/points_m/c.0.0.0"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.chmod(0o644)
+    file.write_bytes(bytes(data))
+    assert cli.run(again_arguments(damaged, out, N)) == 1
+    run = Run.open(out)
+    assert run.quarantined() == {3} and len(run.committed()) == SCENES - 1
+    (record,) = run.quarantine_records()
+    assert isinstance(record, QuarantineRecord) and "points_m" in record.causes[-1]
+
+
+def test_the_audit_compares_runs_of_the_same_scenes(
+    source: Path, again: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = arrays_of(source), arrays_of(again)
+    report = json_of(capsys, ["audit", str(source), str(again)])
+    (account,) = report["sources"]
+    assert account["labels"] == 2 * N and report["ratios"] == []
+    (pair,) = report["pairs"]
+    assert (pair["said_by"]["run"], pair["true_by"]["run"]) == tuple(
+        Run.open(place).storage.url for place in (source, again)
+    )
+    said, true = a["label"] == 1, b["label"] == 1
+    assert pair["confusion"]["false_positive"] == int((said & ~true).sum())
+    assert pair["accuracy"] == pytest.approx((said == true).mean())
+    assert sum(group["count"] for group in pair["by_object"]) == N == pair["count"]
+    per_label_s = [
+        sum(commit.cost.wall_s for commit in Run.open(place).commits()) / N for place in (source, again)
+    ]
+    costs = pair["wall_s_per_correct_label"]
+    assert costs["true_by"] == pytest.approx(per_label_s[1])
+    assert costs["said_by"] == pytest.approx(per_label_s[0] / pair["accuracy"])
+    clear = json_of(capsys, ["audit", str(source), str(again), "--candidates", "clear"])
+    assert clear["candidates"] == "clear" and clear["pairs"][0]["count"] == int(a["base_is_clear"].sum())
+    assert cli.run(["audit", str(source), str(again), "--candidates", "in-range"]) == 0
+    assert "(in-range)" in capsys.readouterr().out
+
+
+def test_runs_of_other_scenes_and_a_run_twice_are_not_compared(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = make_small_run(tmp_path / "other", PER_SCENE, "--seed", "1")
+    report = json_of(capsys, ["audit", str(source), str(other), str(source)])
+    assert report["pairs"] == []
+
+
+@pytest.mark.parametrize("within", ["clear", "in-range"])
+def test_a_run_takes_only_the_asked_candidates_and_counts_redraws_for_want_of_them(
+    within: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = "[candidates]\narm_reach_m = {low = 0.55, high = 0.6}\nrobots_per_scene = 1\n"
+    config = CONFIG + (short if within == "in-range" else "")
+    run = make_small_run(tmp_path / "run", 3 * PER_SCENE, "--candidates", within, config=config)
+    arrays = arrays_of(run)
+    assert arrays["base_is_clear"].all()
+    if within == "in-range":
+        assert (arrays["mount_distance_m"] <= arrays["arm_reach_m"]).all()
+        assert json_of(capsys, ["audit", str(run)])["sources"][0]["redraws"]["no_base"] > 0
+    assert Run.open(run).manifest.spec.candidates.within == within
+    before = files_of(run, "commits")
+    assert cli.run(["submit", "heuristic", "--n", "8", "--out", str(run)]) == 2  # another specification
+    assert files_of(run, "commits") == before
