@@ -70,10 +70,10 @@ def print_table(models: list[ObjectModel], gripper: Gripper, params: GraspParams
         row: Graspability = graspability(model, gripper, params)
         spent_s = time.process_time() - start
         trials += 3 * (row.n_scored + 1) // 2
+        counts = f"{row.n_free} | {row.n_clear} | {row.n_scored} | {row.n_clear_held}"
         print(
-            f"| {model.name} | {len(model.convex_parts_m)} | {model.mass_kg:.2f} | {row.n_free} "
-            f"| {row.n_clear} | {row.n_scored} | {row.n_clear_held} | {row.held_share:.2f} | {row.reason or 'target'} "
-            f"| {spent_s:.1f} |",
+            f"| {model.name} | {len(model.convex_parts_m)} | {model.mass_kg:.2f} | {counts} "
+            f"| {row.held_share:.2f} | {row.reason or 'target'} | {spent_s:.1f} |",
             flush=True,
         )
     cpu_s, wall_s = time.process_time() - begin, time.perf_counter() - wall
