@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from workers.houses.house import House, HouseSource
 from workers.objects import open_objects
 from workers.objects.model import ObjectModel, ObjectSource
 from workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays
+
+if TYPE_CHECKING:
+    from workers.grasps.targets import Targets
 
 # Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
 _HOUSES_KEPT = 16
@@ -75,6 +79,35 @@ class World:
             model = self.objects.load(name)
             self._objects[name] = PreparedObject(model, object_rays(model))
         return self._objects[name]
+
+    def draw_target(self, rng: np.random.Generator) -> str:
+        """A target's name, each equally likely.
+
+        For an arm targets are what its gripper was found to hold. That takes seconds an object, the
+        first time on a machine, so only objects that are drawn are looked at. Raises InputError where
+        there is none.
+        """
+        if self.spec.arm is None:
+            return self.target_names[rng.integers(len(self.target_names))]
+        found = self._arm_targets.draw(rng)
+        if found is not None:
+            return found
+        raise InputError(
+            "--objects",
+            self.objects.kind,
+            f"none of {len(self.object_names)} objects can be grasped by {self.spec.arm.robot}",
+            "Add smaller or lighter objects, or take another robot",
+        )
+
+    @cached_property
+    def _arm_targets(self) -> Targets:
+        # Imported here: labels without an arm need neither robots nor grasps.
+        from workers.grasps.targets import Targets
+        from workers.robots import gripper_of
+
+        assert self.spec.arm is not None
+        gripper = gripper_of(self.spec.arm.robot)
+        return Targets(self.object_names, self.objects.load, gripper, self.spec.arm.grasps)
 
     def stage(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayStage:
         """A house with the named objects at these poses (K, 4, 4), ready for rays."""

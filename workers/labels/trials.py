@@ -21,7 +21,7 @@ from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse, translation, yaw_pose
 from workers.grasps.grasp import GraspSet
-from workers.grasps.library import grasps_of
+from workers.grasps.keep import grasps_of
 from workers.motion.candidate import plan_candidate
 from workers.motion.plan import MotionPlan, PlanReport
 from workers.motion.scene import PlanningScene, pose_of_base, prepare

@@ -12,7 +12,7 @@ from workers.robots.description import RobotDescription, RobotLimits
 
 if TYPE_CHECKING:
     from workers.robots.arm import Arm
-    from workers.robots.robot import Robot
+    from workers.robots.robot import Gripper, Robot
 
 ROBOTS: dict[str, str] = {
     "panda-scaled": "workers.robots.panda:PANDA_SCALED",
@@ -56,6 +56,13 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     # Pedestals of any height carry the same arm.
     scaled = reach_m if description.extension is not None else None
     return _built(name, scaled, 0.0).at_height(base_height_m)
+
+
+def gripper_of(name: str) -> Gripper:
+    """The gripper of a robot, which is the same at every reach and height."""
+    limits = robot_limits(name)
+    height_m = limits.base_height_m[0] if limits.base_height_m else 0.0
+    return open_robot(name, limits.reach_m[1], height_m).gripper
 
 
 def _description(name: str) -> RobotDescription:

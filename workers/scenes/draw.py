@@ -102,7 +102,7 @@ def _load_house(world: World, house_id: str) -> PreparedHouse:
 
 def _draw_names(world: World, rng: np.random.Generator) -> list[str]:
     """The target first, then clutter, all different."""
-    target = world.target_names[rng.integers(len(world.target_names))]
+    target = world.draw_target(rng)
     others = [name for name in world.object_names if name != target]
     clutter = rng.choice(len(others), size=world.spec.scene.n_clutter, replace=False)
     return [target, *(others[k] for k in clutter)]
