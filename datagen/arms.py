@@ -11,8 +11,8 @@ from workers.robots import robot_limits
 
 # Label sources that move an arm, and the distributions whose version can move bits of their labels.
 ARM_PACKAGES: dict[str, tuple[str, ...]] = {
-    "plan": ("coal", "mani_skill", "ompl", "pin", "sapien"),
-    "sim": ("coal", "mani_skill", "ompl", "pin", "sapien"),
+    "plan": ("coal", "mani_skill", "pin", "sapien"),
+    "sim": ("coal", "mani_skill", "pin", "sapien"),
 }
 # Sections of the arm that only some label sources have.
 _NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial", "disturbance"), "sim": ()}
