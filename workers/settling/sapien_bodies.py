@@ -41,6 +41,18 @@ def add_object(
     material: physx.PhysxMaterial,
 ) -> physx.PhysxRigidDynamicComponent:
     """A body that moves freely, of convex parts (V, 3) each in the object's frame, at a pose (4, 4)."""
+    body = object_body(parts_m, mass_kg, material)
+    entity = sapien.Entity()
+    entity.add_component(body)
+    entity.set_pose(sapien_pose(T_world_object))
+    scene.add_entity(entity)
+    return body
+
+
+def object_body(
+    parts_m: Sequence[F32], mass_kg: float, material: physx.PhysxMaterial
+) -> physx.PhysxRigidDynamicComponent:
+    """A body of convex parts (V, 3) each, in no scene yet."""
     body = physx.PhysxRigidDynamicComponent()
     for part in parts_m:
         body.attach(convex_shape(part, material))
@@ -50,10 +62,6 @@ def add_object(
     inertia = np.asarray(body.inertia, np.float32) * np.float32(scale)
     body.set_mass(mass_kg)
     body.set_inertia(inertia.tolist())
-    entity = sapien.Entity()
-    entity.add_component(body)
-    entity.set_pose(sapien_pose(T_world_object))
-    scene.add_entity(entity)
     return body
 
 

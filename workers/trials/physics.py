@@ -11,7 +11,7 @@ import numpy as np
 from schemas.specification import TrialParams
 from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Robot
-from workers.settling.sapien_bodies import add_object, convex_shape, pose_of, sapien_pose
+from workers.settling.sapien_bodies import convex_shape, object_body, pose_of, sapien_pose
 from workers.trials.articulation import Articulation
 from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
 
@@ -24,12 +24,13 @@ with warnings.catch_warnings():
 # Collision groups [kinds it is, kinds it meets, -, -]: two shapes meet where one meets what the other is.
 # Things meet all. The arm meets things and what stands still, never itself: the planner has seen to that.
 # What carries the arm meets things alone; the shoulder, which turns on the pedestal, not the pedestal.
-_THING, _STILL, _PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
-_ARM, _SHOULDER, _CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
+THING, STILL, PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
+ARM, SHOULDER, CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 15, 1
 # PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
 CONTACT_OFFSET_M = 0.005
+SLEEP_THRESHOLD = 0.005  # PhysX's, joules a kilogram
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,56 @@ class Things:
     parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
     mass_kg: F64  # (K,)
     T_world_object: F64  # (K, 4, 4)
+
+
+def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:
+    """What does not move, of convex parts (V, 3) each in the world frame."""
+    material = physx.PhysxMaterial(friction, friction, 0.0)
+    body = physx.PhysxRigidStaticComponent()
+    for part in parts_m:
+        # PhysX wants hulls near their own origin: cooking loses precision far from it.
+        centre_m = part.mean(axis=0)
+        shape = convex_shape(part - centre_m, material)
+        shape.set_local_pose(sapien.Pose(centre_m.tolist()))
+        tune_shape(shape, groups)
+        body.attach(shape)
+    return body
+
+
+def thing_body(parts_m: Sequence[F32], mass_kg: float, friction: float) -> physx.PhysxRigidDynamicComponent:
+    """A movable object of convex parts (V, 3) each in its own frame."""
+    body = object_body(parts_m, mass_kg, physx.PhysxMaterial(friction, friction, 0.0))
+    for shape in body.get_collision_shapes():
+        tune_shape(shape, THING)
+    tune_body(body)
+    return body
+
+
+def tune_shape(shape: physx.PhysxCollisionShape, groups: list[int]) -> None:
+    """What a shape meets, and from where on contacts are looked for."""
+    shape.set_collision_groups(groups)
+    shape.set_contact_offset(CONTACT_OFFSET_M)
+    shape.set_rest_offset(0.0)
+
+
+def tune_pad(shape: physx.PhysxCollisionShape, friction: float, finger_friction: float, pad_m: float) -> None:
+    """Makes rubber of a finger's shape; the pad is `pad_m` across.
+
+    PhysX takes the mean of a pair's frictions, and a pair shall be as slippery as its more slippery
+    side: rubber holds a soapy bottle no better than the soap allows. A soft pad also resists turning
+    about its normal, as points do not.
+    """
+    grip = min(friction, finger_friction)
+    shape.set_physical_material(physx.PhysxMaterial(grip, grip, 0.0))
+    shape.set_patch_radius(pad_m / 2)
+    shape.set_min_patch_radius(pad_m / 2)
+
+
+def tune_body(body: physx.PhysxRigidDynamicComponent | physx.PhysxArticulation) -> None:
+    """Solver iterations and when it sleeps."""
+    body.set_solver_position_iterations(POSITION_ITERATIONS)
+    body.set_solver_velocity_iterations(VELOCITY_ITERATIONS)
+    body.set_sleep_threshold(SLEEP_THRESHOLD)
 
 
 class TrialWorld:
@@ -59,34 +110,35 @@ class TrialWorld:
         friction: float,
         params: TrialParams,
     ) -> None:
-        self._system = physx.PhysxCpuSystem()
+        self._system = _fresh_system()
         self._system.set_timestep(params.timestep_s)
         self._scene = sapien.Scene([self._system])
-        material = physx.PhysxMaterial(friction, friction, 0.0)
-        self._add_still(still_parts_m, _STILL, material)
+        self._add(still_body(still_parts_m, STILL, friction))
         if pedestal_m is not None:
-            self._add_still([pedestal_m], _PEDESTAL, material)
+            self._add(still_body([pedestal_m], PEDESTAL, friction))
         self._things = [
-            add_object(self._scene, parts, float(mass), T, material)
-            for parts, mass, T in zip(things.parts_m, things.mass_kg, things.T_world_object, strict=True)
+            thing_body(parts, float(mass), friction)
+            for parts, mass in zip(things.parts_m, things.mass_kg, strict=True)
         ]
-        for body in self._things:
-            _refine(body)
-            for shape in body.get_collision_shapes():
-                shape.set_contact_offset(CONTACT_OFFSET_M)
-                shape.set_collision_groups(_THING)
-        # PhysX takes the mean of a pair's frictions. A pair is as slippery as its more slippery side:
-        # rubber holds a soapy bottle no better than the soap allows.
-        grip = min(friction, params.finger_friction)
-        pads = physx.PhysxMaterial(grip, grip, 0.0)
-        self._links = self._add_robot(robot, articulation, T_world_base, material, pads, params.grip_force_n)
-        self._arm = self._links[0].articulation
-        _refine(self._arm)
-        names = (*robot.joint_names, *robot.finger_joint_names)
-        active = {joint.name: k for k, joint in enumerate(self._arm.get_active_joints())}
-        self._columns = np.array([active[name] for name in names])
-        self._joints = [self._arm.get_active_joints()[k] for k in self._columns]
-        self._fingers = [self._links[k] for k in articulation.order[-2:]]
+        for body, T in zip(self._things, things.T_world_object, strict=True):
+            self._add(body, T)
+        links = _robot_links(robot, articulation, friction, params)
+        for link in links:
+            self._add(link, T_world_base @ articulation.T_base_root if link is links[0] else None)
+        self._arm = links[0].articulation
+        tune_body(self._arm)
+        joints = self._arm.get_active_joints()
+        columns = {joint.name: k for k, joint in enumerate(joints)}
+        self._columns = np.array([columns[n] for n in (*robot.joint_names, *robot.finger_joint_names)])
+        self._joints = [joints[k] for k in self._columns]
+        self._fingers = [links[k] for k in articulation.order[-2:]]
+
+    def _add(self, body: sapien.Component, T_world_body: F64 | None = None) -> None:
+        entity = sapien.Entity()
+        entity.add_component(body)
+        if T_world_body is not None:
+            entity.set_pose(sapien_pose(T_world_body))
+        self._scene.add_entity(entity)
 
     # -- what moves ---------------------------------------------------------------------------------
 
@@ -155,75 +207,47 @@ class TrialWorld:
                             impulses[k] += np.multiply(sign, point.impulse)
         return impulses
 
-    # -- building -----------------------------------------------------------------------------------
 
-    def _add_still(self, parts_m: Sequence[F32], groups: list[int], material: physx.PhysxMaterial) -> None:
-        body = physx.PhysxRigidStaticComponent()
-        for part in parts_m:
-            # PhysX wants hulls near their own origin: cooking loses precision far from it.
-            centre_m = part.mean(axis=0)
-            shape = convex_shape(part - centre_m, material)
-            shape.set_local_pose(sapien.Pose(centre_m.tolist()))
-            shape.set_collision_groups(groups)
-            shape.set_contact_offset(CONTACT_OFFSET_M)
-            body.attach(shape)
-        entity = sapien.Entity()
-        entity.add_component(body)
-        self._scene.add_entity(entity)
+def _fresh_system() -> physx.PhysxCpuSystem:
+    """A system with settings of its own: SAPIEN keeps them for the process, where others may change them."""
+    before = physx.get_scene_config()
+    physx.set_scene_config(physx.PhysxSceneConfig())  # PhysX's: TGS, PCM, 9.81 m/s^2 down, one thread
+    try:
+        return physx.PhysxCpuSystem()
+    finally:
+        physx.set_scene_config(before)
 
-    def _add_robot(
-        self,
-        robot: Robot,
-        articulation: Articulation,
-        T_world_base: F64,
-        material: physx.PhysxMaterial,
-        pads: physx.PhysxMaterial,
-        grip_force_n: float,
-    ) -> list[physx.PhysxArticulationLinkComponent]:
-        links: list[physx.PhysxArticulationLinkComponent] = []
-        entities: list[sapien.Entity] = []
-        fingers = articulation.order[-2:]
-        shoulder = articulation.order[0]
-        patch_m = sum(robot.gripper.pad_size_m) / 4
-        for k, body in enumerate(articulation.bodies):
-            link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
-            groups = _CARRIER if k == 0 else _SHOULDER if k == shoulder else _ARM
-            for part in body.parts_m:
-                shape = convex_shape(part, pads if k in fingers else material)
-                shape.set_collision_groups(groups)
-                shape.set_contact_offset(CONTACT_OFFSET_M)
-                if k in fingers:
-                    # A soft pad resists turning about its normal, as points do not.
-                    shape.set_patch_radius(patch_m)
-                    shape.set_min_patch_radius(patch_m)
-                link.attach(shape)
-            link.set_mass(body.mass_kg)
-            link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
-            link.set_inertia(body.inertia_kgm2.tolist())
-            # As ManiSkill's agents: a real arm's controller carries its own weight.
-            link.set_disable_gravity(True)
-            joint = link.joint
-            if body.parent < 0:
-                joint.type = "fixed"
+
+def _robot_links(
+    robot: Robot, articulation: Articulation, friction: float, params: TrialParams
+) -> list[physx.PhysxArticulationLinkComponent]:
+    links: list[physx.PhysxArticulationLinkComponent] = []
+    material = physx.PhysxMaterial(friction, friction, 0.0)
+    fingers, shoulder = articulation.order[-2:], articulation.order[0]
+    for k, body in enumerate(articulation.bodies):
+        link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
+        for part in body.parts_m:
+            shape = convex_shape(part, material)
+            tune_shape(shape, CARRIER if k == 0 else SHOULDER if k == shoulder else ARM)
+            if k in fingers:
+                tune_pad(shape, friction, params.finger_friction, sum(robot.gripper.pad_size_m) / 2)
+            link.attach(shape)
+        link.set_mass(body.mass_kg)
+        link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
+        link.set_inertia(body.inertia_kgm2.tolist())
+        # As ManiSkill's agents: a real arm's controller carries its own weight.
+        link.set_disable_gravity(True)
+        joint = link.joint
+        if body.parent < 0:
+            joint.type = "fixed"
+        else:
+            joint.name, joint.type = body.joint, body.kind
+            joint.set_pose_in_parent(sapien_pose(body.T_parent_joint))
+            joint.set_pose_in_child(sapien_pose(body.T_body_joint))
+            joint.set_limits([[body.lower, body.upper]])
+            if k in fingers:
+                joint.set_drive_properties(FINGER_STIFFNESS, FINGER_DAMPING, params.grip_force_n, "force")
             else:
-                joint.name, joint.type = body.joint, body.kind
-                joint.set_pose_in_parent(sapien_pose(body.T_parent_joint))
-                joint.set_pose_in_child(sapien_pose(body.T_body_joint))
-                joint.set_limits([[body.lower, body.upper]])
-                if k in fingers:
-                    joint.set_drive_properties(FINGER_STIFFNESS, FINGER_DAMPING, grip_force_n, "force")
-                else:
-                    joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n, "force")
-            entity = sapien.Entity()
-            entity.add_component(link)
-            links.append(link)
-            entities.append(entity)
-        entities[0].set_pose(sapien_pose(T_world_base @ articulation.T_base_root))
-        for entity in entities:
-            self._scene.add_entity(entity)
-        return links
-
-
-def _refine(body: physx.PhysxRigidDynamicComponent | physx.PhysxArticulation) -> None:
-    body.set_solver_position_iterations(POSITION_ITERATIONS)
-    body.set_solver_velocity_iterations(VELOCITY_ITERATIONS)
+                joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n, "force")
+        links.append(link)
+    return links

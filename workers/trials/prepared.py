@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from schemas.specification import TrialParams
 from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import translation
 from workers.objects.merging import merge_parts
-from workers.objects.model import ObjectModel
 from workers.robots.robot import Robot
 from workers.scenes.scene import SettledScene
 from workers.trials.articulation import Articulation, articulation_of
@@ -58,7 +56,9 @@ def prepare_trials(
         still_parts_m=still,
         still_low_m=low,
         still_high_m=high,
-        parts_m=tuple(_merged(model, params.hulls_per_object) for model in scene.models),
+        parts_m=tuple(
+            merge_parts(model.convex_parts_m, params.hulls_per_object).parts_m for model in scene.models
+        ),
         mass_kg=np.array([model.mass_kg for model in scene.models]),
         T_world_object=scene.T_world_object,
     )
@@ -95,23 +95,3 @@ def moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:
     corners = np.concatenate(prepared.parts_m[0]).astype(np.float64)
     lowest, was = (corners @ M[2, :3] + M[2, 3] for M in (T, T_planned))
     return translation(0.0, 0.0, max(0.0, was.min() - lowest.min()) + _MOVED_ABOVE_M) @ T
-
-
-def _merged(model: ObjectModel, limit: int) -> tuple[F32, ...]:
-    return _merged_by_digest(_Keyed(model), limit)
-
-
-@dataclass(frozen=True)
-class _Keyed:
-    """A model that is known by its digest."""
-
-    model: ObjectModel = field(compare=False)
-    digest: str = ""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "digest", self.model.digest)
-
-
-@lru_cache(maxsize=256)
-def _merged_by_digest(keyed: _Keyed, limit: int) -> tuple[F32, ...]:
-    return merge_parts(keyed.model.convex_parts_m, limit).parts_m

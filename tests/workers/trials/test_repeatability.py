@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
+from sapien import physx
+
 from schemas.specification import SettleParams, TrialParams
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import ball_model, box_model, cylinder_model
@@ -61,6 +63,20 @@ def test_order_and_other_work_change_no_bit() -> None:
         )
         found[k] = digest(k)
     assert [found[k] for k in range(COUNT)] == forwards
+
+
+def test_settings_that_others_left_in_the_process_change_no_bit() -> None:
+    before = digest(1)
+    scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
+    try:
+        physx.set_scene_config(enable_tgs=False, enable_pcm=False, bounce_threshold=0.1)
+        physx.set_body_config(4, 2, 0.5)
+        physx.set_shape_config(0.03, 0.001)
+        assert digest(1) == before
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
 
 
 def test_processes_agree() -> None:
