@@ -55,7 +55,8 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
     naming the file and what is wrong in it.
     """
     tree = read_urdf(robots_folder() / description.urdf)
-    hand = read_urdf(robots_folder() / description.hand.urdf)
+    same = description.hand.urdf == description.urdf
+    hand = tree if same else read_urdf(robots_folder() / description.hand.urdf)
     held = dict(description.held)
     if description.lift:
         held[description.lift.joint] = lift_m

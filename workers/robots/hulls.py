@@ -19,6 +19,7 @@ from workers.robots.urdf import Shape
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
+_TAKEN_AT_ONCE = 4
 _PUSHES = 50
 _TOUCHING_M = 1e-6
 # Faces, edges and corners of a cube.
@@ -55,6 +56,8 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
+    if not path.is_file():
+        raise _wrong(path, "is missing")
     try:
         mesh = trimesh.load_mesh(path, process=False)
         points = np.asarray(mesh.vertices, np.float64)
@@ -84,8 +87,8 @@ def _slab(points: F64, edges: npt.NDArray[np.int64], low: float, high: float) ->
 def outer_hull(points: F64) -> F64:
     """Corners (V, 3) of a polytope that contains all points; their hull itself where it has few corners.
 
-    Takes the points furthest out in 26 directions, then again and again the one furthest outside of
-    the hull of those taken. What still stands out of a face pushes the face's corners along its
+    Takes the points furthest out in 26 directions, then again and again those furthest outside of the
+    hull of those taken, each over a face of its own. What still stands out of a face pushes the face's corners along its
     normal until nothing does.
     """
     hull = ConvexHull(points)
@@ -95,7 +98,9 @@ def outer_hull(points: F64) -> F64:
     taken = np.unique((points @ _DIRECTIONS.T).argmax(axis=0))
     while len(taken) < MAX_CORNERS:
         outside = _outside(points, ConvexHull(points[taken]))
-        taken = np.append(taken, outside.max(axis=1).argmax())
+        furthest = outside.argmax(axis=0)[np.argsort(-outside.max(axis=0), kind="stable")]
+        first = np.sort(np.unique(furthest, return_index=True)[1])
+        taken = np.append(taken, furthest[first][: min(_TAKEN_AT_ONCE, MAX_CORNERS - len(taken))])
     corners = points[taken]
     for _ in range(_PUSHES):
         hull = ConvexHull(corners)

@@ -1,0 +1,113 @@
+"""Broken URDFs and meshes are refused by file and field; sound ones keep their numbers."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from schemas.errors import InputError
+from workers.robots.assembly import assemble
+from workers.robots.description import robots_folder
+from workers.robots.franka_hand import FRANKA_HAND
+from workers.robots.panda import PANDA
+from workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
+
+
+@pytest.fixture
+def build(tmp_path: Path) -> Callable[[str], None]:
+    """Assembles the Panda from another text of its URDF."""
+    source = robots_folder() / "panda"
+    (tmp_path / "franka_description").symlink_to(source / "franka_description")
+    urdf = tmp_path / "panda.urdf"
+
+    def run(text: str) -> None:
+        urdf.write_text(text)
+        assemble(replace(PANDA, urdf=str(urdf), hand=replace(FRANKA_HAND, urdf=str(urdf))), None, 0.0)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def text() -> str:
+    return (robots_folder() / "panda" / "panda_v2.urdf").read_text()
+
+
+def test_the_text_itself_is_sound(build: Callable[[str], None], text: str) -> None:
+    build(text)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "other", "field", "said"),
+    [
+        ("</robot>", "", "", "not XML"),
+        ('<robot name="panda">', '<robots name="panda">', "", "not XML"),
+        ('name="panda_joint3"', 'name="joint_x"', "panda_joint3", "is missing"),
+        ('"panda_joint8" type="fixed"', '"panda_joint8" type="prismatic"', "panda_joint8", "has no limit"),
+        ('"panda_joint7" type="revolute"', '"panda_joint7" type="fixed"', "panda_joint7", "is fixed"),
+        ('name="panda_joint2" type="revolute"', 'name="panda_joint2" type="ball"', "panda_joint2", "ball"),
+        ('lower="-1.7628" upper="1.7628"', 'lower="nan" upper="1.7628"', "panda_joint2", "nan"),
+        ('lower="-1.7628" upper="1.7628"', 'lower="1.7628" upper="-1.7628"', "panda_joint2", "empty"),
+        ('lower="0.0" upper="0.04"', 'lower="0.0" upper="0.0"', "panda_finger_joint1", "empty"),
+        ('lower="0.0" upper="0.04"', 'lower="0.0" upper="0.0001"', "panda_finger_joint1", "open"),
+        ('lower="0.0" upper="0.04"', 'lower="0.01" upper="0.04"', "panda_finger_joint1", "open"),
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "panda_finger_joint2", "TCP"),
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>', "panda_finger_joint2", "no length"),
+        ('<parent link="panda_link2"/>', '<parent link="panda_linkx"/>', "panda_joint3", "panda_linkx"),
+        ('<parent link="panda_link0"/>', '<parent link="panda_link7"/>', "panda_link", "loop"),
+        ('<child link="panda_link3"/>', '<child link="panda_link2"/>', "joints", "two parents"),
+        ("collision/link3.stl", "collision/gone.stl", "", "is missing"),
+        ("collision/link3.stl", "visual/link3.stl", "", "is missing"),
+        ('<box size="22e-3 15e-3 20e-3"/>', "<cylinder/>", "panda_leftfinger", "neither a box nor a mesh"),
+        ('<box size="22e-3 15e-3 20e-3"/>', '<box size="1 2"/>', "panda_leftfinger", "3 finite numbers"),
+        ('<mass value="4.970684"/>', '<mass value="-1"/>', "panda_link1", "negative"),
+        ('<mass value="4.970684"/>', '<mass value="heavy"/>', "panda_link1", "heavy"),
+        ('<link name="panda_link5">', "<link>", "link", "no name"),
+    ],
+)  # fmt: skip
+def test_what_is_broken_is_named(
+    build: Callable[[str], None], text: str, pattern: str, other: str, field: str, said: str
+) -> None:
+    assert pattern in text
+    with pytest.raises(InputError) as refused:
+        build(text.replace(pattern, other, 1))
+    assert field in refused.value.field and said in refused.value.problem
+    assert re.search(r"panda\.urdf|\.stl", refused.value.place)
+
+
+def test_a_missing_or_empty_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.urdf: cannot be read"):
+        read_urdf(tmp_path / "none.urdf")
+    (tmp_path / "empty.urdf").write_bytes(b"")
+    with pytest.raises(InputError, match=r"empty\.urdf: is not XML"):
+        read_urdf(tmp_path / "empty.urdf")
+    (tmp_path / "other.urdf").write_text("<sdf/>")
+    with pytest.raises(InputError, match=r"other\.urdf: sdf: is not <robot>"):
+        read_urdf(tmp_path / "other.urdf")
+
+
+@pytest.mark.parametrize("content", [b"", b"solid nothing\nendsolid", b"\x00" * 90, b"v 1 2"])
+def test_a_broken_mesh_is_named(
+    build: Callable[[str], None], text: str, tmp_path: Path, content: bytes
+) -> None:
+    (tmp_path / "bad.stl").write_bytes(content)
+    with pytest.raises(InputError, match=r"bad\.stl"):
+        build(text.replace("franka_description/meshes/collision/link3.stl", "bad.stl", 1))
+
+
+@given(st.lists(st.floats(-3.14, 3.14), min_size=3, max_size=3))
+def test_angles_and_rotations_agree(rpy: list[float]) -> None:
+    R = rpy_rotation(np.array(rpy))
+    np.testing.assert_allclose(R, Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rpy_rotation(rotation_rpy(R)), R, atol=1e-8)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_a_pitch_of_90_degrees_keeps_its_rotation(pitch: float) -> None:
+    R = rpy_rotation(np.array([0.4, pitch, -1.1]))
+    np.testing.assert_allclose(rpy_rotation(rotation_rpy(R)), R, atol=1e-8)

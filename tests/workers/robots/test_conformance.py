@@ -1,0 +1,196 @@
+"""What every robot must hold, and what its constants must agree with."""
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog, minimize
+from scipy.spatial import ConvexHull
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+
+from tests.workers.robots.robots_under_test import CASES, IDS, opened
+from workers.robots import ROBOTS, robot_limits
+from workers.robots.hulls import MAX_CORNERS
+from workers.robots.robot import Robot
+
+POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.0005, np.radians(0.5)
+
+
+@pytest.fixture(params=CASES, ids=IDS)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return opened(request.param)
+
+
+def random_q(robot: Robot, count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    return rng.uniform(low, high, (count, len(low)))
+
+
+def pose_error(A: np.ndarray, B: np.ndarray) -> tuple[float, float]:
+    cos = (np.trace(A[:3, :3].T @ B[:3, :3]) - 1) / 2
+    return float(np.linalg.norm(A[:3, 3] - B[:3, 3])), float(np.arccos(np.clip(cos, -1, 1)))
+
+
+def test_every_robot_of_the_registry_is_tested() -> None:
+    assert {name for name, _, _ in CASES} == set(ROBOTS)
+
+
+def test_lengths_and_limits(robot: Robot) -> None:
+    joints, links = len(robot.joint_names), len(robot.link_names)
+    assert len(set(robot.joint_names)) == joints and len(set(robot.link_names)) == links
+    for values in (robot.q_lower_rad, robot.q_upper_rad, robot.speed_limit_radps):
+        assert values.shape == (joints,) and np.isfinite(values).all()
+    assert (robot.q_lower_rad < robot.q_upper_rad).all() and (robot.speed_limit_radps > 0).all()
+    assert len(robot.link_parts_m) == links == len(robot.link_meshes())
+    assert robot.stiffness > 0 and robot.damping > 0 and robot.force_limit_n > 0
+    assert robot.urdf.is_file()
+    limits = robot_limits(robot.name)
+    assert robot.reach_m == pytest.approx(np.clip(robot.reach_m, *limits.reach_m), abs=1e-3)
+    assert robot.base_radius_m == limits.base_radius_m
+
+
+def test_parts_are_convex_and_small(robot: Robot) -> None:
+    for parts in (*robot.link_parts_m, robot.gripper.parts_at(robot.gripper.max_opening_m)):
+        assert parts
+        for part in parts:
+            assert part.dtype == np.float32 and 4 <= len(part) <= MAX_CORNERS
+            assert len(ConvexHull(part).vertices) >= 0.8 * len(part)
+
+
+def test_homes_are_tucked_and_free(robot: Robot) -> None:
+    homes = robot.homes_rad
+    assert len(homes) >= 6 and homes.shape[1] == len(robot.joint_names)
+    assert ((homes > robot.q_lower_rad) & (homes < robot.q_upper_rad)).all()
+    assert not any(robot.collides_itself(q) for q in homes)
+    turns = homes[:, 0]
+    assert turns.min() < -1.2 and turns.max() > 1.2  # to both sides
+    for q in homes:
+        T = robot.T_base_link(q)
+        moved = [
+            np.concatenate(parts) @ T[k, :3, :3].T + T[k, :3, 3]
+            for k, parts in enumerate(robot.link_parts_m)
+            if k > 0
+        ]
+        points = np.concatenate(moved)
+        assert np.hypot(points[:, 0], points[:, 1]).max() < max(0.45 * robot.reach_m, 0.2)
+        if robot.base_radius_m is None:
+            assert points[:, 2].min() > 0.0  # above the pedestal
+        else:
+            assert points[:, 2].min() > 0.3 - robot.base_height_m  # above the floor
+        if abs(q[0]) < 0.1:
+            assert points[:, 0].max() < 0.3  # what stands in front is a table
+
+
+def test_reach_is_the_largest_distance(robot: Robot) -> None:
+    def distance(q: np.ndarray) -> float:
+        return float(np.linalg.norm(robot.T_base_tcp(q)[:3, 3] - robot.shoulder_m))
+
+    q = random_q(robot, 2000)
+    far = np.array([distance(x) for x in q])
+    bounds = list(zip(robot.q_lower_rad, robot.q_upper_rad, strict=True))
+    starts = q[np.argsort(far)[-4:]]
+    best = max(-minimize(lambda x: -distance(x), start, bounds=bounds).fun for start in starts)
+    assert far.max() <= robot.reach_m + 1e-5
+    assert abs(best - robot.reach_m) < 0.01
+
+
+def test_the_first_joint_moves_the_shoulder_nowhere(robot: Robot) -> None:
+    low, high = robot.homes_rad[0].copy(), robot.homes_rad[0].copy()
+    low[0], high[0] = -1.0, 1.0
+    tcp = [robot.T_base_tcp(q)[:3, 3] - robot.shoulder_m for q in (low, high)]
+    assert np.linalg.norm(tcp[0]) == pytest.approx(np.linalg.norm(tcp[1]), abs=1e-9)
+
+
+def test_base_frame(robot: Robot) -> None:
+    root = robot.T_base_link(robot.homes_rad[0])[0]
+    np.testing.assert_allclose(root, robot.T_base_root, atol=1e-12)
+    floor = 0.0 if robot.base_radius_m is None else -robot.base_height_m
+    assert root[2, 3] == pytest.approx(floor, abs=1e-9)
+    if robot.base_radius_m is not None:
+        points = np.concatenate(robot.link_parts_m[0]) @ root[:3, :3].T + root[:3, 3]
+        # Hulls stand out of the meshes by less than a centimetre.
+        assert np.hypot(points[:, 0], points[:, 1]).max() < robot.base_radius_m + 0.01
+
+
+def test_gripper_agrees_with_the_links(robot: Robot) -> None:
+    gripper = robot.gripper
+    q = robot.homes_rad[0]
+    T, tcp = robot.T_base_link(q), robot.T_base_tcp(q)
+    hand = gripper.parts_at(gripper.max_opening_m)
+    of_links = [part @ T[k, :3, :3].T + T[k, :3, 3] for k in (-3, -2, -1) for part in robot.link_parts_m[k]]
+    for ours, theirs in zip(hand, of_links, strict=True):
+        np.testing.assert_allclose(ours @ tcp[:3, :3].T + tcp[:3, 3], theirs, atol=1e-6)
+    left, right = (np.concatenate(parts) for parts in gripper.finger_parts_m)
+    assert left[:, 1].min() == pytest.approx(0.0, abs=1e-3) == -right[:, 1].max()
+    assert left[:, 1].mean() > 0.005 and right[:, 1].mean() < -0.005
+    # Pads lie around the TCP, and nothing of the hand reaches beyond them.
+    assert left[:, 2].max() == pytest.approx(gripper.pad_size_m[1] / 2, abs=2e-3)
+    palm = np.concatenate(gripper.palm_parts_m)
+    assert palm[:, 2].max() == pytest.approx(-gripper.palm_depth_m, abs=1e-6)
+    assert gripper.palm_depth_m > gripper.pad_size_m[1] / 2
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_ik_reaches_what_it_returns(robot: Robot, seed: int) -> None:
+    q, other = random_q(robot, 2, seed)
+    goal = robot.T_base_tcp(q)
+    found = robot.ik(goal, other)
+    if found is not None:
+        assert ((found >= robot.q_lower_rad) & (found <= robot.q_upper_rad)).all()
+        distance, angle = pose_error(robot.T_base_tcp(found), goal)
+        assert distance <= POSITION_TOLERANCE_M + 1e-9 and angle <= ANGLE_TOLERANCE_RAD + 1e-6
+    np.testing.assert_array_equal(robot.ik(goal, q), q)
+
+
+def test_ik_finds_most_poses_from_near_and_gives_up_on_far_ones(robot: Robot) -> None:
+    q = random_q(robot, 100)
+    near = np.clip(q + np.random.default_rng(1).normal(0, 0.3, q.shape), robot.q_lower_rad, robot.q_upper_rad)
+    found = [robot.ik(robot.T_base_tcp(a), b) for a, b in zip(q, near, strict=True)]
+    assert sum(x is not None for x in found) >= 90
+    away = robot.T_base_tcp(q[0])
+    away[:3, 3] = robot.shoulder_m + (0.0, 0.0, robot.reach_m + 0.02)
+    assert all(robot.ik(away, b) is None for b in near)
+
+
+def test_self_pairs_are_found_from_the_geometry(robot: Robot) -> None:
+    names = robot.link_names
+    pairs = {(names[a], names[b]) for a, b in robot.self_pairs}
+    assert all(a < b for a, b in robot.self_pairs)
+    arm = names[: len(robot.joint_names) + 1]
+    # All of the arm but neighbours is watched, and the hand against all that its wrist can bring it to.
+    for k, link in enumerate(arm):
+        for other in arm[k + 2 :]:
+            assert (link, other) in pairs
+        for part in names[-3:]:
+            assert ((link, part) in pairs) == (k <= 5)
+    assert not {(a, b) for a in names[-3:] for b in names[-3:]} & pairs
+
+
+def test_self_collision_agrees_with_separating_planes(robot: Robot) -> None:
+    # Fingers are checked as one hull each.
+    parts = [*robot.link_parts_m[:-2], *((np.concatenate(p),) for p in robot.link_parts_m[-2:])]
+    for q in random_q(robot, 12, seed=3):
+        T = robot.T_base_link(q)
+        placed = [[part @ T[k, :3, :3].T + T[k, :3, 3] for part in body] for k, body in enumerate(parts)]
+        gaps = [separation(one, two) for a, b in robot.self_pairs for one in placed[a] for two in placed[b]]
+        if min(gaps) > 1e-4:
+            assert not robot.collides_itself(q)
+        elif min(gaps) <= 0.0:
+            assert robot.collides_itself(q)
+
+
+def separation(one: np.ndarray, two: np.ndarray) -> float:
+    """Positive where a plane separates two point sets: the largest margin over normals in a unit cube."""
+    spheres = np.linalg.norm(one.mean(0) - two.mean(0))
+    if (
+        spheres
+        > np.linalg.norm(one - one.mean(0), axis=1).max() + np.linalg.norm(two - two.mean(0), axis=1).max()
+    ):
+        return 1.0
+    # max m with n . x + m <= d <= n . y - m, |n_i| <= 1
+    rows = [[*x, -1.0, 1.0] for x in one] + [[*(-y), 1.0, 1.0] for y in two]
+    result = linprog([0, 0, 0, 0, -1], rows, np.zeros(len(rows)), bounds=[(-1, 1)] * 3 + [(None, None)] * 2)
+    return float(-result.fun) if -result.fun > 1e-9 else 0.0

@@ -1,0 +1,64 @@
+"""What `open_robot` refuses, and what it keeps."""
+
+import math
+
+import pytest
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+
+from schemas.errors import InputError
+from workers.robots import open_robot, robot_limits
+
+
+@pytest.mark.parametrize(
+    ("name", "reach_m", "height_m", "said"),
+    [
+        ("panda-scald", 0.7, 0.8, "panda-scaled"),
+        ("panda-scaled", 0.29, 0.8, "from 0.3 to 1.0 m"),
+        ("panda-scaled", 1.01, 0.8, "from 0.3 to 1.0 m"),
+        ("panda-scaled", math.nan, 0.8, "from 0.3 to 1.0 m"),
+        ("panda-scaled", None, 0.8, "from 0.3 to 1.0 m"),
+        ("panda", 0.8, 0.8, "reach of 0.947 m"),
+        ("panda", None, -0.1, "at least 0.0 m"),
+        ("panda", None, math.nan, "at least 0.0 m"),
+        ("panda", None, math.inf, "at least 0.0 m"),
+        ("fetch", None, 0.5, "from 0.727 to 1.112 m"),
+        ("fetch", None, 1.2, "from 0.727 to 1.112 m"),
+        ("fetch", 1.0, 0.8, "reach of 1.11 m"),
+    ],
+)
+def test_wrong_arguments_name_the_option_and_the_range(
+    name: str, reach_m: float | None, height_m: float, said: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        open_robot(name, reach_m, height_m)
+    assert refused.value.place == "--robot" and said in str(refused.value)
+
+
+def test_limits_are_those_that_open() -> None:
+    for name in ("panda", "xarm7", "fetch"):
+        limits = robot_limits(name)
+        low, high = limits.base_height_m or (0.0, 1.5)
+        assert open_robot(name, limits.reach_m[0], low).base_height_m == low
+        assert open_robot(name, None, high).base_height_m == high
+    for reach_m in robot_limits("panda-scaled").reach_m:
+        assert open_robot("panda-scaled", reach_m, 0.8).reach_m == reach_m
+
+
+def test_pedestals_share_an_arm_and_torsos_do_not() -> None:
+    low, high = open_robot("panda-scaled", 0.7, 0.5), open_robot("panda-scaled", 0.7, 0.9)
+    assert (low.base_height_m, high.base_height_m) == (0.5, 0.9)
+    assert low.urdf == high.urdf and low.link_parts_m is high.link_parts_m
+    low, high = open_robot("fetch", None, 0.8), open_robot("fetch", None, 1.0)
+    assert low.urdf != high.urdf
+    assert low.T_base_root[2, 3] == pytest.approx(-0.8) and high.T_base_root[2, 3] == pytest.approx(-1.0)
+    assert low.gripper.digest == high.gripper.digest
+
+
+def test_the_family_shares_one_hand_with_the_xarm() -> None:
+    digests = {
+        open_robot(name, reach_m, 0.8).gripper.digest
+        for name, reach_m in (("panda", None), ("panda-scaled", 0.3), ("panda-scaled", 1.0), ("xarm7", None))
+    }
+    assert len(digests) == 1
+    assert open_robot("fetch", None, 0.8).gripper.digest not in digests

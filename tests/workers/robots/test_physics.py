@@ -1,0 +1,117 @@
+"""Robots in SAPIEN: the same places of links as pinocchio's, and drives that hold the tucked poses."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import sapien
+    from sapien import physx
+    from sapien.wrapper.urdf_loader import URDFLoader
+
+from tests.workers.robots.robots_under_test import CASES, IDS, opened
+from workers.robots.robot import Robot
+
+STEP_S = 1 / 200
+
+
+@pytest.fixture(params=CASES, ids=IDS)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return opened(request.param)
+
+
+class Simulated:
+    """The robot's own files in a fresh scene, driven as ManiSkill's agents drive: no gravity on its links."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.scene = sapien.Scene([physx.PhysxCpuSystem()])
+        self.scene.set_timestep(STEP_S)
+        loader = URDFLoader()
+        loader.fix_root_link = True
+        loader.set_scene(self.scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.body = loader.load(str(robot.urdf))
+            self.body.set_root_pose(sapien.Pose(robot.T_base_root))
+        self.links = {link.name: link for link in self.body.links}
+        self.joints = self.body.active_joints
+        self.names = [joint.name for joint in self.joints]
+        self.robot = robot
+        for link in self.body.links:
+            link.disable_gravity = True
+        for joint in self.joints:
+            joint.set_drive_properties(robot.stiffness, robot.damping, robot.force_limit_n)
+
+    def place(self, q_rad: np.ndarray) -> np.ndarray:
+        """Sets joints and targets, fingers open; returns the joints in the engine's order."""
+        opening = self.robot.gripper.max_opening_m / 2
+        values = dict(zip(self.robot.joint_names, q_rad, strict=True))
+        values |= dict.fromkeys(self.robot.finger_joint_names, opening) | self.robot.fixed_joints
+        q = np.array([values[name] for name in self.names])
+        self.body.set_qpos(q)
+        self.body.set_qvel(np.zeros_like(q))
+        for joint, value in zip(self.joints, q, strict=True):
+            joint.set_drive_target(value)
+        return q
+
+
+def test_joints_and_links_are_those_of_the_files(robot: Robot) -> None:
+    simulated = Simulated(robot)
+    assert set(simulated.names) == {*robot.joint_names, *robot.finger_joint_names, *robot.fixed_joints}
+    assert set(robot.link_names) == set(simulated.links)
+    for name, parts in zip(robot.link_names, robot.link_parts_m, strict=True):
+        assert len(simulated.links[name].collision_shapes) == len(parts)
+    limits = {joint.name: joint.limits[0] for joint in simulated.joints}
+    ours = np.column_stack([robot.q_lower_rad, robot.q_upper_rad])
+    np.testing.assert_allclose([limits[name] for name in robot.joint_names], ours, atol=1e-6)
+
+
+def test_links_are_where_pinocchio_puts_them(robot: Robot) -> None:
+    simulated = Simulated(robot)
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(robot.q_lower_rad, robot.q_upper_rad, (20, len(robot.joint_names))):
+        simulated.place(q)
+        poses = [simulated.links[name].entity_pose.to_transformation_matrix() for name in robot.link_names]
+        # Single precision over a metre.
+        np.testing.assert_allclose(robot.T_base_link(q), poses, atol=2e-6)
+
+
+@pytest.mark.parametrize("payload_kg", [0.0, 1.0])
+def test_drives_hold_every_home(robot: Robot, payload_kg: float) -> None:
+    weight = [0.0, 0.0, -9.81 * payload_kg]
+    for home in robot.homes_rad:
+        simulated = Simulated(robot)
+        q = simulated.place(home)
+        hand = simulated.links[robot.link_names[-3]]
+        tcp = robot.T_base_tcp(home)[:3, 3]
+        for _ in range(int(1.0 / STEP_S)):
+            hand.add_force_at_point(weight, tcp)
+            simulated.scene.step()
+        arm = [simulated.names.index(name) for name in robot.joint_names]
+        assert np.degrees(np.abs(simulated.body.qpos - q)[arm]).max() < 1.0
+
+
+def test_links_that_may_touch_do_not_push_each_other(robot: Robot) -> None:
+    # Random poses that are free by `collides_itself` stay where they are: no pair that is left out collides.
+    simulated = Simulated(robot)
+    rng = np.random.default_rng(5)
+    low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    free = [q for q in rng.uniform(low, high, (60, len(low))) if not robot.collides_itself(q)][:15]
+    for home in free:
+        q = simulated.place(home)
+        for _ in range(20):
+            simulated.scene.step()
+        assert np.degrees(np.abs(simulated.body.qpos - q)).max() < 0.1
+
+
+def test_files_hold_no_visuals_and_only_convex_parts(robot: Robot) -> None:
+    text = robot.urdf.read_text()
+    assert "<visual" not in text
+    assert robot.urdf.with_suffix(".srdf").is_file()
+    for line in text.split('filename="')[1:]:
+        assert Path(line.split('"')[0]).suffix == ".stl"

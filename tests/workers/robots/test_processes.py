@@ -1,0 +1,69 @@
+"""The same robot in every process, also when several open it at once in an empty cache."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+
+from workers.robots import written
+from workers.robots.assembly import assemble
+from workers.robots.panda import PANDA
+
+PRINT_DIGEST = """
+import hashlib, sys
+import numpy as np
+from workers.robots import open_robot
+order = [("panda-scaled", 0.4), ("panda", None), ("panda-scaled", 0.7), ("xarm7", None)]
+digests = {}
+for name, reach in order if sys.argv[1] == "1" else order[::-1]:
+    robot, bits = open_robot(name, reach, 0.8), hashlib.sha256()
+    low, high = robot.q_lower_rad, robot.q_upper_rad
+    for q in np.random.default_rng(0).uniform(low, high, (50, len(low))):
+        tcp = robot.T_base_tcp(q)
+        found = robot.ik(tcp, (low + high) / 2)
+        bits.update(robot.T_base_link(q).tobytes() + tcp.tobytes())
+        bits.update(b"none" if found is None else found.tobytes())
+        bits.update(bytes([robot.collides_itself(q)]))
+    bits.update(repr((robot.self_pairs, robot.gripper.digest, robot.urdf.name)).encode())
+    for part in (part for parts in robot.link_parts_m for part in parts):
+        bits.update(part.tobytes())
+    digests[f"{name} {reach}"] = bits.hexdigest()
+    assert robot.urdf.read_text().count("<joint") == 10
+print(sorted(digests.items()))
+"""
+
+
+def test_processes_agree_to_the_bit(tmp_path: Path) -> None:
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", PRINT_DIGEST, order],
+            env=os.environ | {"DATAGEN_CACHE": str(tmp_path), "OMP_NUM_THREADS": order},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for order in ("1", "2")
+    ]
+    printed = [process.communicate(timeout=120)[0] for process in started]
+    assert [process.returncode for process in started] == [0, 0]
+    assert printed[0] == printed[1] and "panda-scaled 0.4" in printed[0]
+    left = [path.name for path in (tmp_path / "robots").iterdir()]
+    assert not [name for name in left if name.startswith(".")]  # nothing half written
+    assert sum(name.endswith(".urdf") for name in left) == 4
+
+
+def test_a_cache_that_cannot_be_written_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    monkeypatch.setenv("DATAGEN_CACHE", str(blocked))
+    written._folder.cache_clear()
+    try:
+        urdf = written.write_urdf("panda", assemble(PANDA, None, 0.0), [])
+        assert urdf.is_file() and tmp_path not in urdf.parents
+    finally:
+        written._folder.cache_clear()
