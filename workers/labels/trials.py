@@ -114,10 +114,10 @@ def try_candidate(
 
     Depends on the scene, the candidate and the specification alone, not on what was tried before.
     """
-    if len(at.grasps) == 0:
-        return CandidateTrial("no_grasp")
     if candidates.clearance_m[row] < 0:
         return CandidateTrial("base_collision")
+    if len(at.grasps) == 0:
+        return CandidateTrial("no_grasp")
     T_world_base = pose_of_base(
         candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, at.scene.target_center_m
     )

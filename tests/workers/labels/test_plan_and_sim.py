@@ -1,0 +1,170 @@
+"""Label sources `plan` and `sim` on a hand-made scene, with the real arm, grasps and physics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.cost import StageClock
+from schemas.errors import InputError
+from schemas.fields import OUTCOMES, SCHEMAS
+from schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    GraspParams,
+    Source,
+    Specification,
+    TrialParams,
+    VisibilityParams,
+)
+from tests.workers.motion.tables import scene_of
+from tests.workers.worlds import box_model, on_table, table_house
+from workers.bases.candidates import Candidates
+from workers.bases.clearance import base_clearance_m
+from workers.geometry.transforms import translation
+from workers.labels import load_label_source, plan
+from workers.labels.trials import arm_in_scene, try_candidate
+from workers.scenes.scene import SettledScene
+
+NAMES = tuple(OUTCOMES)
+REACH_M, HEIGHT_M = 0.85, 0.75
+# Around the target, metres: in front of the table (three times), on it, behind the wall, far off.
+OFFSETS_M = [(0.0, -0.62), (0.15, -0.6), (-0.2, -0.65), (0.0, 0.1), (0.0, 2.4), (1.6, -0.9)]
+TARGET = box_model("box", (0.05, 0.05, 0.12))
+
+
+def specification(**arm: Any) -> Specification:
+    return Specification(
+        label_source="sim" if "trial" in arm else "plan",
+        seed=3,
+        houses=Source(kind="builtin", digest="1" * 64),
+        objects=Source(kind="builtin", digest="2" * 64),
+        candidates=CandidateParams(base_radius_m=0.2),
+        visibility=VisibilityParams(window_px=16),
+        # A box needs no long search.
+        arm=ArmParams(grasps=GraspParams(per_object=24), **arm),
+    )
+
+
+def scene() -> SettledScene:
+    clutter = box_model("clutter", (0.06, 0.06, 0.08))
+    objects, poses = [TARGET, clutter], [on_table(TARGET, 0.0, -0.2), on_table(clutter, 0.25, 0.1)]
+    return scene_of(table_house(), objects, poses)
+
+
+def candidates(at: SettledScene) -> Candidates:
+    n = len(OFFSETS_M)
+    xy = (at.target_center_m[:2] + np.array(OFFSETS_M)).astype(np.float32)
+    ones = np.ones(n, np.float32)
+    camera_m, height_m = ones * np.float32(1.2), ones * np.float32(HEIGHT_M)
+    params = CandidateParams(base_radius_m=0.2)
+    clearance = base_clearance_m(xy, height_m, camera_m, at.house.obstacles, params)
+    return Candidates(xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance)
+
+
+@pytest.fixture(scope="module")
+def labelled() -> dict[str, dict[str, np.ndarray]]:
+    at = scene()
+    return {
+        name: load_label_source(name).label(at, candidates(at), spec, StageClock())
+        for name, spec in (("plan", specification()), ("sim", specification(trial=TrialParams())))
+    }
+
+
+def test_each_candidate_has_the_cause_a_person_would_name(labelled: dict[str, Any]) -> None:
+    for columns in labelled.values():
+        outcome = [NAMES[code] for code in columns["outcome"]]
+        assert outcome[:3] == ["success"] * 3
+        assert outcome[3:5] == ["base_collision"] * 2  # on the table, and outside the room
+        assert outcome[5] in ("out_of_reach", "base_collision")
+        np.testing.assert_array_equal(columns["label"], [1, 1, 1, 0, 0, 0])
+
+
+def test_columns_are_those_of_the_schema(labelled: dict[str, Any]) -> None:
+    drawn = {"sample_id", "sample_scene_index", "candidate_index", "robot_index", "base_xy_m"}
+    drawn |= {"camera_height_m", "base_height_m", "arm_reach_m", "base_clearance_m", "base_is_clear"}
+    drawn |= {"label_source", "label_version"}
+    for name, columns in labelled.items():
+        fields = {f.name: f for f in SCHEMAS[name].sample_fields if f.name not in drawn}
+        assert set(columns) == set(fields)
+        for field in fields.values():
+            values = columns[field.name]
+            assert values.dtype == np.dtype(field.dtype), field.name
+            assert values.shape == SCHEMAS[name].shape(field, len(OFFSETS_M))
+            assert np.isfinite(values).all()
+
+
+def test_every_positive_says_how(labelled: dict[str, Any]) -> None:
+    for name, columns in labelled.items():
+        good = columns["label"] == 1
+        assert (columns["path_length_rad"][good] > 0.5).all()
+        assert (columns["grasps_free"][good] > 0).all() and (columns["grasps_tried"][good] > 0).all()
+        assert np.linalg.norm(columns["T_target_tcp"][good][:, :3, 3], axis=1).max() < 0.12
+        assert (columns["q_grasp_rad"][~good] == 0).all()
+        if name == "sim":
+            assert (columns["lift_m"][good] > 0.08).all() and (columns["slip_m"][good] < 0.03).all()
+            np.testing.assert_array_equal(columns["trials"], good)
+            np.testing.assert_array_equal(columns["successes"], good)
+
+
+def test_sim_plans_as_plan_does(labelled: dict[str, Any]) -> None:
+    first_worked = labelled["sim"]["attempts"] <= 1
+    for name in ("T_target_tcp", "q_grasp_rad", "path_length_rad", "grasps_free", "heuristic_label"):
+        np.testing.assert_array_equal(
+            labelled["plan"][name][first_worked], labelled["sim"][name][first_worked]
+        )
+
+
+def test_a_candidate_alone_has_the_label_it_has_among_others(labelled: dict[str, Any]) -> None:
+    at, spec = scene(), specification(trial=TrialParams())
+    for row in (2, 0):
+        arm = arm_in_scene(at, candidates(at), row, spec, StageClock())
+        trial = try_candidate(arm, candidates(at), row, spec)
+        assert trial.results[-1].slip_m == pytest.approx(labelled["sim"]["slip_m"][row], abs=0)
+        assert NAMES[labelled["sim"]["outcome"][row]] == trial.outcome
+
+
+def test_repeats_are_counted(labelled: dict[str, Any]) -> None:
+    at = scene()
+    still = DisturbanceParams(repeats=2, target_position_std_m=0.0, base_position_std_m=0.0)
+    wild = DisturbanceParams(repeats=2, base_position_std_m=0.3)
+    for disturbance in (still, wild):
+        spec = specification(trial=TrialParams(), disturbance=disturbance)
+        columns = load_label_source("sim").label(at, candidates(at), spec, StageClock())
+        planned = columns["path_length_rad"] > 0
+        np.testing.assert_array_equal(columns["trials"], np.where(planned, 2, 0))
+        np.testing.assert_array_equal(columns["attempts"], columns["trials"])
+        good = 2 * columns["successes"] >= columns["trials"]
+        np.testing.assert_array_equal(columns["label"] == 1, planned & good)
+        if disturbance is wild:
+            assert columns["successes"].sum() < columns["trials"].sum()
+
+
+def test_the_clock_has_its_stages() -> None:
+    at, clock = scene(), StageClock()
+    load_label_source("sim").label(at, candidates(at), specification(trial=TrialParams()), clock)
+    assert set(clock.wall_s) == {"visibility", "grasps", "plan", "execute"}
+
+
+def test_a_target_without_grasps_is_told_and_not_tried() -> None:
+    wide = box_model("wide", (0.3, 0.3, 0.2))
+    at = scene_of(table_house(), [wide], [on_table(wide)])
+    columns = plan.label(at, candidates(at), specification(), StageClock())
+    assert {NAMES[code] for code in columns["outcome"]} == {"base_collision", "no_grasp"}
+
+
+def test_a_target_inside_another_body_is_an_outcome() -> None:
+    block = box_model("block", (0.07, 0.07, 0.14))
+    T = on_table(TARGET, 0.0, -0.2)
+    at = scene_of(table_house(), [TARGET, block], [T, T @ translation(0, 0, 0.01)])
+    columns = plan.label(at, candidates(at), specification(), StageClock())
+    assert NAMES[columns["outcome"][0]] == "no_grasp" and not columns["label"].any()
+
+
+def test_an_arm_needs_its_section() -> None:
+    at = scene()
+    with pytest.raises(InputError, match="arm"):
+        plan.label(at, candidates(at), specification().model_copy(update={"arm": None}), StageClock())
