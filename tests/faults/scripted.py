@@ -59,8 +59,6 @@ def misbehave(word: str) -> None:
         raise MemoryError
     elif word == "disk":
         raise JobCannotGoOn(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
-    elif word == "slow":
-        time.sleep(0.3)
     elif word == "grow":
         GROWN.append(bytearray(os.urandom(1) * (300 << 20)))
 
