@@ -18,7 +18,7 @@ LIBRARIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "libX11.so.6": ("sapien", ("libx11-6",)),
     "libGL.so.1": ("opencv, which sapien imports", ("libgl1",)),
     "libgthread-2.0.so.0": ("opencv, which sapien imports", ("libglib2.0-0t64", "libglib2.0-0")),
-    "libgomp.so.1": ("scipy and simulation wheels built with OpenMP", ("libgomp1",)),
+    "libgomp.so.1": ("pinocchio", ("libgomp1",)),
 }
 
 

@@ -12,6 +12,10 @@ from typing import Any
 
 from schemas.errors import InputError, choices
 
+# What the `sim` extra brings, by the names that are imported; the core works without.
+SIM_MODULES = ("pinocchio", "coal", "mani_skill")
+SIM_MEND = "Install the extra that brings it: pip install 'datagen[sim]'"
+
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
     """What a registry holds under a name. `option` is where the name was given, for the error.
@@ -26,6 +30,8 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
         return getattr(import_module(module), attribute)
     except ImportError as error:
         mend = f"Run `datagen doctor`, or take another one: {', '.join(sorted(registry))}"
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in SIM_MODULES:
+            mend = SIM_MEND
         raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
 
 

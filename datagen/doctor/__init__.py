@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check
 from datagen.doctor.engines import engine_checks
 from datagen.doctor.host import host_checks
@@ -88,7 +89,7 @@ def doctor(
 
     Exits with 0 when labels can be made here, else with 1.
     """
-    checks = [*host_checks(), *engine_checks(), *asset_checks(houses, objects)]
+    checks = [*host_checks(), *engine_checks(), *arm_checks(), *asset_checks(houses, objects)]
     failures = sum(check.status == "fail" for check in checks)
     if json:
         sys.stdout.write(as_json(checks) + "\n")

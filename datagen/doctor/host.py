@@ -34,7 +34,7 @@ LIBRARIES = {
     "libX11.so.6": ("the SAPIEN settler and renderer", "libx11-6"),
     "libGL.so.1": ("the SAPIEN settler and renderer", "libgl1"),
     "libgthread-2.0.so.0": ("the SAPIEN settler and renderer", "libglib2.0-0"),
-    "libgomp.so.1": ("simulation wheels built with OpenMP", "libgomp1"),
+    "libgomp.so.1": ("the arm libraries, built with OpenMP", "libgomp1"),
 }
 
 

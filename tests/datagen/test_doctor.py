@@ -9,9 +9,10 @@ import pytest
 from rich.console import Console
 
 from datagen import cli, doctor
-from datagen.doctor import engines, host
+from datagen.doctor import arm, engines, host
 from datagen.doctor.check import Check, probe
 from datagen.doctor.host import ENOUGH_DISK_BYTES
+from workers.robots import ROBOTS
 
 
 def test_a_probe_survives_a_crash() -> None:
@@ -64,6 +65,23 @@ def test_one_settler_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["sapien physics"].status == "warn"
     assert "libX11" in found["sapien physics"].detail
     assert "sapien render device" not in found
+
+
+def test_a_missing_extra_is_one_warning_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arm, "_LIBRARIES", "import sys; sys.modules['coal'] = None; import coal")
+    (check,) = arm.arm_checks()
+    assert check.status == "warn" and "coal" in check.detail
+    assert check.mend == "Install the extra that brings it: pip install 'datagen[sim]'"
+
+
+def test_what_is_broken_of_the_arm_stack_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arm, "_LIBRARIES", "print('there')")
+    monkeypatch.setattr(arm, "_ROBOT", "raise OSError('no such URDF')")
+    monkeypatch.setattr(arm, "_TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    found = {check.name: check for check in arm.arm_checks()}
+    assert found["robot panda"].status == "warn" and "no such URDF" in found["robot panda"].detail
+    assert found["grasp trial"].status == "warn" and found["grasp trial"].detail == "crashed with SIGSEGV"
+    assert all(check.mend for check in found.values() if check.status != "ok")
 
 
 @pytest.mark.parametrize(
@@ -132,7 +150,9 @@ def test_json_names_every_check(capsys: pytest.CaptureFixture[str]) -> None:
     assert report["ok"] == (code == 0)
     names = [check["name"] for check in report["checks"]]
     assert len(names) == len(set(names))
-    assert {"python", "memory", "disk", "embree", "ray", "houses", "objects"} <= set(names)
+    assert {"python", "memory", "disk", "embree", "ray", "arm libraries", "houses", "objects"} <= set(names)
+    arms = [check for check in report["checks"] if check["name"].startswith(("arm", "robot", "grasp"))]
+    assert len(arms) == 2 + len(ROBOTS) and {check["status"] for check in arms} == {"ok"}, arms
     for check in report["checks"]:
         assert list(check) == ["name", "status", "detail", "mend"]
         assert check["status"] != "ok" or check["detail"]

@@ -1,0 +1,69 @@
+"""Whether arms can be planned for and trials run, asked in processes of their own: the `sim` extra."""
+
+from __future__ import annotations
+
+from datagen.doctor.check import Check, probe
+from workers.registry import SIM_MEND
+from workers.robots import ROBOTS, robot_limits
+
+_LIBRARIES = """
+import importlib, importlib.metadata, importlib.util
+pinocchio = importlib.import_module("pinocchio")
+coal = importlib.import_module("coal")
+model = pinocchio.buildSampleModelManipulator()
+pinocchio.forwardKinematics(model, model.createData(), pinocchio.neutral(model))
+near, far = coal.Transform3s(), coal.Transform3s()
+far.setTranslation(importlib.import_module("numpy").array([3.0, 0.0, 0.0]))
+ball = coal.Sphere(1.0)
+ask = lambda other: coal.collide(ball, near, ball, other, coal.CollisionRequest(), coal.CollisionResult())
+assert ask(near) and not ask(far), "two balls do not meet as they should"
+print("pinocchio " + pinocchio.__version__ + ", coal " + importlib.metadata.version("coal"))
+"""
+
+_ROBOT = """
+from workers.robots import open_robot
+robot = open_robot({name!r}, {reach_m!r}, {height_m!r})
+home = robot.homes_rad[0]
+assert not robot.collides_itself(home), "the first tucked pose touches itself"
+hand = robot.gripper
+print(f"{{len(home)}} joints, reach {{robot.reach_m:.3f}} m, hand opens {{hand.max_opening_m:.3f}} m")
+"""
+
+_TRIAL = """
+from datagen.doctor.lift import main
+raise SystemExit(main())
+"""
+
+_AGAIN = "Install it again: pip install --force-reinstall 'datagen[sim]'"
+# Several times what it takes where every file is read for the first time and the cores are busy.
+_DEADLINE_S = 120.0
+# An arm stands so high where its own limits allow any height.
+_HEIGHT_M = 0.5
+
+
+def arm_checks() -> list[Check]:
+    """The arm libraries, every robot of the registry, and a trial in physics.
+
+    Nothing here fails the machine: heuristic labels need none of it. Where the libraries are missing
+    the rest is not asked.
+    """
+    libraries = probe(_LIBRARIES, _DEADLINE_S)
+    if not libraries.succeeded:
+        mend = SIM_MEND if "ModuleNotFoundError" in libraries.text else _AGAIN
+        return [Check("arm libraries", "warn", f"no plan and sim labels: {libraries.text}", mend)]
+    checks = [Check("arm libraries", "ok", libraries.text)]
+    for name in ROBOTS:
+        limits = robot_limits(name)
+        height_m = limits.base_height_m[0] if limits.base_height_m else _HEIGHT_M
+        code = _ROBOT.format(name=name, reach_m=limits.reach_m[1], height_m=height_m)
+        opened = probe(code, _DEADLINE_S)
+        mend = SIM_MEND if "not installed" in opened.text else f"Use another --robot, or: {_AGAIN}"
+        checks.append(_check(f"robot {name}", opened.succeeded, opened.text, mend))
+    trial = probe(_TRIAL, _DEADLINE_S)
+    mend = "See sapien physics and the robots above; plan labels need no physics."
+    checks.append(_check("grasp trial", trial.succeeded, trial.text, mend))
+    return checks
+
+
+def _check(name: str, succeeded: bool, text: str, mend: str) -> Check:
+    return Check(name, "ok", text) if succeeded else Check(name, "warn", text, mend)
