@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 
 def print_json(value: Any) -> None:
@@ -19,12 +20,15 @@ def print_json(value: Any) -> None:
 
 def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:
     """A table; the first column is left-aligned, the others right-aligned when there are heads."""
-    table = Table(title=title, title_justify="left", show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
+    table = Table(show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
     for k in range(len(heads)) if heads else range(2):
         table.add_column(heads[k] if heads else "", justify="right" if heads and k else "left")
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, width=None if sys.stdout.isatty() else 110).print(table)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    # A table's own title is wrapped to the table's width.
+    console.print(Text(title, style="italic"), soft_wrap=True)
+    console.print(table)
 
 
 def seconds(value: float) -> str:

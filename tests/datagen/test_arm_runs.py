@@ -1,0 +1,111 @@
+"""Runs of `plan` and `sim` over the stored scenes of a heuristic run: paired labels, and their audit."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen import cli
+from schemas.fields import OUTCOMES
+from schemas.run import Run
+from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run
+
+pytestmark = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("pinocchio", "coal", "mani_skill", "sapien")),
+    reason="the extra `sim` is not installed",
+)
+
+PER_SCENE, SCENES = 8, 2
+N = PER_SCENE * SCENES
+# Long arms, so that some candidates can be reached; few grasps, which are quickly found.
+LONG_ARMS = "[candidates]\narm_reach_m = {low = 0.9, high = 1.0}\nrobots_per_scene = 1\n"
+FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run of each label source, by its name, and one of disturbed trials, over the same candidates."""
+    folder = tmp_path_factory.mktemp("paired")
+    source = make_small_run(
+        folder / "heuristic", N, "--candidates", "in-range", config=CONFIG + LONG_ARMS, per_scene=PER_SCENE
+    )
+    (folder / "arm.toml").write_text(FEW_GRASPS)
+    made = {"heuristic": source}
+    for name, *more in (("plan",), ("sim",), ("disturbed", "--perturb", "2")):
+        made[name] = folder / name
+        assert cli.run([
+            "submit", "sim" if name == "disturbed" else name, "--n", str(N), "--out", str(made[name]),
+            "--scenes-from", str(source), "--config", str(folder / "arm.toml"), "--workers", "0", *more,
+        ]) == 0  # fmt: skip
+    return made
+
+
+def test_all_label_the_same_candidates_of_the_same_scenes(runs: dict[str, Path]) -> None:
+    arrays = {name: arrays_of(run) for name, run in runs.items()}
+    first = arrays["heuristic"]
+    for name in ("plan", "sim", "disturbed"):
+        for column in first.keys() - {"sample_id", "label", "label_source", "label_version"}:
+            np.testing.assert_array_equal(arrays[name][column], first[column], err_msg=f"{name} {column}")
+        np.testing.assert_array_equal(arrays[name]["heuristic_label"], first["label"])
+    ids = {row.tobytes() for a in arrays.values() for row in a["sample_id"]}
+    assert len(ids) == 4 * N
+    assert len({Run.open(run).manifest.spec.scenes_hash for run in runs.values()}) == 1
+
+
+def test_a_label_is_its_outcome_and_execution_begins_from_the_plan(runs: dict[str, Path]) -> None:
+    plan, sim, disturbed = (arrays_of(runs[name]) for name in ("plan", "sim", "disturbed"))
+    success = list(OUTCOMES).index("success")
+    for arrays in (plan, sim, disturbed):
+        np.testing.assert_array_equal(arrays["label"] == 1, arrays["outcome"] == success)
+    not_planned = plan["label"] == 0
+    assert 0 < not_planned.sum() < N
+    np.testing.assert_array_equal(sim["outcome"][not_planned], plan["outcome"][not_planned])
+    assert (sim["trials"][not_planned] == 0).all() and (sim["trials"][~not_planned] == 1).all()
+    assert (disturbed["trials"][~not_planned] == 2).all()
+    assert not ({"base_collision"} & {list(OUTCOMES)[code] for code in plan["outcome"]})  # all are clear
+
+
+def test_specifications_hold_the_arm_and_what_moves_it(runs: dict[str, Path]) -> None:
+    plan, sim, disturbed = (Run.open(runs[name]).manifest for name in ("plan", "sim", "disturbed"))
+    arms = [manifest.spec.arm for manifest in (plan, sim, disturbed)]
+    assert all(arm is not None and arm.grasps.per_object == 40 for arm in arms)
+    assert [arm is not None and arm.trial is not None for arm in arms] == [False, True, True]
+    assert [arm is not None and arm.disturbance is not None for arm in arms] == [False, False, True]
+    for manifest in (plan, sim, disturbed):
+        assert {"pin", "coal", "mani_skill", "sapien", "scenes", "labels"} <= manifest.spec.engines.keys()
+        assert {"pin", "coal", "mani_skill"} <= manifest.libraries.keys()
+    assert not Run.open(runs["heuristic"]).manifest.spec.engines.keys() & {"pin", "coal", "mani_skill"}
+
+
+def test_the_audit_holds_every_source_against_the_next(
+    runs: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Named in another order: what is nearer to the truth counts as it.
+    places = [str(runs[name]) for name in ("disturbed", "plan", "heuristic", "sim")]
+    report = json_of(capsys, ["audit", *places])
+    assert [source["label_source"] for source in report["sources"]] == ["heuristic", "plan", "sim"]
+    assert [source["labels"] for source in report["sources"]] == [N, N, 2 * N]
+    assert [source["projection"]["paper_days"] for source in report["sources"]] == [3.0, None, 21.0]
+    assert "outcomes" not in report["sources"][0]
+    plan = arrays_of(runs["plan"])
+    outcomes = report["sources"][1]["outcomes"]["outcomes"]
+    assert sum(row["count"] for row in outcomes) == N
+    for row in outcomes:
+        assert row["count"] == int((plan["outcome"] == list(OUTCOMES).index(row["outcome"])).sum())
+        assert row["stage"] == OUTCOMES[row["outcome"]]
+    assert [(r["over"], r["source"]) for r in report["ratios"]] == [
+        ("heuristic", "plan"), ("heuristic", "sim"), ("plan", "sim")
+    ]  # fmt: skip
+    who = [
+        tuple((side["label_source"], side["disturbed"]) for side in (pair["said_by"], pair["true_by"]))
+        for pair in report["pairs"]
+    ]
+    fidelities = [("heuristic", False), ("plan", False), ("sim", False), ("sim", True)]
+    assert who == [(a, b) for k, a in enumerate(fidelities) for b in fidelities[k + 1 :]]
+    assert all(pair["count"] == N for pair in report["pairs"])
+    assert cli.run(["audit", *places]) == 0
+    told = capsys.readouterr().out
+    assert "plan against sim" in told and "sim against sim disturbed" in told and "decided by" in told
