@@ -139,7 +139,7 @@ class MotionParams(_Frozen):
     # Spacing of the configurations at which a path is checked against the scene.
     check_step_rad: float = Field(default=0.05, gt=0, le=1.0)
     # Counts, never a time: labels must not depend on how fast a machine is. Both are of one candidate.
-    max_grasps_tried: int = Field(default=12, ge=1, le=10_000)
+    max_grasps_tried: int = Field(default=24, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Distance that the arm keeps from everything, and the hand up to the pregrasp.
     margin_m: Metres = 0.005

@@ -22,6 +22,7 @@ STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_pa
 _STARTS = 3  # tucked poses from which a straight line is tried
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
+_SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
 @dataclass(eq=False)
@@ -51,7 +52,7 @@ def plan_candidate(
     T_base_world = inverse(T_world_base)
     T_base_tcp = np.matmul(T_base_world, prepared.T_world_tcp[rows])
     distance, seeds = prepared.moving.table.nearest(T_base_tcp, prepared.params.ik_seeds)
-    order = order_by_distance(distance, prepared.moving.table.limit_m)[: prepared.params.max_grasps_tried]
+    order = order_by_distance(distance)[: prepared.params.max_grasps_tried]
     if len(order) == 0:
         return PlanReport("no_ik", None, prepared.grasps_free, 0)
     at = surroundings(prepared, T_world_base)
@@ -68,60 +69,58 @@ def plan_candidate(
 
 
 def _try_grasp(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tuple[str, MotionPlan | None]:
+    """The arm's ways to take one grasp, one a seed, until one leads to a whole plan."""
+    scene, furthest = search.at.scene, "no_ik"
+    params = scene.params
+    T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
+    T_up = np.stack(
+        [search.T_base_world @ raised(scene.T_world_tcp[k], float(r)) for r in line_offsets_m(params.lift_m)]
+    )
+    seen: list[F64] = []
+    for seed in seeds_rad:
+        q_grasp = scene.robot.ik(T_base_tcp, seed)
+        if q_grasp is None or any(np.abs(q_grasp - q).max() < _SAME_RAD for q in seen):
+            continue
+        seen.append(q_grasp)
+        outcome, plan = _try_arm(search, k, q_grasp, T_back, T_up)
+        furthest = max(furthest, outcome, key=STAGES.index)
+        if plan is not None or outcome == "no_start":
+            return outcome, plan
+    return furthest, None
+
+
+def _try_arm(search: _Search, k: int, q_grasp: F64, T_back: F64, T_up: F64) -> tuple[str, MotionPlan | None]:
+    """On from joints at grasp `k`; `T_back` and `T_up` (K, 4, 4) are the hand's lines away from it."""
     at, scene = search.at, search.at.scene
-    outcome, ends = _ends(search, k, T_base_tcp, seeds_rad)
-    if ends is None:
-        return outcome, None
-    q_grasp, q_pregrasp = ends
+    q_pregrasp = scene.robot.ik(T_back[-1], q_grasp)
+    if q_pregrasp is None:
+        return "no_ik", None
     opening_m = float(scene.opening_m[k])
+    if (
+        at.is_base_stuck
+        or at.first_arm_blocked(q_grasp[None], is_target_held=False) == 0
+        or at.first_blocked(q_pregrasp[None], opening_m) == 0
+    ):
+        return "arm_collision", None
     homes = np.flatnonzero(at.free_homes(opening_m))
     if len(homes) == 0:
         return "no_start", None
-    params = scene.params
-    backs_m = line_offsets_m(params.pregrasp_m)
-    T_line = np.stack([backed(T_base_tcp, float(b)) for b in backs_m])
-    approach = follow_line(at, T_line, q_grasp, q_pregrasp, is_target_held=False)
-    if approach is None:
+    back = follow_line(at, T_back, q_grasp, q_pregrasp, is_target_held=False)
+    if back is None:
         return "no_approach", None
-    T_line = np.stack(
-        [search.T_base_world @ raised(scene.T_world_tcp[k], float(r)) for r in line_offsets_m(params.lift_m)]
-    )
-    lift = follow_line(at, T_line, q_grasp, None, is_target_held=True)
+    lift = follow_line(at, T_up, q_grasp, None, is_target_held=True)
     if lift is None:
         return "no_lift", None
     found = _reach(search, homes, q_pregrasp, opening_m)
     if found is None:
         return "no_path", None
     home, q_reach = found
-    q_approach = approach[::-1]
-    length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in (q_reach, q_approach))
+    approach = back[::-1]
+    length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in (q_reach, approach))
     some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
     clearance_m = at.clearance_m(q_reach[some], opening_m)
-    plan = MotionPlan(int(scene.grasp[k]), home, q_reach, q_approach, lift, opening_m, length, clearance_m)
+    plan = MotionPlan(int(scene.grasp[k]), home, q_reach, approach, lift, opening_m, length, clearance_m)
     return "success", plan
-
-
-def _ends(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tuple[str, tuple[F64, F64] | None]:
-    """Joints at grasp and pregrasp, both free, from the first seed that leads to such a pair."""
-    at, robot = search.at, search.at.scene.robot
-    T_pregrasp = backed(T_base_tcp, at.scene.params.pregrasp_m)
-    opening_m = float(at.scene.opening_m[k])
-    outcome = "no_ik"
-    for seed in seeds_rad:
-        q_grasp = robot.ik(T_base_tcp, seed)
-        if q_grasp is None:
-            continue
-        if at.is_base_stuck or at.first_arm_blocked(q_grasp[None], is_target_held=False) == 0:
-            outcome = "arm_collision"
-            continue
-        q_pregrasp = robot.ik(T_pregrasp, q_grasp)
-        if q_pregrasp is None:
-            continue
-        if at.first_blocked(q_pregrasp[None], opening_m) == 0:
-            outcome = "arm_collision"
-            continue
-        return "success", (q_grasp, q_pregrasp)
-    return outcome, None
 
 
 def _reach(search: _Search, homes: np.ndarray, q_pregrasp: F64, opening_m: float) -> tuple[int, F64] | None:

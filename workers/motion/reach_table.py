@@ -13,10 +13,10 @@ from workers.motion.collision import Ints
 from workers.motion.forward import ForwardKinematics
 from workers.robots.robot import Robot
 
-_SAMPLES = 8192
-_PROBES = 512
+_SAMPLES = 16384
+_PROBES = 1024
 # Poses further from all samples than this share of reachable ones are not asked for.
-_QUANTILE = 0.99
+_QUANTILE = 0.97
 _METRES_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions
 
 
@@ -35,9 +35,14 @@ class ReachTable:
     upper_rad: F64  # (A,)
 
     def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
-        """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A)."""
+        """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
+
+        Beyond the limit distances are infinite and seeds are of no use.
+        """
         features, azimuth = _features(T_base_tcp, self.turns)
-        distance, row = self.tree.query(features, k=list(range(1, count + 1)))
+        ranks = list(range(1, count + 1))
+        distance, row = self.tree.query(features, k=ranks, distance_upper_bound=self.limit_m)
+        row = np.where(np.isfinite(distance), row, row[:, :1]) % len(self.q_rad)
         seeds = self.q_rad[row]
         if self.turns:
             seeds[:, :, 0] += azimuth[:, None] - self.azimuth_rad[row]
@@ -76,7 +81,7 @@ def _features(T_base_tcp: F64, turns: bool) -> tuple[F64, F64]:
     return turned.reshape(len(p), 9), azimuth
 
 
-def order_by_distance(distance_m: F64, limit_m: float) -> Ints:
-    """Rows within the limit, nearest first."""
+def order_by_distance(distance_m: F64) -> Ints:
+    """Rows at finite distances, nearest first."""
     rows = np.argsort(distance_m, kind="stable")
-    return rows[distance_m[rows] <= limit_m]
+    return rows[np.isfinite(distance_m[rows])]

@@ -57,7 +57,7 @@ def test_reachable_poses_lie_near_the_table_and_its_seeds_lead_there(robot: Robo
     table = reach_table(robot, kinematics)
     T = kinematics.tcp(joints(robot, 100))
     distance, seeds = table.nearest(T, 3)
-    assert (distance <= table.limit_m).mean() > 0.95
+    assert np.isfinite(distance).mean() > 0.9
     assert ((seeds >= robot.q_lower_rad) & (seeds <= robot.q_upper_rad)).all()
     solved = [any(robot.ik(T[k], s) is not None for s in seeds[k]) for k in range(len(T))]
     assert np.mean(solved) > 0.9
@@ -69,5 +69,5 @@ def test_the_table_refuses_what_is_far_out_of_reach() -> None:
     far = np.tile(np.eye(4), (2, 1, 1))
     far[:, 0, 3] = (1.5, -2.0)
     distance, _ = table.nearest(far, 1)
-    assert len(order_by_distance(distance, table.limit_m)) == 0
-    np.testing.assert_array_equal(order_by_distance(np.array([0.3, 0.1, 0.2, 0.9]), 0.5), [1, 2, 0])
+    assert len(order_by_distance(distance)) == 0
+    np.testing.assert_array_equal(order_by_distance(np.array([0.3, 0.1, np.inf, 0.2])), [1, 3, 0])
