@@ -67,7 +67,7 @@ FETCH = RobotDescription(
     lift=TorsoLift(joint="torso_lift_joint", mount_at_zero_m=0.72601),
     # A shelf for the arm and a neck stand out of it, between which the arm turns.
     cuts_m={"torso_lift_link": (0.18, 0.304, 0.47)},
-    # They lie below the base's own hull but for the tread, which dips 5 mm into the floor.
+    # They lie within the base's outline, and their treads dip 5 mm into the floor.
     shapeless=("r_wheel_link", "l_wheel_link"),
     held={"head_pan_joint": 0.0, "head_tilt_joint": 0.0},
 )

@@ -88,8 +88,8 @@ def outer_hull(points: F64) -> F64:
     """Corners (V, 3) of a polytope that contains all points; their hull itself where it has few corners.
 
     Takes the points furthest out in 26 directions, then again and again those furthest outside of the
-    hull of those taken, each over a face of its own. What still stands out of a face pushes the face's corners along its
-    normal until nothing does.
+    hull of those taken, each over a face of its own. What still stands out of a face pushes the face's
+    corners along its normal until nothing does.
     """
     hull = ConvexHull(points)
     if len(hull.vertices) <= MAX_CORNERS:

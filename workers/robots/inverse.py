@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio
-from scipy.linalg.lapack import dposv
+from scipy.linalg import lapack
 
 from workers.geometry.mesh import F64
 
-# Its binary modules have no types.
+# Binary modules have no types.
 pin: Any = pinocchio
+_lapack: Any = lapack
 
 POSITION_TOLERANCE_M = 0.0005
 ANGLE_TOLERANCE_RAD = float(np.radians(0.5))
@@ -50,7 +51,7 @@ def solve(model: Any, data: Any, frame: int, T_base_tcp: F64, q_seed_rad: F64) -
         J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL)
         H = J.dot(J.T)
         H.flat[::7] += _DAMPING + _DAMPING_PER_ERROR * squared
-        dq = J.T.dot(dposv(H, error)[1])
+        dq = J.T.dot(_lapack.dposv(H, error)[1])
         longest = max(map(abs, dq.tolist()))
         if longest > _LONGEST_STEP_RAD:
             dq *= _LONGEST_STEP_RAD / longest

@@ -245,12 +245,15 @@ def rotation_rpy(R: F64) -> F64:
 
 
 def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
-    """The body `scale` times as long, of the same density: mass by the cube, inertia by the fifth power."""
+    """The body `scale` times as long and as heavy as before, so that its inertia grows with the square.
+
+    At equal density the hand would weigh many times what a short arm does, and PhysX's drives, solved in
+    few iterations, would sag under it by degrees.
+    """
     return replace(
         inertial,
-        mass_kg=inertial.mass_kg * scale**3,
         centre_m=inertial.centre_m * scale,
-        inertia_kgm2=inertial.inertia_kgm2 * scale**5,
+        inertia_kgm2=inertial.inertia_kgm2 * scale**2,
     )
 
 

@@ -1,0 +1,139 @@
+"""Constants of the robots' files against the URDFs and meshes that they cite."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+
+from workers.geometry.transforms import inverse
+from workers.robots import open_robot
+from workers.robots.arm import Arm
+from workers.robots.description import RobotDescription, robots_folder
+from workers.robots.fetch import FETCH
+from workers.robots.franka_hand import FRANKA_HAND
+from workers.robots.hulls import MAX_CORNERS, excess_m, mesh_hulls, outer_hull, read_points
+from workers.robots.panda import PANDA, PANDA_SCALED
+from workers.robots.urdf import Tree, read_urdf
+from workers.robots.xarm7 import XARM7
+
+
+def tree_of(description: RobotDescription) -> Tree:
+    return read_urdf(robots_folder() / description.urdf)
+
+
+def test_the_franka_hand() -> None:
+    tree = tree_of(PANDA)
+    np.testing.assert_allclose(FRANKA_HAND.T_palm_tcp, tree.joint("panda_hand_tcp_joint").T_parent_child)
+    np.testing.assert_allclose(PANDA.T_flange_palm, tree.joint("panda_hand_joint").T_parent_child, atol=1e-15)
+    pad = tree.link("panda_leftfinger").collisions[3]
+    assert pad.box_m is not None
+    assert FRANKA_HAND.pad_size_m == (pad.box_m[0], pad.box_m[2])
+    centre = tree.joint("panda_finger_joint1").T_parent_child @ pad.T_link_shape
+    assert abs((inverse(FRANKA_HAND.T_palm_tcp) @ centre)[2, 3]) < 0.0003  # as the file says
+    gripper = open_robot("panda", None, 0.8).gripper
+    assert gripper.max_opening_m == 0.08 and gripper.palm_depth_m == pytest.approx(0.0374, abs=2e-3)
+
+
+def test_fetch() -> None:
+    tree = tree_of(FETCH)
+    assert FETCH.lift is not None and FETCH.limits.base_height_m is not None
+    torso, mount = tree.joint("torso_lift_joint"), tree.joint("shoulder_pan_joint")
+    at_zero = torso.T_parent_child[2, 3] + mount.T_parent_child[2, 3]
+    assert FETCH.lift.mount_at_zero_m == pytest.approx(at_zero, abs=1e-9)
+    low, high = FETCH.limits.base_height_m
+    assert at_zero + torso.lower <= low < at_zero + torso.lower + 1e-3
+    assert at_zero + torso.upper - 1e-3 < high <= at_zero + torso.upper
+    np.testing.assert_allclose(FETCH.T_flange_palm, tree.joint("gripper_axis").T_parent_child)
+    points, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/base_link_collision.STL")
+    offset = (torso.T_parent_child @ mount.T_parent_child)[:2, 3]
+    assert np.hypot(*(points[:, :2] - offset).T).max() <= FETCH.limits.base_radius_m
+    finger, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/r_gripper_finger_link.STL")
+    np.testing.assert_allclose(FETCH.hand.pad_size_m, np.ptp(finger, axis=0)[[2, 0]], atol=1e-3)
+    # The wheels lie within the base's outline; their treads dip into the floor.
+    base = ConvexHull(points[:, :2]).equations
+    for name in FETCH.shapeless:
+        wheel = tree.link(name).collisions[0]
+        assert wheel.mesh is not None
+        corners = read_points(wheel.mesh)[0] + tree.joint_above(name).T_parent_child[:3, 3]
+        assert (corners[:, :2] @ base[:, :2].T + base[:, 2]).max() < 0.0
+        assert corners[:, 2].max() < points[:, 2].max()
+        assert corners[:, 2].min() > -0.006 < 0.0
+
+
+@pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+def test_joints_are_those_of_the_urdf(description: RobotDescription) -> None:
+    tree, robot = tree_of(description), open_robot(description.name, None, 0.8)
+    for k, name in enumerate(description.arm_joints):
+        joint = tree.joint(name)
+        free = joint.kind == "continuous"
+        assert robot.q_lower_rad[k] == (-np.pi if free else max(joint.lower, -2 * np.pi))
+        assert robot.q_upper_rad[k] == (np.pi if free else min(joint.upper, 2 * np.pi))
+        assert robot.speed_limit_radps[k] == joint.speed
+
+
+@pytest.mark.parametrize("description", [PANDA, XARM7, FETCH], ids=lambda d: d.name)
+def test_hulls_contain_their_meshes_and_stand_out_little(description: RobotDescription) -> None:
+    # docs/robots.md states these.
+    allowed: Mapping[str, float] = {"base_link": 0.009, "torso_lift_link": 0.005, "head_pan_link": 0.005}
+    for link in tree_of(description).links.values():
+        for shape in link.collisions:
+            if shape.mesh is None or link.name in description.shapeless:
+                continue
+            cuts = description.cuts_m.get(link.name, ())
+            points, _ = read_points(shape.mesh)
+            hulls = mesh_hulls(shape.mesh, cuts)
+            inside = np.zeros(len(points), bool)
+            for hull in hulls:
+                faces = ConvexHull(hull).equations
+                inside |= (points @ faces[:, :3].T + faces[:, 3]).max(axis=1) < 1e-7
+                assert len(hull) <= MAX_CORNERS
+                if not cuts:
+                    assert excess_m(hull, points) < allowed.get(link.name, 0.0041)
+            assert inside.all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 400), flat=st.floats(0.05, 1.0))
+def test_outer_hulls_contain_any_points(seed: int, count: int, flat: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3))
+    points *= (flat, 1.0, 2.0) / np.linalg.norm(points, axis=1, keepdims=True)  # all on the hull
+    corners = outer_hull(points)
+    assert len(corners) <= MAX_CORNERS
+    faces = ConvexHull(corners).equations
+    assert (points @ faces[:, :3].T + faces[:, 3]).max() < 1e-9
+    assert ConvexHull(corners).volume < 1.25 * ConvexHull(points).volume
+
+
+def test_the_wrist_extension_ends_where_it_should() -> None:
+    """No tube from half a metre on; below it one that fills the gap between flange and hand."""
+    rule = PANDA_SCALED.extension
+    assert rule is not None
+    for reach_m, length_m in ((0.3, 0.05), (0.4, 0.025), (0.5, 0.0), (0.9, 0.0)):
+        robot = open_robot("panda-scaled", reach_m, 0.8)
+        T = robot.T_base_link(robot.homes_rad[0])
+        wrist, hand = robot.link_names.index("panda_link7"), robot.link_names.index("panda_hand")
+        offset = (inverse(T[wrist]) @ T[hand])[2, 3]
+        assert offset == pytest.approx(0.107 * robot.scale + length_m, abs=1e-12)
+        assert len(robot.link_parts_m[wrist]) == (2 if length_m else 1)
+        if length_m:
+            tube = robot.link_parts_m[wrist][1]
+            assert np.ptp(tube[:, 2]) == pytest.approx(length_m, abs=1e-6)
+            assert np.hypot(tube[:, 0], tube[:, 1]).max() == pytest.approx(rule.radius_m, rel=0.05)
+
+
+def test_without_the_extension_the_hand_would_meet_the_forearm() -> None:
+    assert PANDA_SCALED.extension is not None
+    bare = replace(PANDA_SCALED, extension=replace(PANDA_SCALED.extension, longest_m=0.0))
+    pairs = {
+        length_m: {(robot.link_names[a], robot.link_names[b]) for a, b in robot.self_pairs}
+        for length_m, robot in ((0.05, open_robot("panda-scaled", 0.3, 0.8)), (0.0, Arm(bare, 0.3, 0.8)))
+    }
+    # They touch in most poses, and the rule that drops such pairs would hide it.
+    assert ("panda_link5", "panda_hand") in pairs[0.05] - pairs[0.0]
