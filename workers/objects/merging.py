@@ -67,7 +67,7 @@ def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
     Greedy: at each step the pair is joined whose hull reaches least far out of the union of all
     original parts, and of equal ones that which adds least volume. So a wall becomes a few even
     sectors, and an opening, which reaches far, is closed last. By volume alone thin slivers come
-    first, whatever they reach across (a wall and its floor, 27 mm deep in one cup).
+    first, whatever they reach across: the corner between a wall and its floor.
 
     Where there are `limit` parts or fewer they are returned as they are. Else the result depends
     neither on the order of the parts nor on that of their vertices; it is kept in memory and in the
