@@ -63,7 +63,7 @@ def _try_scene(
         if not surfaces:
             raise Redraw("no_surface")
         surface = surfaces[rng.integers(len(surfaces))]
-        names = _draw_names(world, rng)
+        names = _draw_names(world, rng, clock)
         models = tuple(world.object(name).model for name in names)
         taken = standing_footprints(house.house, surface)
         start = drop_poses(models, surface, taken, spec.scene, rng)
@@ -100,9 +100,10 @@ def _load_house(world: World, house_id: str) -> PreparedHouse:
         raise Redraw("bad_house", str(error)) from error
 
 
-def _draw_names(world: World, rng: np.random.Generator) -> list[str]:
+def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:
     """The target first, then clutter, all different."""
-    target = world.draw_target(rng)
+    with clock.stage("draw" if world.spec.arm is None else "grasps"):
+        target = world.draw_target(rng)
     others = [name for name in world.object_names if name != target]
     clutter = rng.choice(len(others), size=world.spec.scene.n_clutter, replace=False)
     return [target, *(others[k] for k in clutter)]
