@@ -51,11 +51,8 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     if not (math.isfinite(base_height_m) and bottom <= base_height_m <= top):
         mend = _within("base height", bottom, top)
         raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", mend)
-    if description.lift is not None:
-        return _built(name, None, base_height_m)
-    # Pedestals of any height carry the same arm.
-    scaled = reach_m if description.extension is not None else None
-    return _built(name, scaled, 0.0).at_height(base_height_m)
+    own = description.extension is None
+    return _mounted(name, None if own else reach_m, base_height_m)
 
 
 def gripper_of(name: str) -> Gripper:
@@ -70,11 +67,18 @@ def _description(name: str) -> RobotDescription:
 
 
 @lru_cache(maxsize=64)
-def _built(name: str, reach_m: float | None, base_height_m: float) -> Arm:
-    # Imported here, so that limits can be read without a simulator.
-    from workers.robots.arm import Arm
+def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Arm:
+    if _description(name).lift is not None:
+        return _built(name, reach_m, base_height_m)
+    # Pedestals of any height carry the same arm.
+    return _built(name, reach_m, 0.0).at_height(base_height_m)
 
-    return Arm(_description(name), reach_m, base_height_m)
+
+@lru_cache(maxsize=64)
+def _built(name: str, reach_m: float | None, base_height_m: float) -> Arm:
+    # Imported when asked for, so that limits can be read without a simulator.
+    build = entry({name: "workers.robots.arm:Arm"}, name, "--robot")
+    return build(_description(name), reach_m, base_height_m)
 
 
 def _within(what: str, low: float, high: float) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from schemas.errors import InputError
 from workers.geometry.mesh import F64
+from workers.registry import SIM_MEND
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,5 @@ def robots_folder() -> Path:
     spec = find_spec("mani_skill")
     folders = list(spec.submodule_search_locations or []) if spec else []
     if not folders:
-        mend = "Install the extra that brings it: pip install 'datagen[sim]'"
-        raise InputError("--robot", "mani_skill", "the package is not installed", mend)
+        raise InputError("--robot", "mani_skill", "the package is not installed", SIM_MEND)
     return Path(folders[0]) / "assets" / "robots"

@@ -1,6 +1,8 @@
 """What `open_robot` refuses, and what it keeps."""
 
 import math
+import subprocess
+import sys
 
 import pytest
 
@@ -35,6 +37,16 @@ def test_wrong_arguments_name_the_option_and_the_range(
     assert refused.value.place == "--robot" and said in str(refused.value)
 
 
+@pytest.mark.parametrize("module", ["pinocchio", "mani_skill"])
+def test_a_missing_library_is_named_with_the_extra_that_brings_it(module: str) -> None:
+    hide = f"import sys; sys.modules['{module}'] = None"
+    ask = "from workers.robots import open_robot, robot_limits; robot_limits('panda')"
+    code = f"{hide}\n{ask}\nopen_robot('panda', None, 0.8)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "InputError: --robot" in done.stderr and "datagen[sim]" in done.stderr
+
+
 def test_limits_are_those_that_open() -> None:
     for name in ("panda", "xarm7", "fetch"):
         limits = robot_limits(name)
@@ -48,6 +60,7 @@ def test_limits_are_those_that_open() -> None:
 def test_pedestals_share_an_arm_and_torsos_do_not() -> None:
     low, high = open_robot("panda-scaled", 0.7, 0.5), open_robot("panda-scaled", 0.7, 0.9)
     assert (low.base_height_m, high.base_height_m) == (0.5, 0.9)
+    assert open_robot("panda-scaled", 0.7, 0.9) is high
     assert low.urdf == high.urdf and low.link_parts_m is high.link_parts_m
     low, high = open_robot("fetch", None, 0.8), open_robot("fetch", None, 1.0)
     assert low.urdf != high.urdf
