@@ -1,0 +1,187 @@
+"""Executed trials: what they cost, by part; the same in ManiSkill; what solver and timestep decide.
+
+    python -m benchmarks.trials [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 12] [--maniskill 6]
+                                [--solver]
+
+Planned candidates (clear and in range) are drawn as a run draws them, and their first plan is executed.
+CPU seconds of this process; a rate is for one core. The first `--maniskill` of them are executed again in
+`DatagenGrasp-v1` on `physx_cpu`, built anew each as a trial is; loading ManiSkill is not counted.
+`--solver` repeats all with other solver settings, each at its timestep and at half of it, undisturbed
+and disturbed, and counts the successes that flip.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.physical_sense import Case, planned_cases
+from schemas.identity import Stream, generator
+from schemas.specification import DisturbanceParams, Specification, TrialParams
+from workers.labels.trials import arm_of, draw_disturbances
+from workers.trials import physics
+from workers.trials.execute import TrialScene, prepare_trials, run_trial
+from workers.trials.prepared import pedestal_below, still_parts_near
+from workers.trials.trial import Disturbance, TrialResult
+
+
+@dataclass(frozen=True)
+class Solver:
+    """What one row of the solver table changes."""
+
+    position_iterations: int
+    velocity_iterations: int
+    contact_offset_m: float
+    frequency_hz: int
+
+
+SOLVERS = (
+    Solver(15, 1, 0.005, 200),
+    Solver(15, 1, 0.002, 200),
+    Solver(25, 4, 0.005, 200),
+    Solver(40, 8, 0.005, 200),
+    Solver(15, 1, 0.005, 400),
+)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--houses", default="builtin")
+    parser.add_argument("--objects", default="builtin")
+    parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--candidates", type=int, default=40, help="a scene")
+    parser.add_argument("--plans", type=int, default=8, help="most planned candidates taken from a scene")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--maniskill", type=int, default=0, help="trials to execute in ManiSkill, too")
+    parser.add_argument("--solver", action="store_true", help="the table of solver settings")
+    options = parser.parse_args()
+    spec, cases = planned_cases(options)
+    trial = arm_of(spec).trial
+    assert trial is not None
+    print(f"{len(cases)} planned candidates in {options.scenes} scenes")
+    own_s, results = print_cost(cases, trial)
+    if options.maniskill:
+        print_maniskill(cases[: options.maniskill], trial, results, own_s)
+    if options.solver:
+        print_solvers(spec, cases, trial)
+
+
+def print_cost(cases: list[Case], trial: TrialParams) -> tuple[list[float], list[TrialResult]]:
+    """CPU seconds of every trial, and its result."""
+    started_s = time.process_time()
+    prepared = prepare_all(cases, trial)
+    prepare_s = (time.process_time() - started_s) / len(set(map(id, prepared)))
+    spent_s: list[float] = []
+    results: list[TrialResult] = []
+    for case, scene in zip(cases, prepared, strict=True):
+        started_s = time.process_time()
+        results.append(
+            run_trial(scene, case.T_world_base, case.plan, Disturbance.none(trial.object_friction))
+        )
+        spent_s.append(time.process_time() - started_s)
+    build_s = build_time_s(cases, prepared, trial)
+    simulated_s = float(np.mean([r.simulated_s for r in results]))
+    mean_s = float(np.mean(spent_s))
+    print(f"a trial: {1000 * mean_s:.0f} ms ({1 / mean_s:.1f}/s a core) for {simulated_s:.2f} simulated s")
+    print(
+        f"  of which a fresh scene: {1000 * build_s:.0f} ms; preparing a scene, once: {1000 * prepare_s:.0f} ms"
+    )
+    slow_s = np.quantile(spent_s, 0.9)
+    print(f"  90% end within {1000 * slow_s:.0f} ms, all within {1000 * max(spent_s):.0f} ms")
+    print("  " + ", ".join(f"{n} {name}" for name, n in Counter(r.outcome for r in results).most_common()))
+    return spent_s, results
+
+
+def prepare_all(cases: list[Case], trial: TrialParams) -> list[TrialScene]:
+    """The prepared scene of every case, made once a scene and robot."""
+    made: dict[int, TrialScene] = {}
+    for case in cases:
+        if id(case.at) not in made:
+            made[id(case.at)] = prepare_trials(case.at.scene, case.at.robot, trial, case.at.base_radius_m)
+    return [made[id(case.at)] for case in cases]
+
+
+def build_time_s(cases: list[Case], prepared: list[TrialScene], trial: TrialParams) -> float:
+    """Mean CPU seconds until the first step of a trial."""
+    started_s = time.process_time()
+    for case, scene in zip(cases, prepared, strict=True):
+        physics.TrialWorld(
+            still_parts_near(scene, case.T_world_base),
+            pedestal_below(scene, case.T_world_base),
+            physics.Things(scene.parts_m, scene.mass_kg, scene.T_world_object),
+            scene.robot,
+            scene.articulation,
+            case.T_world_base,
+            trial.object_friction,
+            trial,
+        )
+    return (time.process_time() - started_s) / len(cases)
+
+
+def print_maniskill(
+    cases: list[Case], trial: TrialParams, results: list[TrialResult], own_s: list[float]
+) -> None:
+    """The same trials in ManiSkill: time, ratio, agreement."""
+    import gymnasium
+
+    from workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
+
+    spent_s, agree = 0.0, 0
+    for case, scene, result in zip(cases, prepare_all(cases, trial), results, strict=False):
+        task = GraspTask(scene, case.T_world_base, case.plan, Disturbance.none(trial.object_friction))
+        env = gymnasium.make(ENV_ID, tasks=[task], obs_mode="none", reward_mode="none")
+        unwrapped = env.unwrapped
+        assert isinstance(unwrapped, DatagenGraspEnv)
+        started_s = time.process_time()
+        success = bool(execute_plans(unwrapped)[0])  # resets, which builds a fresh scene
+        spent_s += time.process_time() - started_s
+        agree += success == (result.outcome == "success")
+        env.close()
+    n = len(cases)
+    ratio = spent_s / sum(own_s[:n])
+    print(f"\nthe first {n} in ManiSkill: {1000 * spent_s / n:.0f} ms a trial ({n / spent_s:.2f}/s a core),")
+    print(f"  {ratio:.1f} times as long as the trials here; the same success in {agree} of {n}")
+
+
+def print_solvers(spec: Specification, cases: list[Case], trial: TrialParams) -> None:
+    """Successes that flip when the timestep is halved, for every row of SOLVERS."""
+    head = "undisturbed: success, flips   disturbed: success, flips"
+    print(f"\n{'iterations':>11}{'offset':>8}{'rate':>7}{'ms':>6}   {head}")
+    for solver in SOLVERS:
+        physics.POSITION_ITERATIONS = solver.position_iterations
+        physics.VELOCITY_ITERATIONS = solver.velocity_iterations
+        physics.CONTACT_OFFSET_M = solver.contact_offset_m
+        text, spent_s = "", 0.0
+        for disturbed in (False, True):
+            rows: list[np.ndarray] = []
+            for factor in (1, 2):
+                params = trial.model_copy(update={"timestep_s": 1 / (solver.frequency_hz * factor)})
+                started_s = time.process_time()
+                rows.append(successes(spec, cases, params, disturbed))
+                spent_s += time.process_time() - started_s if factor == 1 and not disturbed else 0.0
+            text += f"{rows[0].mean():20.3f}{int((rows[0] != rows[1]).sum()):4d} of {len(cases)}"
+        its = f"{solver.position_iterations}/{solver.velocity_iterations}"
+        milli_s, offset_mm = 1000 * spent_s / len(cases), 1000 * solver.contact_offset_m
+        print(f"{its:>11}{offset_mm:6.0f}mm{solver.frequency_hz:5d}Hz{milli_s:6.0f}{text}", flush=True)
+
+
+def successes(spec: Specification, cases: list[Case], params: TrialParams, disturbed: bool) -> np.ndarray:
+    """Whether the first plan (N,) of every case succeeds, in the planned world or in one disturbed one."""
+    out: list[bool] = []
+    for k, (case, scene) in enumerate(zip(cases, prepare_all(cases, params), strict=True)):
+        disturbance = Disturbance.none(params.object_friction)
+        if disturbed:
+            rng = generator(spec.seed, Stream.DISTURBANCE, k)
+            T_world_target = case.at.scene.T_world_object[0]
+            disturbance = draw_disturbances(DisturbanceParams(repeats=1), T_world_target, rng)[0]
+        out.append(run_trial(scene, case.T_world_base, case.plan, disturbance).outcome == "success")
+    return np.array(out)
+
+
+if __name__ == "__main__":
+    main()
