@@ -41,7 +41,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     stored = tuple(OUTCOMES)[int(shown.rows.samples["outcome"][row])]
     title = Title(
         LOOKS[outcome].colour,
-        f"candidate {row}: {outcome} ({LOOKS[outcome].words})",
+        f"candidate {row}: {outcome} ({_words(retrial)})",
         (
             f"{shown.title}   target {shown.target}",
             f"{arm.robot}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high"
@@ -74,6 +74,12 @@ def _candidate(shown: Shown, candidate: int | None) -> int:
         problem = f"{candidate} is no candidate of scene {scene}"
         raise InputError(shown.run, "--trial", problem, f"Choose one from 0 to {count - 1}")
     return candidate
+
+
+def _words(retrial: Retrial) -> str:
+    if retrial.trial.outcome != "success":
+        return LOOKS[retrial.trial.outcome].words
+    return "a whole plan" if retrial.result is None else "lifted and held"
 
 
 def _measured(retrial: Retrial) -> str:

@@ -24,7 +24,7 @@ Told = tuple[tuple[int, str], ...]  # rows of a recording, and what they are
 _WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the middle of what it shows
 _LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
 _FOLLOWED_M = 1.0  # a target that fell farther is not kept in the picture
-_OUTLINE_RGB = (255, 45, 111)  # the target's, as in the frame of every scene's picture
+OUTLINE_RGB = (255, 45, 111)  # the target's, as in the frame of every scene's picture
 
 # Moments that tell a trial: phase, share of it, words.
 _MOMENTS = (
@@ -83,7 +83,10 @@ def film_of(
 ) -> Film:
     """Choose both views of a trial of which the moments `told` matter; sizes are (width, height)."""
     named = {words: moment for moment, words in told}
-    shown = sorted({0, named.get("at the grasp", len(recording.phase) // 2), len(recording.phase) - 1})
+    middle = len(recording.phase) // 2
+    shown = sorted(
+        {0, named.get("on the way", 0), named.get("at the grasp", middle), len(recording.phase) - 1}
+    )
     moments = [_stage(recalled, bodies, T_world_base, recording, m) for m in shown]
     n_objects = len(recalled.models)
     hand = tuple(n_objects + k for k in bodies.hand)
@@ -94,12 +97,12 @@ def film_of(
     forward = T_world_base[:3, 0]
     house = recalled.house.house
     wide = Subject(
-        moments, ((arm, 1.0), (hand, 1.0), ((0,), 1.0)),
+        moments, ((arm, 1.0), (hand, 1.5), ((0,), 1.5)),
         np.concatenate([_around(origins_m, _LINK_M), _around(target_m, _LINK_M)]), forward,
     )  # fmt: skip
     grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
     half_m = max(_NEAR_HALF_M, float(recalled.models[0].radius_m) + 0.03)
-    near = Subject(moments[1:] or moments, ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
+    near = Subject(moments[-2:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
     return Film(
         recalled, bodies, T_world_base, recording, told,
         choose_shot(house, wide, _WIDE_M, *wide_px), choose_shot(house, near, _NEAR_M, *near_px),
@@ -151,7 +154,7 @@ class Lens:
             seen = rows[nearer]
             rgb[seen], depth_m[seen], target[seen] = front.rgb[nearer], front.depth_m[nearer], k == 0
         if self.outlined:
-            rgb[self._border(target)] = _OUTLINE_RGB
+            rgb[self._border(target)] = OUTLINE_RGB
         h, w, s = self.camera.height_px, self.camera.width_px, self.sharpness
         fine = rgb.reshape(h // s, s, w // s, s, 3).astype(np.uint16)
         return (fine.sum((1, 3)) // (s * s)).astype(np.uint8)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from datagen.drawing.film import Film, pictures
+from datagen.drawing.film import OUTLINE_RGB, Film, pictures
 from datagen.drawing.film_camera import Shot
 from workers.geometry.mesh import U8
 
@@ -73,8 +73,8 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
         for moment, (wide, near) in zip(moments, pictures(film, list(moments), 1), strict=True)
     ]
     # One palette for all, so that what stands still stays the same and costs nothing.
-    sample = Image.fromarray(np.concatenate([np.asarray(f) for f in frames[:: max(1, len(frames) // 4)]]))
-    palette = sample.quantize(256, dither=Image.Dither.NONE)
+    sample = np.concatenate([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 4)]])
+    palette = Image.fromarray(np.concatenate([sample, _swatches(title, sample.shape[1])])).quantize(256)
     shown = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     step_ms = round(1000 * seconds / max(len(shown) - 1, 1))
     shown[0].save(
@@ -85,6 +85,22 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
         loop=0,
         optimize=False,
     )
+
+
+def _swatches(title: Title, width: int) -> U8:
+    """Areas of the colours that mean something, so large that a palette keeps them."""
+    kept = [
+        ImageColor.getrgb(title.colour),
+        OUTLINE_RGB,
+        *_PHASE_RGB.values(),
+        *map(_paled, _PHASE_RGB.values()),
+    ]
+    return np.repeat(np.array(kept, np.uint8)[:, None, :], 60 * width, axis=1).reshape(-1, width, 3)
+
+
+def _paled(rgb: tuple[int, int, int]) -> tuple[int, int, int]:
+    r, g, b = ((c + 3 * 255) // 4 for c in rgb)
+    return r, g, b
 
 
 def _motion_frame(film: Film, title: Title, moment: int, wide: U8, near: U8) -> Image.Image:
@@ -100,8 +116,7 @@ def _motion_frame(film: Film, title: Title, moment: int, wide: U8, near: U8) -> 
     for k, phase in enumerate(phases):
         x0, x1 = (_GAP_PX + full * j / len(phases) for j in (k, k + 1))
         colour = _PHASE_RGB.get(phase, _PALE)
-        pale = tuple((c + 3 * 255) // 4 for c in colour)
-        draw.rectangle((x0, y, x1, y + 5), fill=colour if k <= moment else pale)
+        draw.rectangle((x0, y, x1, y + 5), fill=colour if k <= moment else _paled(colour))
     draw.text((_GAP_PX, y + 9), film.words(moment), _INK, _font(16, bold=True))
     draw.text((_GAP_PX + full, y + 10), _state(film, moment), _PALE, _font(13), anchor="ra")
     return frame
@@ -122,7 +137,7 @@ def _state(film: Film, moment: int) -> str:
     recording = film.recording
     if recording.time_s[-1] == recording.time_s[0]:  # poses, not a motion
         return ""
-    rise_cm = 100 * film.rise_m(moment)
+    rise_cm = round(100 * film.rise_m(moment), 1) + 0.0  # no -0.0
     return (
         f"{recording.time_s[moment] - recording.time_s[0]:.1f} s   "
         f"fingers {100 * recording.opening_m[moment]:.1f} cm   target {rise_cm:+.1f} cm"
