@@ -12,7 +12,7 @@ import numpy.typing as npt
 from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import inverse, rotation_of, translation
 from workers.robots.robot import Gripper, Parts
-from workers.settling.sapien_bodies import add_object, convex_shape, pose_of, sapien_pose
+from workers.settling.sapien_bodies import add_object, convex_shape, sapien_pose
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
@@ -135,15 +135,18 @@ def _slips(
         bodies.append(body)
     for _ in range(round(test.close_s / test.timestep_s)):
         scene.step()
-    before_m = np.array([pose_of(body)[:3, 3] for body in bodies])
+    before_m = _positions(bodies)
     forces_n = (mass_kg * pull_mps2).astype(np.float32)
     for _ in range(round(test.pull_s / test.timestep_s)):
         for body, force_n in zip(bodies, forces_n, strict=True):
             body.add_force_torque(force_n, [0.0, 0.0, 0.0])
         scene.step()
-    after_m = np.array([pose_of(body)[:3, 3] for body in bodies])
-    slip_m = np.linalg.norm(after_m - before_m, axis=1)
+    slip_m = np.linalg.norm(_positions(bodies) - before_m, axis=1)
     return np.where(np.isfinite(slip_m), slip_m, np.inf)
+
+
+def _positions(bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> F64:
+    return np.array([body.entity.pose.p for body in bodies], np.float64).reshape(-1, 3)
 
 
 def _add_hand(

@@ -1,0 +1,17 @@
+"""Grasps are kept in memory and on disk: every test begins with neither."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import workers.grasps.keep
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A fresh cache folder, and nothing in memory."""
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
+    workers.grasps.keep.forget()
+    return tmp_path / "cache"

@@ -1,0 +1,104 @@
+"""Which objects are targets, and how one is drawn."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.specification import GraspParams
+from tests.workers.grasps.shapes import box_gripper
+from tests.workers.worlds import box_model, cylinder_model
+from workers.grasps.targets import Targets, graspability, targets_of
+from workers.objects import open_objects
+from workers.objects.model import ObjectModel
+from workers.robots import open_robot
+from workers.robots.robot import Gripper
+
+GRIPPER = box_gripper()
+FEW = GraspParams(per_object=12)
+MODELS = {
+    m.name: m
+    for m in (
+        box_model("box", (0.05, 0.04, 0.1)),
+        box_model("crate", (0.2, 0.2, 0.2)),
+        box_model("lead", (0.05, 0.05, 0.1), mass_kg=5.0),
+        box_model("slab", (0.15, 0.15, 0.02)),
+        *(cylinder_model(f"065-{k}_cups", 0.02 + 0.002 * i, 0.06) for i, k in enumerate("abcde")),
+        box_model("065_other", (0.03, 0.03, 0.05)),
+    )
+}
+
+
+def test_the_table_says_why_not() -> None:
+    reasons = {
+        name: graspability(MODELS[name], GRIPPER, FEW).reason for name in ("box", "crate", "lead", "slab")
+    }
+    assert reasons["box"] == ""
+    assert "near enough" in reasons["crate"]
+    assert "heavier" in reasons["lead"]
+    assert "table" in reasons["slab"]
+
+
+def test_two_of_each_family_of_sizes_and_those_far_apart() -> None:
+    assert targets_of(list(MODELS), MODELS.__getitem__, GRIPPER, FEW) == [
+        "065-a_cups",
+        "065-e_cups",
+        "065_other",
+        "box",
+    ]
+
+
+def test_a_family_whose_largest_does_not_fit_goes_on_inwards() -> None:
+    sizes = {
+        f"7-{k}_pots": cylinder_model(f"7-{k}_pots", r, 0.06)
+        for k, r in zip("abc", (0.02, 0.03, 0.06), strict=True)
+    }
+    assert targets_of(list(sizes), sizes.__getitem__, GRIPPER, FEW) == ["7-a_pots", "7-b_pots"]
+
+
+def test_drawing_gives_each_target_the_same_chance_and_asks_for_few() -> None:
+    loaded: list[str] = []
+
+    def load(name: str) -> ObjectModel:
+        loaded.append(name)
+        return MODELS[name]
+
+    names = list(MODELS)
+    first = Targets(names, load, GRIPPER, FEW)
+    rng = np.random.default_rng(0)
+    assert first.draw(rng) in {"box", "065-a_cups", "065-e_cups", "065_other"}
+    assert len(loaded) < len(names)
+    drawn = [first.draw(rng) for _ in range(400)]
+    counts = np.unique(np.array(drawn), return_counts=True)[1]
+    assert len(counts) == 4 and counts.min() > 60
+    again = np.random.default_rng(0)
+    assert [Targets(names, load, GRIPPER, FEW).draw(again) for _ in range(3)] == [
+        Targets(names, load, GRIPPER, FEW).draw(rng) for rng in [np.random.default_rng(0)] for _ in range(3)
+    ]
+    assert Targets(["crate"], load, GRIPPER, FEW).draw(rng) is None
+
+
+def franka_hand() -> Gripper:
+    if find_spec("mani_skill") is None:
+        pytest.skip("the robots' files come with mani_skill, which is not installed")
+    return open_robot("panda", None, 0.7).gripper
+
+
+def test_real_things_that_lie_flat_are_targets(assets: Path) -> None:
+    gripper = franka_hand()
+    source = open_objects(f"ycb:{assets / 'ycb'}")
+    for name in ("011_banana", "007_tuna_fish_can", "031_spoon", "026_sponge", "024_bowl"):
+        found = graspability(source.load(name), gripper, GraspParams(per_object=16))
+        assert found.is_target, found
+        assert found.n_clear_held >= 4
+
+
+@pytest.mark.slow
+def test_thirty_varied_targets_among_real_objects(assets: Path) -> None:
+    source = open_objects(f"ycb:{assets / 'ycb'}")
+    targets = targets_of(source.names(), source.load, franka_hand(), GraspParams())
+    assert len(targets) >= 30
+    assert sum("cups" in name for name in targets) == 2
