@@ -89,7 +89,7 @@ def print_cost(cases: list[Case], trial: TrialParams) -> tuple[list[float], list
     mean_s = float(np.mean(spent_s))
     print(f"a trial: {1000 * mean_s:.0f} ms ({1 / mean_s:.1f}/s a core) for {simulated_s:.2f} simulated s")
     print(
-        f"  of which a fresh scene: {1000 * build_s:.0f} ms; preparing a scene, once: {1000 * prepare_s:.0f} ms"
+        f"  of which a fresh scene: {1000 * build_s:.0f} ms; before, once a scene: {1000 * prepare_s:.0f} ms"
     )
     slow_s = np.quantile(spent_s, 0.9)
     print(f"  90% end within {1000 * slow_s:.0f} ms, all within {1000 * max(spent_s):.0f} ms")

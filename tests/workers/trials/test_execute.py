@@ -169,3 +169,18 @@ def test_an_arm_and_no_clutter() -> None:
     scene = scene_with([box_model("target", (0.05, 0.05, 0.12))], [(0.0, 0.0)])
     result = trial(scene)
     assert (result.outcome, result.disturbed_m) == ("success", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "reach_m", "distance_m"),
+    [("panda", None, 0.4), ("xarm7", None, 0.4), ("fetch", None, 0.4), ("panda-scaled", 0.45, 0.2)],
+)
+def test_every_robot_lifts_a_box(name: str, reach_m: float | None, distance_m: float) -> None:
+    robot = open_robot(name, reach_m, 0.8)
+    scene = scene_with([box_model("target", (0.05, 0.05, 0.12))], [(-0.45, 0.0)])
+    base = base_before(robot, 0.45 + distance_m)
+    plan = plan_from_above(robot, base, on_top_m(scene, 0.03), 0.08)
+    # From the pregrasp on: the straight way there from a tucked pose may lead through the table.
+    plan = dataclasses.replace(plan, q_reach_rad=plan.q_approach_rad[[0, 0]])
+    result = run_trial(prepare_trials(scene, robot, PARAMS, 0.1), base, plan, Disturbance.none(0.6))
+    assert (result.outcome, result.lift_m) == ("success", pytest.approx(0.1, abs=0.005))
