@@ -43,6 +43,7 @@ def status_report(run: Run) -> dict[str, Any]:
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
         "spec_hash": run.manifest.spec_hash,
+        "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
         "n": run.n,
         "labels": sum(run.layout.rows_wanted(c.shard, run.n)[1] for c in done),
@@ -87,6 +88,8 @@ def _print(place: str, report: dict[str, Any]) -> None:
         ("specification", report["spec_hash"][:16]),
         ("created", report["created"]),
     ]
+    if report["scenes_from"]:
+        rows.append(("scenes from", report["scenes_from"]))
     if report["attempts_without_end"]:
         rows.insert(3, ("without end", f"{report['attempts_without_end']} attempts run now, or were lost"))
     print_rows(f"run {place}", rows)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.arms import complete_arm, refuse_unsuited, robot_of
+from datagen.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
 from datagen.specify import label_engines, layout_of, read_fields, scene_engine_names, validated
 from schemas.errors import InputError
 from schemas.run import Run
@@ -78,11 +78,11 @@ def specify_again(
             raise InputError(place, section, problem, "Take it out")
     fields = before.model_dump(mode="json", exclude_none=True)
     arm = fields.pop("arm", {})
+    # Which arm it is and how it plans stays; whether worlds are disturbed is said for each run.
+    arm.pop("disturbance", None)
     if label_source != before.label_source:
-        # How an arm is tried differs between plan and sim; which arm, and how it plans, does not.
-        for section in ("trial", "disturbance"):
-            arm.pop(section, None)
-    defaults = {"arm": arm} if arm and label_source != "heuristic" else {}
+        arm.pop("trial", None)
+    defaults = {"arm": arm} if arm and label_source in ARM_PACKAGES else {}
     fields = _merged(fields | defaults, chosen)
     complete_arm(label_source, fields, robot, repeats, place)
     suited = robot_of(fields, robot)

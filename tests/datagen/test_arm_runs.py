@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from datagen.stored_scenes import open_stored_scenes, specify_again
 from schemas.fields import OUTCOMES
 from schemas.run import Run
 from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run
@@ -78,6 +79,18 @@ def test_specifications_hold_the_arm_and_what_moves_it(runs: dict[str, Path]) ->
         assert {"pin", "coal", "mani_skill", "sapien", "scenes", "labels"} <= manifest.spec.engines.keys()
         assert {"pin", "coal", "mani_skill"} <= manifest.libraries.keys()
     assert not Run.open(runs["heuristic"]).manifest.spec.engines.keys() & {"pin", "coal", "mani_skill"}
+
+
+def test_the_arm_of_a_stored_run_stays_and_its_disturbance_does_not(runs: dict[str, Path]) -> None:
+    disturbed = open_stored_scenes(str(runs["disturbed"]), None, None, {})
+    before = disturbed.run.manifest.spec
+    again, planned, judged = (specify_again(name, disturbed, None) for name in ("sim", "plan", "heuristic"))
+    assert before.arm is not None and again.arm is not None and planned.arm is not None
+    assert again.arm == before.arm.model_copy(update={"disturbance": None})
+    assert planned.arm == before.arm.model_copy(update={"disturbance": None, "trial": None})
+    assert judged.arm is None
+    assert {spec.scenes_hash for spec in (before, again, planned, judged)} == {before.scenes_hash}
+    assert again.hash() == Run.open(runs["sim"]).manifest.spec_hash  # the same labels, the same names
 
 
 def test_the_audit_holds_every_source_against_the_next(

@@ -83,13 +83,17 @@ def test_a_run_of_stored_scenes_is_itself_a_source_of_the_same_scenes(again: Pat
     np.testing.assert_array_equal(arrays_of(third)["label"], arrays_of(again)["label"][: 2 * PER_SCENE])
 
 
-def test_it_resumes_and_extends_like_any_run(source: Path, tmp_path: Path) -> None:
+def test_it_resumes_and_extends_like_any_run(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
     assert cli.run(again_arguments(source, out, 2 * PER_SCENE)) == 0
     assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
     (out / "commits/000001.json").unlink()
     assert cli.run(again_arguments(source, out, 4 * PER_SCENE)) == 0
     np.testing.assert_array_equal(arrays_of(out)["label"], arrays_of(source)["label"][: 4 * PER_SCENE])
+    report = json_of(capsys, ["status", str(out)])
+    assert report["complete"] and report["scenes_from"] == Run.open(source).storage.url
 
 
 def test_more_than_the_source_has_is_refused_with_how_many_there_are(
