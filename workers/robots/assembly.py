@@ -62,6 +62,8 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         held[description.lift.joint] = lift_m
     heads = (description.root_link, *(tree.joint(name).child for name in description.arm_joints))
     stops = {*description.arm_joints, *_joint_names_above(tree, description.hand.palm_link)}
+    for name in description.shapeless:
+        tree.links[name] = replace(tree.link(name), collisions=(), visuals=())
     clusters = [_cluster(tree, head, stops, held) for head in heads]
     scale, extension_m = 1.0, 0.0
     if description.extension is not None and reach_m is not None:
@@ -70,8 +72,6 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         extension_m = rule.longest_m * min(max(share, 0.0), 1.0)
         scale = _scale_for(description, tree, clusters, extension_m, reach_m)
     arm, palm, chain = _joints(description, tree, clusters, scale, extension_m)
-    for name in description.shapeless:
-        clusters[0][name] = (replace(tree.link(name), collisions=(), visuals=()), np.eye(4))
     links = [
         _body(tree.path, head, cluster, scale, description.cuts_m)
         for head, cluster in zip(heads, clusters, strict=True)
@@ -177,6 +177,8 @@ def _scale_for(
     low, high = 0.1, 1.0
     at_low, at_high = reach_at(low), reach_at(high)
     for _ in range(20):
+        if at_high == at_low:
+            break
         guess = low + (reach_m - at_low) * (high - low) / (at_high - at_low)
         at_guess = reach_at(guess)
         if abs(at_guess - reach_m) < _REACH_TOLERANCE_M:

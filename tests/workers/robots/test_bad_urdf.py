@@ -15,7 +15,7 @@ from schemas.errors import InputError
 from workers.robots.assembly import assemble
 from workers.robots.description import robots_folder
 from workers.robots.franka_hand import FRANKA_HAND
-from workers.robots.panda import PANDA
+from workers.robots.panda import PANDA, PANDA_SCALED
 from workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
 
 
@@ -111,3 +111,16 @@ def test_angles_and_rotations_agree(rpy: list[float]) -> None:
 def test_a_pitch_of_90_degrees_keeps_its_rotation(pitch: float) -> None:
     R = rpy_rotation(np.array([0.4, pitch, -1.1]))
     np.testing.assert_allclose(rpy_rotation(rotation_rpy(R)), R, atol=1e-8)
+
+
+def test_an_arm_without_lengths_has_no_scale(tmp_path: Path, text: str) -> None:
+    source = robots_folder() / "panda"
+    (tmp_path / "franka_description").symlink_to(source / "franka_description")
+    urdf = tmp_path / "panda.urdf"
+    arm, hand = text.split('<link name="panda_hand">')
+    arm = re.sub(
+        r'(<joint name="panda_joint.*?<origin rpy="[^"]*" xyz=)"[^"]*"', r'\1"0 0 0"', arm, flags=re.S
+    )
+    urdf.write_text(arm + '<link name="panda_hand">' + hand)
+    with pytest.raises(InputError, match=r"panda\.urdf: joints: no scale gives a reach of 0\.7 m"):
+        assemble(replace(PANDA_SCALED, urdf=str(urdf)), 0.7, 0.0)
