@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from datagen.drawing.floor_plan import draw_camera, draw_house, draw_objects, draw_scores, frame_axes
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
@@ -55,23 +56,29 @@ def draw_arm_picture(
         views[0].set_xlabel("none succeeded")
     else:
         views[0].set_xlabel(f"{len(used.count)} different grasps in {int(used.count.sum())} successes")
-        grasps.colorbar(scale, ax=views, location="bottom", shrink=0.5, label="successes with this grasp")
+        grasps.colorbar(
+            scale,
+            ax=views,
+            location="bottom",
+            shrink=0.5,
+            label="successes with this grasp",
+            ticks=MaxNLocator(integer=True),
+        )
     draw_outcome_legend(legend.subplots(), samples["outcome"])
     _write_numbers(numbers.subplots(), recalled, record, samples, robots)
     figure.savefig(out)
 
 
 def best_success(samples: Columns) -> int | None:
-    """Row of the best success, or None: most often lifted, then widest path; the first of equals."""
+    """Row of the best success, or None: most often lifted, with fewest grasps, on the widest path."""
     rows = np.flatnonzero(samples["outcome"] == _SUCCESS)
     if not len(rows):
         return None
-    share = (
-        samples["successes"][rows] / np.maximum(samples["trials"][rows], 1)
-        if "trials" in samples
-        else 0 * rows
-    )
-    return int(rows[np.lexsort((-samples["path_clearance_m"][rows], -share))[0]])
+    keys = [-samples["path_clearance_m"][rows]]
+    if "trials" in samples:
+        share = samples["successes"][rows] / np.maximum(samples["trials"][rows], 1)
+        keys += [samples["attempts"][rows], -share]
+    return int(rows[np.lexsort(keys)[0]])
 
 
 def reach_radius_m(robot: Robot, target_height_m: float) -> float:

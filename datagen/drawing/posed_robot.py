@@ -14,7 +14,7 @@ from workers.robots.robot import Robot
 from workers.robots.urdf import read_urdf
 
 _PEDESTAL_RGB, _PEDESTAL_SIDES = (196, 205, 216), 24
-_FINGER_RGB = (240, 120, 30)  # so that one sees them close
+_FINGER_RGB = (0, 185, 200)  # few objects have it, so one sees the fingers close
 
 
 @dataclass(frozen=True, eq=False)
