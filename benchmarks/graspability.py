@@ -6,7 +6,9 @@
 these, poses that also keep above what the upright object stands on; `scored`: varied ones of them, with
 their flips, tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
 share of these among the scored and clear ones. CPU seconds are those of this process; 0.0 where the grasps
-were kept from before. `--cold` works everything out anew. `--stability` also repeats the trials with half the timestep and counts
+were kept from before.
+
+`--cold` works everything out anew. `--stability` also repeats trials with half the timestep and counts
 those that end differently.
 """
 
@@ -26,7 +28,7 @@ from workers.grasps.keep import scored_grasps
 from workers.grasps.targets import Graspability, Targets, graspability
 from workers.objects import open_objects
 from workers.objects.model import ObjectModel
-from workers.robots import open_robot, robot_limits
+from workers.robots import gripper_of
 from workers.robots.robot import Gripper
 
 _STABILITY_GRASPS = 8  # of each object
@@ -48,8 +50,7 @@ def main() -> None:
     if options.cold:
         os.environ["DATAGEN_CACHE"] = tempfile.mkdtemp(prefix="datagen-graspability-")
     source = open_objects(options.objects)
-    heights_m = robot_limits(options.robot).base_height_m or (0.7, 0.7)
-    gripper = open_robot(options.robot, None, heights_m[0]).gripper
+    gripper = gripper_of(options.robot)
     models = [source.load(name) for name in source.names()]
     print_table(models, gripper, GraspParams())
     targets = Targets(source.names(), source.load, gripper, GraspParams()).names()

@@ -14,7 +14,7 @@ from tests.workers.worlds import box_model, cylinder_model
 from workers.grasps.targets import Targets, graspability, targets_of
 from workers.objects import open_objects
 from workers.objects.model import ObjectModel
-from workers.robots import open_robot
+from workers.robots import gripper_of
 from workers.robots.robot import Gripper
 
 GRIPPER = box_gripper()
@@ -84,7 +84,7 @@ def test_drawing_gives_each_target_the_same_chance_and_asks_for_few() -> None:
 def franka_hand() -> Gripper:
     if find_spec("mani_skill") is None:
         pytest.skip("the robots' files come with mani_skill, which is not installed")
-    return open_robot("panda", None, 0.7).gripper
+    return gripper_of("panda")
 
 
 def test_real_things_that_lie_flat_are_targets(assets: Path) -> None:
