@@ -59,6 +59,8 @@ def search_grasps(
     An object that cannot be grasped gives none and a reason, and so does one whose parts have no
     volume.
     """
+    if not model.convex_parts_m or not all(np.isfinite(part).all() for part in model.convex_parts_m):
+        return _none(0, "it has no collision parts, or a corner that is not finite")
     try:
         T, opening_m, n_tried = _free_poses(model, gripper, rng)
     except QhullError:

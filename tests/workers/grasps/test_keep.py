@@ -91,8 +91,17 @@ def test_what_cannot_be_grasped_gives_none_and_a_reason() -> None:
     boards = [box_vertices((0.3, 0.3, 0.1), (0, 0, z)) for z in (-0.07, 0.07)]
     spool = model_of("spool", cube.visual, [*boards, box_vertices((0.02, 0.02, 0.06))], 0.3)
     flat = replace(cube, name="sheet", convex_parts_m=(box_vertices((0.1, 0.1, 0.0)),))
+    bare = replace(cube, name="bare", convex_parts_m=())
+    nan = replace(cube, name="nan", convex_parts_m=(cube.convex_parts_m[0] * np.float32("nan"),))
     heavy = box_model("lead", (0.05, 0.05, 0.1), mass_kg=50.0)
-    for model, reason in ((cube, "near enough"), (spool, "touches"), (flat, "volume"), (heavy, "holds")):
+    for model, reason in (
+        (cube, "near enough"),
+        (spool, "touches"),
+        (flat, "volume"),
+        (bare, "no collision parts"),
+        (nan, "not finite"),
+        (heavy, "holds"),
+    ):
         scored = scored_grasps(model, GRIPPER, FEW)
         assert reason in scored.reason
         assert len(grasps_of(model, GRIPPER, FEW)) == 0
