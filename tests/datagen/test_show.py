@@ -1,0 +1,149 @@
+"""Pictures of `plan` and `sim` runs: the outcome map, a candidate tried again, and what is refused."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageColor, ImageSequence
+
+from datagen import cli
+from datagen.drawing.outcome_colours import LOOKS
+from schemas.fields import OUTCOMES
+from schemas.run import Run
+from schemas.scene_rows import read_scene
+from tests.refusals import refused
+from tests.small_runs import CONFIG, arrays_of, make_small_run
+from workers.scenes.recall import recall_candidates, recall_scene
+from workers.world import open_world
+
+pytestmark = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("pinocchio", "coal", "ompl", "mani_skill", "sapien")),
+    reason="the extra `sim` is not installed",
+)
+
+PER_SCENE = 12
+NAMES = tuple(OUTCOMES)
+# One long arm, so that some candidates can be reached; few grasps, which are quickly found.
+ARM = """
+[candidates]
+arm_reach_m = {low = 0.9, high = 1.0}
+robots_per_scene = 1
+[arm.grasps]
+per_object = 40
+per_scene = 10
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same candidates of one scene, labelled by each source; `disturbed` executes each plan twice."""
+    folder = tmp_path_factory.mktemp("shown")
+    scene, arm = ARM.split("[arm.grasps]")
+    choices = ["--candidates", "in-range", "--seed", "4"]
+    source = make_small_run(folder / "run", PER_SCENE, *choices, config=CONFIG + scene, per_scene=PER_SCENE)
+    made = {"heuristic": source}
+    (folder / "arm.toml").write_text("[arm.grasps]" + arm)
+    for name, *more in (("plan",), ("sim",), ("disturbed", "--perturb", "2")):
+        made[name] = folder / name
+        source = "sim" if name == "disturbed" else name
+        assert cli.run([
+            "submit", source, "--n", str(PER_SCENE), "--out", str(made[name]), "--workers", "0",
+            "--scenes-from", str(made["heuristic"]), "--config", str(folder / "arm.toml"), *more,
+        ]) == 0  # fmt: skip
+    return made
+
+
+def row_of(run: Path, success: bool) -> int:
+    """A candidate of the run that the arm took, or one for which it had no plan."""
+    arrays = arrays_of(run)
+    good = arrays["outcome"] == NAMES.index("success")
+    return int(np.flatnonzero(good if success else arrays["path_length_rad"] == 0)[0])
+
+
+def show(run: Path, out: Path, *more: str) -> np.ndarray:
+    """The picture that the command line writes, (height, width, 3)."""
+    assert cli.run(["show", str(run), "--out", str(out), *more]) == 0
+    with Image.open(out) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@pytest.mark.parametrize("name", ["plan", "sim"])
+def test_a_scene_is_drawn_with_its_outcomes(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    pixels = show(runs[name], tmp_path / "scene.png")
+    assert pixels.shape == (1240, 2000, 3)
+    outcome_map = pixels[60:560, 650:1200]
+    codes, counts = np.unique(arrays_of(runs[name])["outcome"], return_counts=True)
+    for code in codes[counts > 2]:  # the stars of two picks may hide two
+        colour = ImageColor.getrgb(LOOKS[NAMES[code]].colour)
+        assert (outcome_map == colour).all(axis=2).sum() > 5, NAMES[code]
+
+
+@pytest.mark.parametrize("name", ["plan", "sim", "disturbed"])
+def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str, Path]) -> None:
+    from datagen.retrial import try_again
+
+    run = Run.open(str(runs[name]))
+    spec, rows = run.manifest.spec, read_scene(run, 0)
+    scene = recall_scene(open_world(spec, "builtin", "builtin"), rows.record)
+    for row in range(0, PER_SCENE, 2):
+        again = try_again(scene, recall_candidates(rows.samples), row, spec)
+        assert again.trial.outcome == NAMES[rows.samples["outcome"][row]]
+        assert again.moves == (rows.samples["path_length_rad"][row] > 0)
+        if name != "plan":
+            assert again.trial.successes == rows.samples["successes"][row]
+            assert (again.result is None) == (rows.samples["attempts"][row] == 0)
+        recording = again.recording
+        assert recording.T_world_object.shape == (len(recording.phase), len(scene.models), 4, 4)
+        moments = [moment for moment, _ in again.told]
+        assert moments[0] == 0 and moments[-1] == len(recording.phase) - 1
+
+
+def test_a_filmstrip(runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    row = row_of(runs["sim"], success=True)
+    pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
+    told = capsys.readouterr().out
+    assert pixels.shape[1] == 10 + 4 * 470 and f"candidate  {row} at" in told and "success" in told
+    assert tuple(pixels[20, 15]) == ImageColor.getrgb(LOOKS["success"].colour)
+
+
+def test_a_failure_shows_how_it_failed(runs: dict[str, Path], tmp_path: Path) -> None:
+    row = row_of(runs["sim"], success=False)
+    outcome = NAMES[arrays_of(runs["sim"])["outcome"][row]]
+    pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
+    assert tuple(pixels[20, 15]) == ImageColor.getrgb(LOOKS[outcome].colour)
+
+
+def test_a_film_of_the_best_success_moves(runs: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "trial.gif"
+    show(runs["plan"], out)
+    with Image.open(out) as image:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
+    assert len(frames) > 5 and all((a != b).any() for a, b in pairwise(frames))
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "words"),
+    [
+        ("heuristic", ["--trial", "0", "--out", "a.png"], ["--trial", "heuristic"]),
+        ("heuristic", ["--out", "a.gif"], ["--out", "heuristic", "plan or sim"]),
+        ("sim", ["--trial", str(PER_SCENE), "--out", "a.png"], ["--trial", f"0 to {PER_SCENE - 1}"]),
+        ("sim", ["--trial", "-1", "--out", "a.png"], ["--trial", "-1"]),
+        ("sim", ["--trial", "first", "--out", "a.png"], ["--trial", "first", "best"]),
+        ("sim", ["--trial", "9" * 30, "--out", "a.png"], ["--trial"]),
+        ("sim", ["--trial", "0", "--out", "a.mp4"], ["a.mp4", ".gif"]),
+        ("sim", ["--trial", "{failed}", "--out", "a.gif"], ["--out", "before the arm moved", ".png"]),
+        ("sim", ["--scene", "1", "--trial", "0", "--out", "a.png"], ["--scene", "1"]),
+    ],
+)
+def test_what_cannot_be_shown(
+    name: str, arguments: list[str], words: list[str], runs: dict[str, Path], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    failed = str(row_of(runs["sim"], success=False))
+    filled = [a.replace("{failed}", failed) if a != arguments[-1] else str(tmp_path / a) for a in arguments]
+    refused(["show", str(runs[name]), *filled], capsys, *words)
+    assert list(tmp_path.iterdir()) == []
