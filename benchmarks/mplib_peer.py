@@ -2,8 +2,8 @@
 
     PEER benchmarks/mplib_peer.py < QUESTION.json > ANSWER.json
 
-mplib crashes with numpy 2, so it has an environment of its own. `benchmarks.robots` and
-`benchmarks.motion` ask it; the process knows neither.
+mplib crashes with numpy 2, so it has an environment of its own. `benchmarks.robots`
+asks it; the process knows nothing of this project.
 """
 
 import json

@@ -1,0 +1,78 @@
+"""The same plans to the bit: in another process, in another order, through a search with random samples."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from tests.workers.motion.tables import arm, deepest_in_plan_m, front_base, prepared, table_scene
+from tests.workers.worlds import ROOM_M, box_body
+from workers.motion.candidate import plan_candidate
+from workers.motion.plan import PlanReport
+from workers.motion.scene import PlanningScene
+from workers.scenes.scene import SettledScene
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+PLACES = ((0.2, 0.6), (0.0, 0.6), (-0.2, 0.45), (0.3, 0.75))  # dx and distance of bases
+
+
+def barred_scene() -> SettledScene:
+    """A bar across the room between bases and the table, at the height where straight paths pass."""
+    bar = box_body("bar", "furniture", "Shelf", (1.2, 0.03, 0.03), (ROOM_M[0] / 2, 1.02, 1.15))
+    return table_scene([bar])
+
+
+def plan_at(scene: PlanningScene, place: int, rng: np.random.Generator) -> PlanReport:
+    dx_m, away_m = PLACES[place]
+    return plan_candidate(scene, front_base(barred_scene(), dx_m=dx_m, away_m=away_m), rng)
+
+
+def digest(report: PlanReport) -> str:
+    """Of everything in a report."""
+    content = hashlib.sha256(f"{report.outcome} {report.grasps_free} {report.grasps_tried}".encode())
+    if report.plan is not None:
+        for name in report.plan.__dataclass_fields__:
+            content.update(np.asarray(getattr(report.plan, name)).tobytes())
+    return content.hexdigest()
+
+
+def digests(order: list[int]) -> dict[int, str]:
+    scene = prepared(barred_scene())
+    return {k: digest(plan_at(scene, k, np.random.default_rng([7, k]))) for k in order}
+
+
+def test_a_search_was_needed_and_its_path_is_free() -> None:
+    scene = barred_scene()
+    ready, searched = prepared(scene), 0
+    for k, (dx_m, away_m) in enumerate(PLACES):
+        rng = np.random.default_rng([7, k])
+        before = rng.bit_generator.state
+        report = plan_at(ready, k, rng)
+        if report.plan is None or rng.bit_generator.state == before:
+            continue
+        searched += 1
+        base = front_base(scene, dx_m=dx_m, away_m=away_m)
+        assert deepest_in_plan_m(scene, arm(), report.plan, base) < 0
+    assert searched >= 1
+
+
+def test_another_order_and_another_process_give_the_same_bits() -> None:
+    here = digests([0, 1, 2, 3])
+    assert digests([3, 1, 0, 2]) == here
+    program = "from tests.workers.motion.test_repeatability import digests; print(digests([2, 0, 3, 1]))"
+    told = subprocess.run(
+        [sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    assert ast.literal_eval(told.stdout) == here
+
+
+def test_the_generator_matters_only_where_a_search_is_needed() -> None:
+    scene = prepared(table_scene())
+    base = front_base(table_scene())
+    reports = [digest(plan_candidate(scene, base, np.random.default_rng(seed))) for seed in range(3)]
+    assert len(set(reports)) == 1
