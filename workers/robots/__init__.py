@@ -21,8 +21,9 @@ ROBOTS: dict[str, str] = {
     "fetch": "workers.robots.fetch:FETCH",
 }
 
-# Reaches are stated in whole millimetres.
-_REACH_STEP_M = 0.001
+# Reaches and heights are stated in whole millimetres.
+_STEP_M = 0.001
+_HIGHEST_MOUNT_M = 100.0
 
 
 def robot_limits(name: str) -> RobotLimits:
@@ -43,16 +44,17 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
         raise InputError(
             "--robot", name, "is scaled to a reach, and none is given", _within("reach", low, high)
         )
-    if reach_m is not None and not low - _REACH_STEP_M <= reach_m <= high + _REACH_STEP_M:
+    if reach_m is not None and not low - _STEP_M <= reach_m <= high + _STEP_M:
         raise InputError(
             "--robot", name, f"a reach of {reach_m} m is outside its range", _within("reach", low, high)
         )
     bottom, top = description.limits.base_height_m or (0.0, math.inf)
-    if not (math.isfinite(base_height_m) and bottom <= base_height_m <= top):
+    # Stored heights are float32, which may lie just outside.
+    if not bottom - _STEP_M <= base_height_m <= min(top + _STEP_M, _HIGHEST_MOUNT_M):
         mend = _within("base height", bottom, top)
         raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", mend)
     own = description.extension is None
-    return _mounted(name, None if own else reach_m, base_height_m)
+    return _mounted(name, None if own else reach_m, min(max(base_height_m, bottom), top))
 
 
 def gripper_of(name: str) -> Gripper:

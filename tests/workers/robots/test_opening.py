@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
@@ -75,3 +76,9 @@ def test_the_family_shares_one_hand_with_the_xarm() -> None:
     }
     assert len(digests) == 1
     assert open_robot("fetch", None, 0.8).gripper.digest not in digests
+
+
+def test_heights_rounded_to_float32_are_those_of_the_range() -> None:
+    for height_m in robot_limits("fetch").base_height_m or ():
+        stored = float(np.float32(height_m))
+        assert open_robot("fetch", None, stored).base_height_m == pytest.approx(height_m, abs=1e-6)
