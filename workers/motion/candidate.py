@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse
+from workers.motion.collision import Ints
 from workers.motion.hand import backed, line_offsets_m, raised
 from workers.motion.lines import follow_line
 from workers.motion.plan import MotionPlan, PlanReport
@@ -20,6 +22,7 @@ from workers.motion.surroundings import Surroundings, surroundings
 # from which the rest is known to work. A later cause came further.
 STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_path", "success")
 _STARTS = 3  # tucked poses from which a straight line is tried
+_SEARCHES = 4  # grasps for which a path is searched where none is straight
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
@@ -31,8 +34,17 @@ class _Search:
 
     at: Surroundings
     T_base_world: F64
-    rng: np.random.Generator
-    iterations_left: int
+    far: list[_Reachable]  # to which no straight path leads
+
+
+@dataclass(frozen=True, eq=False)
+class _Reachable:
+    """A grasp with all of a plan but the path to its pregrasp."""
+
+    k: int
+    q_approach_rad: F64  # (K, A)
+    q_lift_rad: F64  # (J, A)
+    homes: Ints  # free ones, nearest first
 
 
 def plan_candidate(
@@ -44,7 +56,7 @@ def plan_candidate(
     """Look for a whole plan from the base pose (4, 4) to any kept grasp but those in `skip`.
 
     `skip` are rows of the GraspSet. Depends on the arguments alone: neither on candidates before nor on
-    time. `rng` is drawn from only where a straight path fails.
+    time. `rng` is drawn from only where no grasp has a straight path.
     """
     rows = np.flatnonzero(~np.isin(prepared.grasp, sorted(skip)))
     if len(rows) == 0:
@@ -56,7 +68,7 @@ def plan_candidate(
     if len(order) == 0:
         return PlanReport("no_ik", None, prepared.grasps_free, 0)
     at = surroundings(prepared, T_world_base)
-    search = _Search(at, T_base_world, rng, prepared.params.path_iterations)
+    search = _Search(at, T_base_world, [])
     tried: set[int] = set()
     furthest = 0
     for k in order.tolist():
@@ -65,6 +77,9 @@ def plan_candidate(
         furthest = max(furthest, STAGES.index(outcome))
         if plan is not None or outcome == "no_start":
             return PlanReport(outcome, plan, prepared.grasps_free, len(tried))
+    plan = _search_paths(search, rng)
+    if plan is not None:
+        return PlanReport("success", plan, prepared.grasps_free, len(tried))
     return PlanReport(STAGES[furthest], None, prepared.grasps_free, len(tried))
 
 
@@ -111,43 +126,51 @@ def _try_arm(search: _Search, k: int, q_grasp: F64, T_back: F64, T_up: F64) -> t
     lift = follow_line(at, T_up, q_grasp, None, is_target_held=True)
     if lift is None:
         return "no_lift", None
-    found = _reach(search, homes, q_pregrasp, opening_m)
-    if found is None:
-        return "no_path", None
-    home, q_reach = found
-    approach = back[::-1]
-    length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in (q_reach, approach))
-    some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
-    clearance_m = at.clearance_m(q_reach[some], opening_m)
-    plan = MotionPlan(int(scene.grasp[k]), home, q_reach, approach, lift, opening_m, length, clearance_m)
-    return "success", plan
+    gaps = np.linalg.norm(scene.robot.homes_rad[homes] - q_pregrasp, axis=1)
+    found = _Reachable(k, back[::-1], lift, homes[np.argsort(gaps, kind="stable")])
+    step_rad, first_blocked = scene.params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
+    for home in found.homes[:_STARTS].tolist():
+        if is_line_free(scene.robot.homes_rad[home], q_pregrasp, first_blocked, step_rad):
+            path = straight(scene.robot.homes_rad[home], q_pregrasp, step_rad)
+            return "success", _plan(search, found, home, path)
+    search.far.append(found)
+    return "no_path", None
 
 
-def _reach(search: _Search, homes: np.ndarray, q_pregrasp: F64, opening_m: float) -> tuple[int, F64] | None:
-    """A free path (M, A), and the tucked pose it starts from."""
+def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | None:
+    """RRT-Connect to the first grasps that no straight path leads to; they share the iterations evenly."""
     scene = search.at.scene
-    robot, step_rad = scene.robot, scene.params.check_step_rad
+    robot, params = scene.robot, scene.params
+    left, far = params.path_iterations, search.far[:_SEARCHES]
+    for rank, found in enumerate(far):
+        home = int(found.homes[0])
+        first_blocked = partial(search.at.first_blocked, opening_m=float(scene.opening_m[found.k]))
+        corners, used = connect(
+            robot.homes_rad[home],
+            found.q_approach_rad[0],
+            np.maximum(robot.q_lower_rad, -np.pi),
+            np.minimum(robot.q_upper_rad, np.pi),
+            first_blocked,
+            params.check_step_rad,
+            left // (len(far) - rank),
+            rng,
+        )
+        left -= used
+        if corners is not None:
+            path = dense(corners, params.check_step_rad)
+            path = shortened(path, first_blocked, params.check_step_rad, _SHORTCUTS, rng)
+            return _plan(search, found, home, path)
+    return None
 
-    def first_blocked(q_rad: F64) -> int:
-        return search.at.first_blocked(q_rad, opening_m)
 
-    gaps = np.linalg.norm(robot.homes_rad[homes] - q_pregrasp, axis=1)
-    nearest = homes[np.argsort(gaps, kind="stable")]
-    for home in nearest[:_STARTS].tolist():
-        if is_line_free(robot.homes_rad[home], q_pregrasp, first_blocked, step_rad):
-            return home, straight(robot.homes_rad[home], q_pregrasp, step_rad)
-    home = int(nearest[0])
-    corners, used = connect(
-        robot.homes_rad[home],
-        q_pregrasp,
-        np.maximum(robot.q_lower_rad, -np.pi),
-        np.minimum(robot.q_upper_rad, np.pi),
-        first_blocked,
-        step_rad,
-        search.iterations_left,
-        search.rng,
+def _plan(search: _Search, found: _Reachable, home: int, q_reach: F64) -> MotionPlan:
+    scene = search.at.scene
+    opening_m = float(scene.opening_m[found.k])
+    ways = (q_reach, found.q_approach_rad)
+    length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in ways)
+    some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
+    clearance_m = search.at.clearance_m(q_reach[some], opening_m)
+    grasp = int(scene.grasp[found.k])
+    return MotionPlan(
+        grasp, home, q_reach, found.q_approach_rad, found.q_lift_rad, opening_m, length, clearance_m
     )
-    search.iterations_left -= used
-    if corners is None:
-        return None
-    return home, shortened(dense(corners, step_rad), first_blocked, step_rad, _SHORTCUTS, search.rng)
