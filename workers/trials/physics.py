@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,12 +76,13 @@ def tune_shape(shape: physx.PhysxCollisionShape, groups: list[int]) -> None:
 def tune_pad(shape: physx.PhysxCollisionShape, friction: float, finger_friction: float, pad_m: float) -> None:
     """Makes rubber of a finger's shape; the pad is `pad_m` across.
 
-    PhysX takes the mean of a pair's frictions, and a pair shall be as slippery as its more slippery
-    side: rubber holds a soapy bottle no better than the soap allows. A soft pad also resists turning
-    about its normal, as points do not.
+    A pair's friction is the geometric mean of both sides': rubber holds a soapy bottle far worse than a
+    dry one. PhysX takes the arithmetic mean, so the pad gets what makes that the same. A soft pad also
+    resists turning about its normal, as points do not.
     """
-    grip = min(friction, finger_friction)
-    shape.set_physical_material(physx.PhysxMaterial(grip, grip, 0.0))
+    pair = math.sqrt(friction * finger_friction)
+    pad = max(0.0, 2 * pair - friction)
+    shape.set_physical_material(physx.PhysxMaterial(pad, pad, 0.0))
     shape.set_patch_radius(pad_m / 2)
     shape.set_min_patch_radius(pad_m / 2)
 

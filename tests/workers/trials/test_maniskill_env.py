@@ -31,7 +31,7 @@ PREPARED = prepare_trials(scene_with(MODELS, [(0.0, 0.0), (0.0, 0.2)]), ROBOT, P
 PLAN = plan_from_above(ROBOT, BASE, on_top_m(scene_with(MODELS[:1], [(0.0, 0.0)]), 0.03), 0.07)
 WORLDS = {
     "as planned": (Disturbance.none(0.6), "success"),
-    "slippery": (Disturbance.none(0.02), "slipped"),
+    "slippery": (Disturbance.none(0.001), "slipped"),
     "moved away": (Disturbance(translation(0.0, 0.12, 0.0), np.eye(4), 0.6, 1.0), "missed"),
 }
 
