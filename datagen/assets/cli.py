@@ -23,7 +23,7 @@ from datagen.assets.catalogue import CATALOGUE, Asset, select
 from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
 from datagen.console import print_json, print_rows, size
 from schemas.errors import InputError, choices
-from workers.objects.scan import cache_folder
+from workers.content_cache import cache_folder
 
 Json = Annotated[bool, Parameter(negative=(), help="Print one JSON document.")]
 Folder = Annotated[Path, Parameter(help="The folder of assets.")]

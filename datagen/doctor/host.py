@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 
 from datagen.doctor.check import Check
+from workers.content_cache import cache_folder
 
 GIB = 2**30
 CGROUP = Path("/sys/fs/cgroup")
@@ -129,15 +130,6 @@ def check_open_files() -> Check:
     return Check("open files", "ok", detail)
 
 
-def cache_folder() -> Path:
-    """Where unpacked houses and parsed meshes are kept: DATAGEN_CACHE, or the XDG cache folder."""
-    own = os.environ.get("DATAGEN_CACHE")
-    if own:
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "datagen"
-
-
 def check_cache() -> Check:
     """Whether the cache folder, or the nearest folder above it that exists, can be written."""
     try:
@@ -145,7 +137,7 @@ def check_cache() -> Check:
         existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         with tempfile.TemporaryFile(dir=existing):
             return Check("cache", "ok", str(folder))
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
         mend = "Name a folder that can be written in DATAGEN_CACHE; without one every worker parses anew."
         return Check("cache", "warn", str(error), mend)
 

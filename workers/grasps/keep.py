@@ -14,10 +14,10 @@ import numpy as np
 
 from schemas.identity import digest_of
 from schemas.specification import GraspParams
+from workers.content_cache import cache_folder
 from workers.grasps.grasp import GraspSet
 from workers.grasps.search import VERSION, ScoredGrasps, search_grasps
 from workers.objects.model import ObjectModel
-from workers.objects.scan import cache_folder
 from workers.robots.robot import Gripper, Parts
 
 _KEPT_IN_MEMORY = 512

@@ -11,13 +11,11 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
-import io
 import itertools
 import mmap
 import os
 import re
 import tempfile
-import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,14 +27,23 @@ import numpy.typing as npt
 
 from schemas.errors import InputError
 from schemas.identity import canonical_json
+from workers.content_cache import cache_folder, read_arrays, write_arrays
 from workers.houses.reading import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
 _MAX_FILE_BYTES = 64 << 30
 _MAX_IN_MEMORY_BYTES = 2 << 30
-_FORMAT = 1  # raise it when the layout of the cached files changes
+_FORMAT = 2  # raise it when the layout of the cached files changes
 _ID_KEY = re.compile(rb'"_id"\s*:\s*"([^"\\]{1,200})"')
 _MEND = "Restore the file from its source."
+_MAX_INDEX_BYTES = 4 << 30
+_LAYOUT = {
+    "spans": (np.int64, ("lines", 2)),
+    "digests": (np.uint8, ("lines", 32)),
+    "ids": (np.uint8, ("bytes",)),
+    "numbers": (np.int64, ("lines",)),
+    "size": (np.int64, ()),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +100,12 @@ def open_lines(path: Path, cache: Path | None) -> LineIndex:
         raise InputError(path, "", f"the compressed data is damaged ({error})", _MEND) from None
 
 
-def cache_folder() -> Path | None:
-    """`$DATAGEN_CACHE`, else datagen/ in the user's cache folder; None where neither can be written."""
-    named = os.environ.get("DATAGEN_CACHE")
-    home = os.environ.get("XDG_CACHE_HOME")
+def houses_cache() -> Path | None:
+    """The cache's folder of unpacked houses; None where it cannot be written."""
+    folder = cache_folder() / "houses"
     try:
-        base = Path(named) if named else (Path(home) if home else Path.home() / ".cache") / "datagen"
-        folder = base / "houses"
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: no home folder
+    except OSError:
         return None
     return folder if os.access(folder, os.W_OK) else None
 
@@ -190,7 +194,7 @@ class _Collector:
             "digests": np.frombuffer(b"".join(self.digests), np.uint8).reshape(-1, 32),
             "ids": np.frombuffer("\n".join(self.ids).encode(), np.uint8),
             "numbers": np.array(self.numbers, np.int64),
-            "size": np.array([self.offset], np.int64),
+            "size": np.array(self.offset, np.int64),
         }
 
 
@@ -207,16 +211,17 @@ def _names(cache: Path, digest: str) -> tuple[Path, Path]:
 def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
     """None where the cache lacks the file, or holds something that does not fit together."""
     data_path, index_path = _names(cache, digest)
+    arrays = read_arrays(index_path, _LAYOUT, _MAX_INDEX_BYTES)
+    if arrays is None:
+        return None
     try:
-        with index_path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in ("spans", "digests", "ids", "numbers", "size")}
-        size = int(arrays["size"][0])
+        size = int(arrays["size"])
         if data_path.stat().st_size != size:
             return None
         with data_path.open("rb") as stream:
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         return _index(path, data, arrays)
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zlib.error, zipfile.BadZipFile):
+    except (OSError, ValueError):
         return None  # absent or damaged: it is built anew
 
 
@@ -231,11 +236,8 @@ def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
             collector.add(number, line)
         if not scratch.finish(data_path):
             return None
-    buffer = io.BytesIO()
-    np.savez(buffer, **cast(Any, collector.arrays()))
-    with _Scratch(cache) as scratch:
-        if not (scratch.write(buffer.getvalue()) and scratch.finish(index_path)):
-            return None
+    if not write_arrays(index_path, collector.arrays()):
+        return None
     return _from_cache(path, cache, digest)
 
 

@@ -11,7 +11,7 @@ from schemas.identity import digest_of
 from workers.houses.asset_table import TABLE_NAMES, Asset, read_asset_table
 from workers.houses.colours import hash_bytes
 from workers.houses.house import House
-from workers.houses.line_index import LineIndex, cache_folder, open_lines
+from workers.houses.line_index import LineIndex, houses_cache, open_lines
 from workers.houses.loader import build_house
 from workers.houses.reading import parse_json
 
@@ -73,7 +73,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
         raise InputError(path, "", "no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
     if len(names) > _MAX_FILES:
         raise InputError(path, "", f"{len(names)} files, more than {_MAX_FILES}", "Join them as JSON lines.")
-    cache = cache_folder()
+    cache = houses_cache()
     # Single small files are read where they lie; only what holds many houses is worth unpacking.
     files = [open_lines(path / n, None if n.endswith(".json") else cache) for n in names]
     rows, clashes = _rows(files)

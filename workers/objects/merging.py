@@ -5,19 +5,16 @@ A scanned bowl comes with 80 parts, and the time of a physics step grows with th
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import heapq
-import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import scipy
 from scipy.ndimage import map_coordinates
 
+from workers.content_cache import Arrays, Shelf
 from workers.geometry.mesh import F32
 from workers.objects.hulls import (
     Hull,
@@ -28,10 +25,9 @@ from workers.objects.hulls import (
     hull_of,
     surface_points_m,
 )
-from workers.objects.scan import cache_folder
 
 # Part of every cache key: raise it when the same parts may be merged differently.
-MERGER_VERSION = 1
+MERGER_VERSION = 2
 # Of a joined hull. PhysX takes 255, a GPU no more than 64, and contacts of 64 cost half as much.
 MAX_VERTICES = 64
 # Pairs that a part is looked at in: those whose bounding boxes are nearest.
@@ -40,6 +36,17 @@ _NEIGHBOURS = 12
 _CELLS_ACROSS, _SAMPLES_ACROSS = 32, 128
 # Hulls whose errors differ by less are compared by the volume they add.
 _ERROR_STEP_M = 2e-4
+_SHELF = Shelf(
+    "hulls",
+    {
+        "vertices": (np.float32, ("corners", 3)),
+        "cuts": (np.int64, ("cuts",)),
+        "n_before": (np.int64, ()),
+        "figures": (np.float64, (3,)),
+    },
+    most_files=4096,  # of some 20 KB each
+    most_bytes=32 * 2**20,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +86,10 @@ def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
         return MergedParts(tuple(parts_m), len(parts_m), 0.0, 0.0, 0.0)
     key = _key(parts_m, limit)
     if key not in _known:
-        path = cache_folder() / "hulls" / f"{key}.npz"
-        merged = _from_cache(path)
-        if merged is None:
-            merged = _merge(parts_m, limit)
-            _to_cache(path, merged)
+        stored = _SHELF.load(key)
+        merged = _restored(stored) if stored is not None else _merge(parts_m, limit)
+        if stored is None:
+            _SHELF.store(key, _stored(merged))
         _known[key] = merged
     return _known[key]
 
@@ -186,31 +192,16 @@ def _key(parts_m: Sequence[F32], limit: int) -> str:
     return digest.hexdigest()
 
 
-def _from_cache(path: Path) -> MergedParts | None:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            error_m, shrink_m, share = (float(x) for x in data["figures"])
-            parts = tuple(np.split(data["vertices"], data["cuts"]))
-            return MergedParts(parts, int(data["n_before"]), error_m, shrink_m, share)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        return None  # absent or damaged: it is made and written anew
+def _stored(merged: MergedParts) -> Arrays:
+    return {
+        "vertices": np.concatenate(merged.parts_m),
+        "cuts": np.cumsum([len(part) for part in merged.parts_m])[:-1],
+        "n_before": np.array(merged.n_before, np.int64),
+        "figures": np.array([merged.error_m, merged.shrink_m, merged.added_volume_share]),
+    }
 
 
-def _to_cache(path: Path, merged: MergedParts) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            np.savez(
-                file,
-                vertices=np.concatenate(merged.parts_m),
-                cuts=np.cumsum([len(part) for part in merged.parts_m])[:-1],
-                n_before=np.int64(merged.n_before),
-                figures=np.array([merged.error_m, merged.shrink_m, merged.added_volume_share]),
-            )
-        # Atomic, so that workers that fill the cache together never see half a file.
-        temporary.replace(path)
-    except OSError:
-        # A read-only or full cache folder only means that the next worker merges again.
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+def _restored(stored: Arrays) -> MergedParts:
+    error_m, shrink_m, share = (float(figure) for figure in stored["figures"])
+    parts = tuple(np.split(stored["vertices"], stored["cuts"]))
+    return MergedParts(parts, int(stored["n_before"]), error_m, shrink_m, share)

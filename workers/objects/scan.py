@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import tempfile
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,15 +10,33 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.identity import digest_of
+from workers.content_cache import Arrays, Shelf
 from workers.geometry.mesh import F32, Mesh, Texture
 from workers.objects.convex import ConvexParts, read_convex_parts
 from workers.objects.obj_file import ObjMesh, read_obj
 from workers.objects.texture import face_colours, read_texture
 
 # Part of every cache key: raise it when the reading changes what comes out.
-READER_VERSION = 1
+READER_VERSION = 2
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
+_SHELF = Shelf(
+    "objects",
+    {
+        "vertices": (np.float32, ("vertices", 3)),
+        "faces": (np.int32, ("faces", 3)),
+        "face_rgb": (np.uint8, ("faces", 3)),
+        "image": (np.uint8, ("rows", "columns", 3)),
+        "uv": (np.float32, ("vertices", 2)),
+        "part_vertices": (np.float32, ("corners", 3)),
+        "part_cuts": (np.int64, ("cuts",)),
+        "volume": (np.float64, ()),
+        "n_dropped": (np.int64, ()),
+        "size_m": (np.float64, (3,)),
+    },
+    most_files=1024,
+    most_bytes=512 * 2**20,
+)
 
 
 @dataclass(frozen=True)
@@ -58,28 +72,17 @@ def scan_files(visual: Path, texture: Path, collision: Path) -> ScanFiles:
     return ScanFiles(visual, texture, collision, digest_of(digests))
 
 
-def cache_folder() -> Path:
-    """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories)."""
-    if explicit := os.environ.get("DATAGEN_CACHE"):
-        return Path(explicit)
-    try:
-        home = Path.home()
-    except RuntimeError:  # a container may run a user id without a home
-        home = Path(tempfile.gettempdir())
-    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "datagen"
-
-
 def load_scan(files: ScanFiles) -> Scan:
     """The scan, from the cache where it is, else from the files (and then cached).
 
     Raises InputError as `read_scan` does; a cache that cannot be used costs time, never a result.
     """
-    path = cache_folder() / "objects" / f"{files.digest}-{READER_VERSION}.npz"
-    cached = _from_cache(path)
-    if cached is not None:
-        return cached
+    key = f"{files.digest}-{READER_VERSION}"
+    stored = _SHELF.load(key)
+    if stored is not None:
+        return _restored(stored)
     scan = read_scan(files.visual, files.texture, files.collision)
-    _to_cache(path, scan)
+    _SHELF.store(key, _stored(scan))
     return scan
 
 
@@ -140,53 +143,29 @@ def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:
     )
 
 
-def _from_cache(path: Path) -> Scan | None:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            cuts = data["part_cuts"]
-            size = data["size_m"]
-            return Scan(
-                Mesh(
-                    data["vertices"],
-                    data["faces"],
-                    data["face_rgb"],
-                    Texture(data["image"], data["uv"]),
-                ),
-                ConvexParts(
-                    tuple(np.split(data["part_vertices"], cuts)),
-                    float(data["volume"]),
-                    int(data["n_dropped"]),
-                ),
-                (float(size[0]), float(size[1]), float(size[2])),
-            )
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        return None  # absent or damaged: it is read from the files and written anew
-
-
-def _to_cache(path: Path, scan: Scan) -> None:
+def _stored(scan: Scan) -> Arrays:
     texture = scan.visual.texture
     assert texture is not None
-    counts = [len(part) for part in scan.parts.vertices_m]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            np.savez(
-                file,
-                vertices=scan.visual.vertices_m,
-                faces=scan.visual.faces,
-                face_rgb=scan.visual.face_rgb,
-                image=texture.image,
-                uv=texture.uv,
-                part_vertices=np.concatenate(scan.parts.vertices_m),
-                part_cuts=np.cumsum(counts)[:-1],
-                volume=np.float64(scan.parts.volume_m3),
-                n_dropped=np.int64(scan.parts.n_dropped),
-                size_m=np.array(scan.size_m),
-            )
-        # Atomic, so that workers that fill the cache together never see half a file.
-        temporary.replace(path)
-    except OSError:
-        # A read-only or full cache folder only means that the next worker reads the files again.
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+    return {
+        "vertices": scan.visual.vertices_m,
+        "faces": scan.visual.faces,
+        "face_rgb": scan.visual.face_rgb,
+        "image": texture.image,
+        "uv": texture.uv,
+        "part_vertices": np.concatenate(scan.parts.vertices_m),
+        "part_cuts": np.cumsum([len(part) for part in scan.parts.vertices_m])[:-1],
+        "volume": np.array(scan.parts.volume_m3, np.float64),
+        "n_dropped": np.array(scan.parts.n_dropped, np.int64),
+        "size_m": np.array(scan.size_m),
+    }
+
+
+def _restored(stored: Arrays) -> Scan:
+    texture = Texture(stored["image"], stored["uv"])
+    parts = tuple(np.split(stored["part_vertices"], stored["part_cuts"]))
+    width, depth, height = (float(length) for length in stored["size_m"])
+    return Scan(
+        Mesh(stored["vertices"], stored["faces"], stored["face_rgb"], texture),
+        ConvexParts(parts, float(stored["volume"]), int(stored["n_dropped"])),
+        (width, depth, height),
+    )

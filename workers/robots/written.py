@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.identity import digest_of
+from workers.content_cache import cache_folder
 from workers.geometry.mesh import F32, F64
-from workers.objects.scan import cache_folder
 from workers.robots.assembly import Assembly, Body
 from workers.robots.robot import Parts
 from workers.robots.urdf import Inertial, Joint, rotation_rpy

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from schemas.errors import InputError
 from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
 from workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
-from workers.houses.line_index import cache_folder, open_lines
+from workers.houses.line_index import houses_cache, open_lines
 
 
 def named(name: str, **more: object) -> dict:
@@ -106,7 +106,7 @@ def test_without_a_cache_everything_works_in_memory(tmp_path: Path, monkeypatch:
     ref = f"procthor:{write_houses(tmp_path / 'houses', [named('a'), named('b')])}"
     digest = open_houses(ref).digest
     monkeypatch.setenv("DATAGEN_CACHE", str(blocked / "below-a-file"))
-    assert cache_folder() is None
+    assert houses_cache() is None
     source = open_houses(ref)
     assert source.digest == digest and source.load("a").rooms
 

@@ -71,11 +71,15 @@ def test_digests_follow_the_content_not_the_path(tmp_path: Path) -> None:
     assert len({first.digest, heavier.digest, open_objects(f"ycb:{changed}").digest}) == 3
 
 
-def test_the_cache_changes_nothing_and_heals(tmp_path: Path, own_cache: Path) -> None:
+def test_the_cache_changes_nothing_and_heals(
+    tmp_path: Path, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_bundle(tmp_path / "set")
     fresh = open_objects(f"ycb:{folder}").load("001_cube")
     (entry,) = (own_cache / "objects").iterdir()
-    again = open_objects(f"ycb:{folder}").load("001_cube")
+    with monkeypatch.context() as patch:
+        patch.setattr("workers.objects.scan.read_scan", lambda *_: pytest.fail("read again"))
+        again = open_objects(f"ycb:{folder}").load("001_cube")
     entry.write_bytes(entry.read_bytes()[:500])
     healed = open_objects(f"ycb:{folder}").load("001_cube")
     for other in (again, healed):

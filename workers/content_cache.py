@@ -1,0 +1,180 @@
+"""What was worked out once, on disk: files that are whole or absent, the longest unused dropped.
+
+A cache saves time and decides nothing. What is broken, foreign or too large reads as absent, and a
+folder that is read-only or full keeps nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import os
+import stat
+import tempfile
+import time
+import zipfile
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+from uuid import uuid4
+
+import numpy as np
+import numpy.typing as npt
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+# Type and shape of every array; lengths with one name are equal.
+Layout = Mapping[str, tuple[type[np.generic], tuple[int | str, ...]]]
+
+_ABANDONED_S = 3600.0  # a half written file this old is of a process that was killed
+
+
+def cache_folder() -> Path:
+    """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories)."""
+    if explicit := os.environ.get("DATAGEN_CACHE"):
+        return Path(explicit)
+    try:
+        home = Path.home()
+    except RuntimeError:  # a container may run a user id without a home
+        home = Path(tempfile.gettempdir())
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "datagen"
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Named arrays in one folder of the cache, each file under the key of all that decides its content."""
+
+    folder: str  # below the cache folder
+    layout: Layout
+    most_files: int  # beyond it the longest unused are dropped
+    most_bytes: int  # a larger file is not read
+
+    def load(self, key: str) -> dict[str, npt.NDArray[Any]] | None:
+        """The arrays stored under a key, or None; reading counts as use."""
+        path = self._path(key)
+        found = read_arrays(path, {**self.layout, "key": (np.str_, ())}, self.most_bytes)
+        if found is None or str(found.pop("key")) != key:
+            return None
+        refresh(path)
+        return found
+
+    def store(self, key: str, arrays: Arrays) -> None:
+        """Keeps arrays of the shelf's layout, where the folder takes them."""
+        path = self._path(key)
+        if write_arrays(path, {**arrays, "key": np.array(key)}):
+            drop_unused(path.parent, self.most_files)
+
+    def _path(self, key: str) -> Path:
+        return cache_folder() / self.folder / f"{key}.npz"
+
+
+def read_arrays(path: Path, layout: Layout, most_bytes: int) -> dict[str, npt.NDArray[Any]] | None:
+    """The arrays of an uncompressed npz file, or None where it is anything but the layout, whole."""
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
+            return None
+        with zipfile.ZipFile(path) as archive:
+            if {info.filename for info in archive.infolist()} != {f"{name}.npy" for name in layout}:
+                return None
+            for info in archive.infolist():
+                # Compressed, a small file may hold more than memory.
+                if info.compress_type != zipfile.ZIP_STORED:
+                    return None
+                content = io.BytesIO(archive.read(info))  # checks the CRC before anything is parsed
+                arrays[info.filename[:-4]] = np.lib.format.read_array(content, allow_pickle=False)
+    # RuntimeError: an encrypted member. MemoryError: a header that promises more than there is.
+    except (OSError, EOFError, ValueError, RuntimeError, MemoryError, zipfile.BadZipFile):
+        return None
+    return arrays if _fits(arrays, layout) else None
+
+
+def _fits(arrays: Arrays, layout: Layout) -> bool:
+    lengths: dict[str, int] = {}
+    for name, (kind, shape) in layout.items():
+        dtype = arrays[name].dtype
+        if dtype.type is not kind or not dtype.isnative or arrays[name].ndim != len(shape):
+            return False
+        for length, wanted in zip(arrays[name].shape, shape, strict=True):
+            if length != (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length)):
+                return False
+    return True
+
+
+def write_arrays(path: Path, arrays: Arrays) -> bool:
+    """Writes what `read_arrays` reads; False where the folder does not take it."""
+    contents: Any = dict(arrays)
+    try:
+        with whole_file(path) as file:
+            np.savez(file, **contents)
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Generator[IO[bytes]]:
+    """A file that appears under its name when the block ends, or not at all; folders are made.
+
+    Several processes may write one name at once: each sees nothing or a whole file. Raises OSError.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            yield file
+        temporary.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def refresh(path: Path) -> bool:
+    """Marks a file as used now; whether it is there."""
+    try:
+        os.utime(path)
+    except OSError:
+        return path.is_file()  # also where its time is not ours to change
+    return True
+
+
+def drop_unused(folder: Path, most: int, idle_s: float = 0.0) -> None:
+    """Where a folder has more than `most` files, drops the longest unused and an eighth more.
+
+    Keeps files used within `idle_s`, however many. What killed processes left half written goes too.
+    """
+    try:
+        paths = list(folder.iterdir())
+    except OSError:
+        return
+    if len(paths) <= most:
+        return
+    files: list[tuple[float, Path]] = []
+    now = time.time()
+    for path in paths:
+        # Another process may drop the same files meanwhile.
+        with contextlib.suppress(OSError):
+            status = path.lstat()
+            if not stat.S_ISREG(status.st_mode):
+                continue
+            if not path.name.startswith("."):
+                files.append((status.st_mtime, path))
+            elif path.suffix == ".tmp" and now - status.st_mtime > _ABANDONED_S:
+                path.unlink()
+    if len(files) <= most:
+        return
+    for used, path in sorted(files)[: len(files) - most + most // 8]:
+        if now - used >= idle_s:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Generator[None]:
+    """Holds off other processes that ask for the same folder. Raises OSError where it cannot be written."""
+    with (folder / ".lock").open("ab") as file:
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
