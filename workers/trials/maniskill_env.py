@@ -210,8 +210,8 @@ class DatagenGraspEnv(BaseEnv):
         """None: nothing here is drawn."""
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        tree = read_urdf(self.robot.urdf)  # asked for first: the agent loads the same files
         super()._load_agent(options, self._root_poses(), build_separate=True)
-        tree = read_urdf(self.robot.urdf)
         above = {joint.child: joint for joint in tree.joints.values()}
         shoulder, fingers = self.robot.joint_names[0], self.robot.finger_joint_names
         for link in self.agent.robot.get_links():
