@@ -114,7 +114,7 @@ def print_single(spec: Specification, cases: list[Case], trial: TrialParams) -> 
     print_row("default", base, base)
     print_row("default again", outcomes(cases, trial), base)
     for friction in (0.02, 0.05, 0.1, 0.2, 0.4):
-        # PhysX takes the mean of the two frictions, so both are set.
+        # A pair has the mean of the two frictions, so both are set.
         changed = trial.model_copy(update={"object_friction": friction, "finger_friction": friction})
         print_row(f"friction of pads and object {friction}", outcomes(cases, changed), base)
     for force_n in (0.5, 1.0, 2.0, 5.0, 10.0, 70.0):

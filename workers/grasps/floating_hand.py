@@ -12,7 +12,7 @@ import numpy.typing as npt
 from workers.geometry.mesh import F32, F64
 from workers.geometry.transforms import inverse, rotation_of, translation
 from workers.robots.robot import Gripper, Parts
-from workers.settling.sapien_bodies import add_object, convex_shape, sapien_pose
+from workers.settling.sapien_bodies import add_object, convex_shape, pad_material, sapien_pose
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
@@ -120,7 +120,7 @@ def _slips(
     """How far (N,) the objects move in their hands while pulled, metres; inf where physics broke."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(test.timestep_s)
-    rubber = physx.PhysxMaterial(test.finger_friction, test.finger_friction, 0.0)
+    rubber = pad_material(test.object_friction, test.finger_friction)
     skin = physx.PhysxMaterial(test.object_friction, test.object_friction, 0.0)
     n = len(T_tcp_object)
     across = int(np.ceil(np.sqrt(n)))

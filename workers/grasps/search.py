@@ -19,7 +19,7 @@ from workers.robots.robot import Gripper
 Bools = npt.NDArray[np.bool_]
 
 # Part of every cache key and seed: raise it when the same object and hand get other grasps.
-VERSION = 1
+VERSION = 2
 # Room between the open fingers and the object, both sides together: the first that lets the hand in.
 AIR_M = (0.02, 0.006)
 _LEAST_AIR_M = 0.004

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 
@@ -17,6 +18,16 @@ with warnings.catch_warnings():
     from sapien import physx
 
 _UNSCALED = [1.0, 1.0, 1.0]
+
+
+def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxMaterial:
+    """What a finger's pad is made of, so that its friction with the object is the geometric mean of both.
+
+    Rubber holds a soapy bottle far worse than a dry one. PhysX takes the arithmetic mean, in which the
+    object's friction hardly counts; the pad gets what makes that the same.
+    """
+    pad = max(0.0, 2 * math.sqrt(object_friction * finger_friction) - object_friction)
+    return physx.PhysxMaterial(pad, pad, 0.0)
 
 
 def add_static(scene: sapien.Scene, parts_m: Sequence[F32], material: physx.PhysxMaterial) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from schemas.specification import TrialParams
 from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Robot
-from workers.settling.sapien_bodies import convex_shape, object_body, pose_of, sapien_pose
+from workers.settling.sapien_bodies import convex_shape, object_body, pad_material, pose_of, sapien_pose
 from workers.trials.articulation import Articulation
 from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
 
@@ -77,13 +76,9 @@ def tune_shape(shape: physx.PhysxCollisionShape, groups: list[int]) -> None:
 def tune_pad(shape: physx.PhysxCollisionShape, friction: float, finger_friction: float, pad_m: float) -> None:
     """Makes rubber of a finger's shape; the pad is `pad_m` across.
 
-    A pair's friction is the geometric mean of both sides': rubber holds a soapy bottle far worse than a
-    dry one. PhysX takes the arithmetic mean, so the pad gets what makes that the same. A soft pad also
-    resists turning about its normal, as points do not.
+    A soft pad also resists turning about its normal, as points do not.
     """
-    pair = math.sqrt(friction * finger_friction)
-    pad = max(0.0, 2 * pair - friction)
-    shape.set_physical_material(physx.PhysxMaterial(pad, pad, 0.0))
+    shape.set_physical_material(pad_material(friction, finger_friction))
     shape.set_patch_radius(pad_m / 2)
     shape.set_min_patch_radius(pad_m / 2)
 
