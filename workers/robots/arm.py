@@ -17,7 +17,7 @@ from workers.robots.inverse import solve
 from workers.robots.looks import body_mesh
 from workers.robots.robot import Gripper, Parts
 from workers.robots.self_collision import SelfCollision
-from workers.robots.written import hull_of, write_urdf
+from workers.robots.written import RobotFiles, hull_of
 
 # Its binary modules have no types.
 pin: Any = pinocchio
@@ -71,7 +71,12 @@ class Arm:
             for b in range(a + 1, len(names))
             if (a, b) not in self.self_pairs and not (b <= count and b == a + 1)
         ]
-        self.urdf: Path = write_urdf(self.name, assembly, disabled)
+        self._files = RobotFiles(self.name, assembly, disabled)
+
+    @property
+    def urdf(self) -> Path:
+        """Path of its URDF, written now where it is not there."""
+        return self._files.urdf()
 
     def at_height(self, base_height_m: float) -> Arm:
         """The same arm on a pedestal of another height; both share what they are made of."""

@@ -29,6 +29,7 @@ class Body:
     name: str
     inertial: Inertial | None
     parts_m: Parts  # link frame
+    unscaled_m: Parts  # the same before the scale
     visuals: tuple[Shape, ...]  # meshes to look at, link frame, before the scale
     scale: float
     drawn_m: Parts  # parts to look at where no visual shows them
@@ -81,7 +82,12 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         T_flange = _scaled_pose(clusters[-1][description.flange_link][1], scale)
         tube = _tube(T_flange, extension_m, description.extension.radius_m)
         last = links[-1]
-        links[-1] = replace(last, parts_m=(*last.parts_m, tube), drawn_m=(*last.drawn_m, tube))
+        links[-1] = replace(
+            last,
+            parts_m=(*last.parts_m, tube),
+            unscaled_m=(*last.unscaled_m, (tube / scale).astype(np.float32)),
+            drawn_m=(*last.drawn_m, tube),
+        )
     fingers = _fingers(hand, description.hand)
     names = (description.hand.palm_link, *(joint.child for joint in fingers))
     links += [_body(hand.path, name, {name: (hand.link(name), np.eye(4))}, 1.0, {}) for name in names]
@@ -191,10 +197,13 @@ def _body(
     path: Path, name: str, cluster: _Cluster, scale: float, cuts_m: Mapping[str, tuple[float, ...]]
 ) -> Body:
     parts: list[F32] = []
+    unscaled: list[F32] = []
     visuals: list[Shape] = []
     for link, T in cluster.values():
         for shape in link.collisions:
-            parts += shape_parts(_placed(shape, T), scale, cuts_m.get(link.name, ()))
+            cuts = cuts_m.get(link.name, ())
+            parts += shape_parts(_placed(shape, T), scale, cuts)
+            unscaled += shape_parts(_placed(shape, T), 1.0, cuts)
         visuals += (_placed(shape, T) for shape in link.visuals)
     if not parts:
         raise _wrong(path, f"link {name}", "has no collision shape")
@@ -204,7 +213,8 @@ def _body(
     # Other formats than glTF are not read to look at; the hulls stand in for them.
     if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
         visuals = []
-    return Body(name, inertial, tuple(parts), tuple(visuals), scale, drawn_m=() if visuals else tuple(parts))
+    drawn = () if visuals else tuple(parts)
+    return Body(name, inertial, tuple(parts), tuple(unscaled), tuple(visuals), scale, drawn)
 
 
 def _placed(shape: Shape, T: F64) -> Shape:

@@ -51,7 +51,6 @@ class Robot(Protocol):
     base_height_m: float
     base_radius_m: float | None  # footprint of its own mobile base; None stands on a pedestal
     gripper: Gripper
-    urdf: Path  # with paths of meshes that resolve; for physics engines
     T_base_root: F64  # (4, 4), pose of the URDF's root link in the base frame
     joint_names: tuple[str, ...]  # (A,) of the arm, from the base on
     finger_joint_names: tuple[str, str]
@@ -66,6 +65,14 @@ class Robot(Protocol):
     link_names: tuple[str, ...]  # (L,)
     link_parts_m: tuple[Parts, ...]  # (L,) convex parts in link frames, fingers fully open
     self_pairs: tuple[tuple[int, int], ...]  # pairs of links that must not touch
+
+    @property
+    def urdf(self) -> Path:
+        """For physics engines, with paths of meshes that resolve.
+
+        The files are written when asked for and stay for an hour at least: read them soon, and ask again.
+        """
+        ...
 
     def T_base_link(self, q_rad: F64) -> F64:
         """Poses (L, 4, 4) of the links at the joints (A,)."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
-import os
+import shutil
 import tempfile
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,56 +14,90 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.identity import digest_of
-from workers.content_cache import cache_folder
+from workers.content_cache import alone_in, cache_folder, drop_unused, refresh, whole_file
 from workers.geometry.mesh import F32, F64
 from workers.robots.assembly import Assembly, Body
 from workers.robots.robot import Parts
 from workers.robots.urdf import Inertial, Joint, rotation_rpy
 
+# Files of the cache's folder; a robot has two of its own and shares the others with its family.
+_MOST_FILES = 8192
+# Longer than any reader takes from asking for the path to reading the files.
+_IDLE_S = 3600.0
+# The folder is looked through at the first robot that a process writes, and at every so many more.
+_WRITTEN_BETWEEN_PRUNINGS = 256
 
-def write_urdf(name: str, assembly: Assembly, disabled: list[tuple[str, str]]) -> Path:
-    """Writes `<name>-<digest>.urdf` and `.srdf` and returns the first; files that exist are left alone.
+
+class RobotFiles:
+    """The files of one robot, written when they are asked for: planning needs none.
 
     Collision shapes are convex STL files, one a part; visuals are left out, because building their materials
     needs a render device. `disabled` are pairs of links that an engine must not let collide.
     """
-    folder = _folder()
-    root = ElementTree.Element("robot", name=name)
-    for body in assembly.bodies:
-        _add_link(root, body, folder)
-    for joint in (*assembly.arm, assembly.palm, *assembly.fingers):
-        _add_joint(root, joint)
-    ElementTree.indent(root)
-    semantic = ElementTree.Element("robot", name=name)
-    for first, second in disabled:
-        # SAPIEN reads the reason: it honours "Default" alone.
-        ElementTree.SubElement(semantic, "disable_collisions", link1=first, link2=second, reason="Default")
-    ElementTree.indent(semantic)
-    texts = [ElementTree.tostring(element, encoding="unicode") for element in (root, semantic)]
-    stem = f"{name}-{digest_of(texts)[:16]}"
-    # The SRDF first: who finds the URDF finds both.
-    _place(folder / f"{stem}.srdf", texts[1].encode())
-    return _place(folder / f"{stem}.urdf", texts[0].encode())
 
+    _n_written = 0  # by this process
 
-@lru_cache(maxsize=1)
-def _folder() -> Path:
-    try:
-        folder = cache_folder() / "robots"
+    def __init__(self, name: str, assembly: Assembly, disabled: list[tuple[str, str]]) -> None:
+        self._name = name
+        self._assembly = assembly
+        self._disabled = disabled
+        self._paths: tuple[Path, ...] = ()  # the URDF last
+
+    def urdf(self) -> Path:
+        """Path of `<name>-<digest>.urdf`, the `.srdf` beside it; both stay an hour at least.
+
+        They lie in the cache, or else in a temporary folder of this process. Raises OSError where neither
+        takes them.
+        """
+        try:
+            return self._kept_in(cache_folder() / "robots")
+        except OSError:
+            return self._kept_in(_own_folder())
+
+    def _kept_in(self, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    except OSError:
-        pass
-    return Path(tempfile.mkdtemp(prefix="datagen-robots-"))
+        # Nobody drops a file between our finding it and our marking it as used.
+        with alone_in(folder):
+            known = bool(self._paths) and self._paths[-1].parent == folder
+            if not (known and all(refresh(path) for path in self._paths)):
+                self._paths = self._write(folder)
+                if RobotFiles._n_written % _WRITTEN_BETWEEN_PRUNINGS == 0:
+                    drop_unused(folder, _MOST_FILES, _IDLE_S)
+                RobotFiles._n_written += 1
+        return self._paths[-1]
+
+    def _write(self, folder: Path) -> tuple[Path, ...]:
+        root = ElementTree.Element("robot", name=self._name)
+        paths: list[Path] = []
+        for body in self._assembly.bodies:
+            paths += _add_link(root, body, folder)
+        for joint in (*self._assembly.arm, self._assembly.palm, *self._assembly.fingers):
+            _add_joint(root, joint)
+        semantic = ElementTree.Element("robot", name=self._name)
+        for first, second in self._disabled:
+            # SAPIEN reads the reason: it honours "Default" alone.
+            pair = {"link1": first, "link2": second, "reason": "Default"}
+            ElementTree.SubElement(semantic, "disable_collisions", pair)
+        ElementTree.indent(root)
+        ElementTree.indent(semantic)
+        texts = [ElementTree.tostring(element, encoding="unicode") for element in (semantic, root)]
+        stem = f"{self._name}-{digest_of(texts)[:16]}"
+        for text, suffix in zip(texts, (".srdf", ".urdf"), strict=True):
+            paths.append(_place(folder / f"{stem}{suffix}", text.encode()))
+        return tuple(paths)
+
+
+@cache
+def _own_folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="datagen-robots-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _place(path: Path, content: bytes) -> Path:
-    """Several workers write the same files at once; each sees nothing or a whole file."""
-    if not path.exists():
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
+    if not (refresh(path) and path.stat().st_size == len(content)):
+        with whole_file(path) as file:
             file.write(content)
-        os.replace(file.name, path)
     return path
 
 
@@ -88,13 +123,17 @@ def _part_file(corners_m: F32, folder: Path) -> Path:
     return _place(folder / f"{hashlib.sha256(content).hexdigest()[:16]}.stl", content)
 
 
-def _add_link(root: ElementTree.Element, body: Body, folder: Path) -> None:
+def _add_link(root: ElementTree.Element, body: Body, folder: Path) -> list[Path]:
+    """Adds the link and returns the files of its parts."""
     link = ElementTree.SubElement(root, "link", name=body.name)
     if body.inertial is not None:
         _add_inertial(link, body.inertial)
-    for part in body.parts_m:
+    # Parts are written before their scale, so that a family of scaled arms shares them.
+    files = [_part_file(part, folder) for part in body.unscaled_m]
+    for file in files:
         geometry = ElementTree.SubElement(ElementTree.SubElement(link, "collision"), "geometry")
-        ElementTree.SubElement(geometry, "mesh", filename=str(_part_file(part, folder)))
+        ElementTree.SubElement(geometry, "mesh", filename=str(file), scale=_text(np.full(3, body.scale)))
+    return files
 
 
 def _add_inertial(link: ElementTree.Element, inertial: Inertial) -> None:
