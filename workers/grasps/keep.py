@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import zipfile
 from collections import OrderedDict
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import numpy as np
 
 from schemas.identity import digest_of
 from schemas.specification import GraspParams
-from workers.content_cache import cache_folder
+from workers.content_cache import Arrays, Shelf
 from workers.grasps.grasp import GraspSet
 from workers.grasps.search import VERSION, ScoredGrasps, search_grasps
 from workers.objects.model import ObjectModel
 from workers.robots.robot import Gripper, Parts
 
 _KEPT_IN_MEMORY = 512
-_KEPT_ON_DISK = 2048  # files, of some 30 KB each
-_MAX_FILE_BYTES = 20_000_000
+_SHELF = Shelf(
+    "grasps",
+    {
+        "T_object_tcp": (np.float64, ("n", 4, 4)),
+        "opening_m": (np.float32, ("n",)),
+        "score": (np.float32, ("n",)),
+        "is_clear": (np.bool_, ("n",)),
+        "counts": (np.int64, (3,)),
+        "reason": (np.str_, ()),
+    },
+    most_files=2048,  # of some 30 KB each
+    most_bytes=20_000_000,
+)
 # What moves a bit of the result beside our own code.
 _ENGINES = ("sapien", "coal", "scipy", "numpy")
 
@@ -49,12 +56,13 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> 
     if digest in _kept:
         _kept.move_to_end(digest)
         return _kept[digest]
-    path = cache_folder() / "grasps" / f"{_file_digest(digest)}.npz"
-    found = _from_disk(path, digest)
+    key = _file_digest(digest)
+    stored = _SHELF.load(key)
+    found = None if stored is None else _restored(stored)
     if found is None:
         rng = np.random.Generator(np.random.PCG64(int(digest, 16)))
         found = search_grasps(model, gripper, params.per_object, rng)
-        _to_disk(path, digest, found)
+        _SHELF.store(key, _stored(found))
     _kept[digest] = found
     if len(_kept) > _KEPT_IN_MEMORY:
         _kept.popitem(last=False)
@@ -99,69 +107,34 @@ def _version_of(package: str) -> str:
         return ""
 
 
-def _from_disk(path: Path, digest: str) -> ScoredGrasps | None:
-    try:
-        if path.stat().st_size > _MAX_FILE_BYTES:
-            return None
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            if str(data["digest"]) != digest:
-                return None
-            n_tried, n_free, n_clear = (int(n) for n in data["counts"])
-            found = ScoredGrasps(
-                data["T_object_tcp"].astype(np.float64, casting="equiv"),
-                data["opening_m"].astype(np.float32, casting="equiv"),
-                data["score"].astype(np.float32, casting="equiv"),
-                data["is_clear"].astype(bool, casting="equiv"),
-                n_tried,
-                n_free,
-                n_clear,
-                str(data["reason"]),
-            )
-    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
-        return None  # absent, damaged or of something else: worked out and written anew
+def _stored(found: ScoredGrasps) -> Arrays:
+    return {
+        "T_object_tcp": found.T_object_tcp,
+        "opening_m": found.opening_m,
+        "score": found.score,
+        "is_clear": found.is_clear,
+        "counts": np.array([found.n_tried, found.n_free, found.n_clear], np.int64),
+        "reason": np.array(found.reason),
+    }
+
+
+def _restored(stored: Arrays) -> ScoredGrasps | None:
+    n_tried, n_free, n_clear = (int(n) for n in stored["counts"])
+    found = ScoredGrasps(
+        stored["T_object_tcp"],
+        stored["opening_m"],
+        stored["score"],
+        stored["is_clear"],
+        n_tried,
+        n_free,
+        n_clear,
+        str(stored["reason"]),
+    )
     return found if _is_sound(found) else None
 
 
 def _is_sound(found: ScoredGrasps) -> bool:
-    n = len(found.T_object_tcp)
-    if found.T_object_tcp.shape != (n, 4, 4):
-        return False
-    if any(column.shape != (n,) for column in (found.opening_m, found.score, found.is_clear)):
-        return False
     R = found.T_object_tcp[:, :3, :3]
     turned_right = np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     finite = np.isfinite(found.T_object_tcp).all() and np.isfinite(found.opening_m).all()
     return bool(turned_right and finite and ((found.score >= 0) & (found.score <= 1)).all())
-
-
-def _to_disk(path: Path, digest: str, found: ScoredGrasps) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            np.savez(
-                file,
-                digest=np.array(digest),
-                T_object_tcp=found.T_object_tcp,
-                opening_m=found.opening_m,
-                score=found.score,
-                is_clear=found.is_clear,
-                counts=np.array([found.n_tried, found.n_free, found.n_clear]),
-                reason=np.array(found.reason),
-            )
-        # Atomic, so that workers that fill the cache together never see half a file.
-        temporary.replace(path)
-        _drop_oldest(path.parent)
-    except OSError:
-        # A read-only or full cache folder only means that the next worker works it out again.
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-
-
-def _drop_oldest(folder: Path) -> None:
-    files = sorted(folder.glob("*.npz"))
-    if len(files) <= _KEPT_ON_DISK:
-        return
-    files.sort(key=lambda file: file.stat().st_mtime)
-    for file in files[: len(files) - _KEPT_ON_DISK]:
-        file.unlink(missing_ok=True)
