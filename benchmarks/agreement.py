@@ -1,0 +1,94 @@
+"""How rules that look at distance and sight alone agree with a run of `plan` or `sim`, as tables.
+
+    python -m benchmarks.agreement RUN
+
+Rules are computed anew from the stored columns: the paper's heuristic with its absolute distance, the
+same with the distance from mount to target divided by the arm's reach, "within reach", and both
+joined. None of them knows whether the base fits where it would stand; "and clear" adds that.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+
+import numpy as np
+
+from datagen.agreement import CANDIDATE_SETS, Bools, Labelled, agreement, confusion
+from datagen.labelled import read_labelled
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.specification import HeuristicParams
+from workers.labels.heuristic import heuristic
+
+# Distances in reaches of the arm: nothing beyond one can be grasped.
+OVER_REACH = HeuristicParams(
+    distance="mount-over-reach", mu=0.7, sigma_l=0.3, sigma_r=0.15, d_min=0.0, d_max=1.0
+)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", metavar="RUN", help="a run of plan or sim, with any number of labels")
+    run = Run.open(parser.parse_args().run)
+    labelled = read_labelled(run)
+    if labelled is None:
+        raise InputError(run.storage.url, "commits", "no labels yet", "Wait for its first shard")
+    scenes = len(np.unique(labelled.scene))
+    print(f"{len(labelled):,} {run.manifest.spec.label_source} labels of {scenes} scenes")
+    rules = rules_of(labelled)
+    for name in CANDIDATE_SETS:
+        print_set(labelled, rules, name)
+
+
+def rules_of(labelled: Labelled) -> Mapping[str, Bools]:
+    """What each rule says of every candidate (N,)."""
+
+    def by(params: HeuristicParams) -> Bools:
+        distances = (labelled.distance_m, labelled.mount_distance_m)
+        return heuristic(*distances, labelled.reach_m, labelled.visibility, params)[1] == 1
+
+    within = labelled.mount_distance_m <= labelled.reach_m
+    paper, over_reach = by(HeuristicParams()), by(OVER_REACH)
+    return {
+        "nothing is good": np.zeros(len(labelled), np.bool_),
+        "the paper's": paper,
+        "the paper's, and within reach": paper & within,
+        "distance / reach": over_reach,
+        "within reach": within,
+    }
+
+
+def print_set(labelled: Labelled, rules: Mapping[str, Bools], name: str) -> None:
+    """One set of candidates: a row a rule; where bases may collide, a second row with the clear ones."""
+    rows = labelled.is_in(name)
+    label = labelled.label[rows]
+    if not len(label):
+        print(f"\n{name}: no candidates")
+        return
+    print(f"\n{name}: {len(label):,} candidates, {100 * label.mean():.1f}% positive")
+    print(f"{'rule':42}{'says good':>11}{'accuracy':>10}{'balanced':>10}{'found':>8}{'wrong':>8}")
+    for rule, said in rules.items():
+        print_rule(rule, said[rows], label)
+        if name == "grid" and said.any():
+            print_rule(f"{rule}, and clear", (said & labelled.is_clear)[rows], label)
+
+
+def print_rule(rule: str, said: Bools, label: Bools) -> None:
+    """`found`: share of the positives it names; `wrong`: share of what it names that is not."""
+    told, counts = agreement(said, label), confusion(said, label)
+    balanced = told["balanced_accuracy"]
+    named, good = int(said.sum()), int(label.sum())
+    cells = (
+        f"{100 * said.mean():10.1f}%",
+        f"{100 * told['accuracy']:9.1f}%",
+        "         -" if balanced is None else f"{100 * balanced:9.1f}%",
+        f"{100 * counts['true_positive'] / good:7.1f}%" if good else "       -",
+        f"{100 * counts['false_positive'] / named:7.1f}%" if named else "       -",
+    )
+    print(f"{rule:42}" + "".join(cells))
+
+
+if __name__ == "__main__":
+    main()
