@@ -26,6 +26,11 @@ def blocks() -> list[tuple[str, str, str]]:
     return _BLOCK.findall(PAGE.read_text())
 
 
+def lines_of(registry: str) -> list[str]:
+    """The page's lines for one registry."""
+    return [code for kind, place, code in blocks() if kind == "line" and place == registry]
+
+
 def executed(monkeypatch: pytest.MonkeyPatch, name: str, code: str) -> ModuleType:
     """The code as a module that can be imported for the duration of the test."""
     module = ModuleType(name)
@@ -52,9 +57,9 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     return modules
 
 
-def test_each_source_is_one_file_one_line_and_one_test() -> None:
+def test_each_example_is_one_file_one_line_and_one_test() -> None:
     shape = [(kind, place.split("/")[0].split(".")[0]) for kind, place, _ in blocks()]
-    assert shape == [("file", "workers"), ("line", "workers"), ("file", "tests")] * 3
+    assert shape == [("file", "workers"), ("line", "workers"), ("file", "tests")] * 4
     assert PAGE.read_text().count("```python") == len(shape)  # no block escapes this test
     for kind, place, _ in blocks():
         if kind == "file":  # it would be a new file, beside the others of its kind
@@ -75,19 +80,41 @@ def page_tests() -> list[tuple[str, str, str]]:
 def test_the_tests_on_the_page_pass(
     place: str, code: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if place.startswith("tests/workers/robots/"):
+        pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
     module = executed(monkeypatch, place.removesuffix(".py").replace("/", "."), code)
     test = getattr(module, name)
     marks = [mark for mark in getattr(test, "pytestmark", []) if mark.name == "parametrize"]
     cases = [{mark.args[0]: value} for mark in marks for value in mark.args[1]] or [{}]
-    assert set(inspect.signature(test).parameters) <= {"tmp_path", *cases[0]}
+    wanted = inspect.signature(test).parameters
+    assert set(wanted) <= {"tmp_path", *cases[0]}
     for k, case in enumerate(cases):
         folder = tmp_path / str(k)
         folder.mkdir()
-        test(tmp_path=folder, **case)
+        test(**({"tmp_path": folder} if "tmp_path" in wanted else {}), **case)
 
 
 @pytest.mark.usefixtures("extended")
-def test_a_run_with_all_three_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_robot_conforms_by_its_line_alone() -> None:
+    pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
+    from tests.workers.robots import test_conformance, test_physics
+    from tests.workers.robots.robots_under_test import cases_of, opened
+
+    robots = [name for code in lines_of("workers.robots:ROBOTS") for name in eval("{" + code + "}", {})]
+    checks = [
+        check
+        for module in (test_conformance, test_physics)
+        for name, check in vars(module).items()
+        if name.startswith("test_") and set(inspect.signature(check).parameters) == {"robot"}
+    ]
+    assert len(robots) == 1 and len(checks) > 10
+    for case in cases_of(robots[0]):
+        for check in checks:
+            check(robot=opened(case))
+
+
+@pytest.mark.usefixtures("extended")
+def test_a_run_with_all_three_sources_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rooms, boxes, run = tmp_path / "rooms", tmp_path / "boxes.csv", tmp_path / "run"
     rooms.mkdir()
     for k in range(3):

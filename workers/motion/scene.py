@@ -23,7 +23,7 @@ from workers.motion.collision import (
     place_object,
 )
 from workers.motion.forward import ForwardKinematics, forward_kinematics
-from workers.motion.hand import Hand, backed, can_be_lifted, free_grasps, hand_of, varied
+from workers.motion.hand import Hand, can_be_lifted, free_grasps, hand_of, varied
 from workers.motion.reach_table import ReachTable, reach_table
 from workers.robots.robot import Robot
 from workers.scenes.scene import SettledScene
@@ -63,9 +63,7 @@ class PlanningScene:
     grasps_free: int  # of the whole GraspSet
     grasp: Ints  # (K,), row of the GraspSet
     T_world_tcp: F64  # (K, 4, 4)
-    T_world_pregrasp: F64  # (K, 4, 4)
     opening_m: F64  # (K,)
-    score: F64  # (K,)
 
 
 def prepare(
@@ -111,9 +109,7 @@ def prepare(
         len(rows),
         grasp,
         T,
-        backed(T, params.pregrasp_m),
         opening_m[grasp],
-        grasps.score[grasp].astype(np.float64),
     )
 
 

@@ -41,7 +41,6 @@ class Arm:
         self.shoulder_m: F64 = (self.T_base_root @ assembly.arm[0].T_parent_child)[:3, 3]
         self.joint_names = tuple(joint.name for joint in assembly.arm)
         self.finger_joint_names = (assembly.fingers[0].name, assembly.fingers[1].name)
-        self.fixed_joints: dict[str, float] = {}
         self.q_lower_rad: F64 = np.array([joint.lower for joint in assembly.arm])
         self.q_upper_rad: F64 = np.array([joint.upper for joint in assembly.arm])
         self.speed_limit_radps: F64 = np.array([joint.speed for joint in assembly.arm])

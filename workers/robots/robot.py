@@ -54,7 +54,6 @@ class Robot(Protocol):
     T_base_root: F64  # (4, 4), pose of the URDF's root link in the base frame
     joint_names: tuple[str, ...]  # (A,) of the arm, from the base on
     finger_joint_names: tuple[str, str]
-    fixed_joints: dict[str, float]  # other joints of the URDF and where they are held
     q_lower_rad: F64  # (A,)
     q_upper_rad: F64  # (A,)
     speed_limit_radps: F64  # (A,)

@@ -46,9 +46,9 @@ class Articulation:
 
 
 def articulation_of(robot: Robot) -> Articulation:
-    """Reads the URDF; joints other than the arm's and the fingers' are frozen where the robot holds them.
+    """Reads the URDF, in which the arm's and the fingers' joints alone move.
 
-    Raises InputError where the URDF is broken or lacks a joint.
+    Raises InputError where it is broken or lacks a joint.
     """
     tree = read_urdf(robot.urdf)
     moving = (*robot.joint_names, *robot.finger_joint_names)
@@ -59,7 +59,7 @@ def articulation_of(robot: Robot) -> Articulation:
     waiting: list[tuple[int, Joint | None, F64, str]] = [(-1, None, np.eye(4), root)]
     while waiting:
         parent, joint, T_parent_child, link = waiting.pop(0)
-        rigid = _rigid_links(tree, robot, link, moving)
+        rigid = _rigid_links(tree, link, moving)
         index = len(bodies)
         bodies.append(_body(tree, rigid, parent, joint, T_parent_child, robot))
         for name, T_body_link in rigid:
@@ -70,14 +70,13 @@ def articulation_of(robot: Robot) -> Articulation:
     return Articulation(tuple(bodies), tuple(by_joint[name] for name in moving), robot.T_base_root)
 
 
-def _rigid_links(tree: Tree, robot: Robot, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
+def _rigid_links(tree: Tree, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
     """The link and all that hangs on it by joints that do not move, with their poses in its frame."""
     found = [(link, np.eye(4))]
     for name, T in found:
         for joint in tree.children(name):
             if joint.name not in moving:
-                q = robot.fixed_joints.get(joint.name, 0.0) if joint.kind != "fixed" else 0.0
-                found.append((joint.child, T @ joint.T_parent_child @ _moved(joint, q)))
+                found.append((joint.child, T @ joint.T_parent_child))
     return found
 
 
@@ -122,18 +121,6 @@ def _body(
         parent, name, kind, T_parent_child @ T_body_joint, T_body_joint, lower, upper, tuple(parts),
         max(mass, _LEAST_MASS_KG), T_body_principal, np.maximum(values, _LEAST_INERTIA_KGM2),
     )  # fmt: skip
-
-
-def _moved(joint: Joint, q: float) -> F64:
-    """The transform (4, 4) of a joint at q, in its own frame."""
-    T = np.eye(4)
-    if joint.kind == "prismatic":
-        T[:3, 3] = q * joint.axis
-    else:
-        R = _x_onto(joint.axis)
-        c, s = np.cos(q), np.sin(q)
-        T[:3, :3] = R @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ R.T
-    return T
 
 
 def _parallel(centre_m: F64) -> F64:

@@ -1,27 +1,38 @@
-"""The robots that the conformance test opens: every entry of the registry, and scales of the family."""
+"""The robots that the conformance tests open: every entry of the registry over its reaches and heights."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
-from workers.robots import open_robot
+from workers.robots import ROBOTS, open_robot, robot_limits
 from workers.robots.robot import Robot
 
-CASES: tuple[tuple[str, float | None, float], ...] = (
-    ("panda", None, 0.8),
-    ("panda-scaled", 0.3, 0.5),
-    ("panda-scaled", 0.37, 0.8),
-    ("panda-scaled", 0.5, 0.8),
-    ("panda-scaled", 0.75, 0.8),
-    ("panda-scaled", 1.0, 1.0),
-    ("xarm7", None, 0.6),
-    ("fetch", None, 0.75),
-    ("fetch", None, 1.1),
-)
-IDS = [f"{name}-{reach_m or height_m}" for name, reach_m, height_m in CASES]
+Case = tuple[str, float | None, float]
+
+_SHARES_OF_REACH = (0.0, 0.1, 0.3, 0.65, 1.0)  # of the range of a robot that is scaled
+_ON_PEDESTAL_M = 0.8
+
+
+def cases_of(name: str) -> list[Case]:
+    """What one robot is opened with: `open_robot`'s arguments."""
+    limits = robot_limits(name)
+    low, high = limits.reach_m
+    reaches = [None] if low == high else [low + share * (high - low) for share in _SHARES_OF_REACH]
+    heights = dict.fromkeys(limits.base_height_m or [_ON_PEDESTAL_M])
+    return [(name, reach_m, height_m) for reach_m in reaches for height_m in heights]
+
+
+def label_of(case: Case) -> str:
+    """A case's name among the tests."""
+    name, reach_m, height_m = case
+    return f"{name}-{reach_m or height_m:g}"
+
+
+CASES = tuple(case for name in ROBOTS for case in cases_of(name))
+IDS = [label_of(case) for case in CASES]
 
 
 @lru_cache
-def opened(case: tuple[str, float | None, float]) -> Robot:
+def opened(case: Case) -> Robot:
     """One robot a case, kept over the tests."""
     return open_robot(*case)

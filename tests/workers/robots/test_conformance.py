@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
+from schemas.fields import SCHEMAS
 from tests.workers.robots.robots_under_test import CASES, IDS, opened
-from workers.robots import ROBOTS, robot_limits
+from workers.robots import robot_limits
 from workers.robots.hulls import MAX_CORNERS
 from workers.robots.robot import Robot
 
@@ -33,12 +34,10 @@ def pose_error(A: np.ndarray, B: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(A[:3, 3] - B[:3, 3])), float(np.arccos(np.clip(cos, -1, 1)))
 
 
-def test_every_robot_of_the_registry_is_tested() -> None:
-    assert {name for name, _, _ in CASES} == set(ROBOTS)
-
-
 def test_lengths_and_limits(robot: Robot) -> None:
     joints, links = len(robot.joint_names), len(robot.link_names)
+    in_records = next(f for f in SCHEMAS["plan"].sample_fields if f.name == "q_grasp_rad")
+    assert (joints,) == SCHEMAS["plan"].shape(in_records, 1)[1:]
     assert len(set(robot.joint_names)) == joints and len(set(robot.link_names)) == links
     for values in (robot.q_lower_rad, robot.q_upper_rad, robot.speed_limit_radps):
         assert values.shape == (joints,) and np.isfinite(values).all()

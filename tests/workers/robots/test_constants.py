@@ -19,7 +19,7 @@ from workers.robots.fetch import FETCH
 from workers.robots.franka_hand import FRANKA_HAND
 from workers.robots.hulls import MAX_CORNERS, excess_m, mesh_hulls, outer_hull, read_points
 from workers.robots.panda import PANDA, PANDA_SCALED
-from workers.robots.urdf import Tree, read_urdf
+from workers.robots.urdf import Inertial, Tree, read_urdf, scaled_inertial
 from workers.robots.xarm7 import XARM7
 
 
@@ -126,6 +126,21 @@ def test_the_wrist_extension_ends_where_it_should() -> None:
             tube = robot.link_parts_m[wrist][1]
             assert np.ptp(tube[:, 2]) == pytest.approx(length_m, abs=1e-6)
             assert np.hypot(tube[:, 0], tube[:, 1]).max() == pytest.approx(rule.radius_m, rel=0.05)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), scale=st.floats(0.1, 1.5))
+def test_inertia_is_that_of_masses_kept_at_scaled_places(seed: int, scale: float) -> None:
+    points = np.random.default_rng(seed).normal(size=(8, 3))
+
+    def of(places: np.ndarray) -> Inertial:
+        d = places - places.mean(axis=0)
+        return Inertial(8.0, places.mean(axis=0), np.einsum("ni,ni->", d, d) * np.eye(3) - d.T @ d)
+
+    scaled, expected = scaled_inertial(of(points), scale), of(points * scale)
+    assert scaled.mass_kg == expected.mass_kg
+    np.testing.assert_allclose(scaled.centre_m, expected.centre_m, atol=1e-12)
+    np.testing.assert_allclose(scaled.inertia_kgm2, expected.inertia_kgm2, atol=1e-9)
 
 
 def test_without_the_extension_the_hand_would_meet_the_forearm() -> None:

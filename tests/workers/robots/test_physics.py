@@ -51,7 +51,7 @@ class Simulated:
         """Sets joints and targets, fingers open; returns the joints in the engine's order."""
         opening = self.robot.gripper.max_opening_m / 2
         values = dict(zip(self.robot.joint_names, q_rad, strict=True))
-        values |= dict.fromkeys(self.robot.finger_joint_names, opening) | self.robot.fixed_joints
+        values |= dict.fromkeys(self.robot.finger_joint_names, opening)
         q = np.array([values[name] for name in self.names])
         self.body.set_qpos(q)
         self.body.set_qvel(np.zeros_like(q))
@@ -62,7 +62,7 @@ class Simulated:
 
 def test_joints_and_links_are_those_of_the_files(robot: Robot) -> None:
     simulated = Simulated(robot)
-    assert set(simulated.names) == {*robot.joint_names, *robot.finger_joint_names, *robot.fixed_joints}
+    assert set(simulated.names) == {*robot.joint_names, *robot.finger_joint_names}
     assert set(robot.link_names) == set(simulated.links)
     for name, parts in zip(robot.link_names, robot.link_parts_m, strict=True):
         assert len(simulated.links[name].collision_shapes) == len(parts)
