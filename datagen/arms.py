@@ -5,9 +5,11 @@ from __future__ import annotations
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from schemas.errors import InputError
-from schemas.specification import ArmParams, CandidateParams, Range, Specification
-from workers.robots import robot_limits
+from pydantic import ValidationError
+
+from schemas.errors import InputError, choices
+from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
+from workers.robots import ROBOTS, robot_limits
 
 # Label sources that move an arm, and the distributions whose version can move bits of their labels.
 ARM_PACKAGES: dict[str, tuple[str, ...]] = {
@@ -50,6 +52,14 @@ def complete_arm(
     if repeats is not None and label_source != "sim":
         mend = "Take it out, or submit sim"
         raise InputError("--perturb", str(repeats), f"nothing is executed by {label_source}", mend)
+    if repeats is not None:
+        try:
+            DisturbanceParams(repeats=repeats)
+        except ValidationError as error:
+            problem = error.errors()[0]["msg"]
+            raise InputError(
+                "--perturb", str(repeats), problem, "Leave it out for undisturbed trials"
+            ) from None
     if label_source not in ARM_PACKAGES:
         if "arm" in fields:
             raise InputError(place, "arm", f"{label_source} has no arm", "Take the section out")
@@ -63,6 +73,8 @@ def complete_arm(
             raise InputError(place, f"arm.{section}", problem, "Take the section out, or submit sim")
     if robot is not None:
         arm["robot"] = robot
+    elif isinstance(named := arm.get("robot"), str) and named not in ROBOTS:
+        raise InputError(place, "arm.robot", f"no robot named {named!r}", choices(ROBOTS))
     if label_source == "sim":
         arm.setdefault("trial", {})
         if repeats is not None:

@@ -32,7 +32,9 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     """
     arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
-    retrial = try_again(shown.recalled, recall_candidates(shown.rows.samples), row, shown.spec)
+    retrial = try_again(
+        shown.recalled, recall_candidates(shown.rows.samples, shown.recalled), row, shown.spec
+    )
     outcome, robot = retrial.trial.outcome, retrial.robot
     moving = out.suffix.lower() == ".gif"
     if moving and not retrial.moves:

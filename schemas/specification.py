@@ -132,24 +132,24 @@ class MotionParams(_Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
     ik_seeds: int = Field(default=3, ge=1, le=100)
-    pregrasp_m: Metres = 0.08
-    lift_m: Metres = 0.10
+    pregrasp_m: float = Field(default=0.08, ge=0, le=0.5)
+    lift_m: float = Field(default=0.10, ge=0.01, le=0.5)
     # Between neighbouring points of a straight line no joint may move further.
     max_joint_jump_rad: float = Field(default=0.6, gt=0, le=6.3)
     # Spacing of the configurations at which a path is checked against the scene.
-    check_step_rad: float = Field(default=0.05, gt=0, le=1.0)
+    check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
     # Counts, never a time: labels must not depend on how fast a machine is. Both are of one candidate.
     max_grasps_tried: int = Field(default=24, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Distance that the arm keeps from everything, and the hand up to the pregrasp.
-    margin_m: Metres = 0.005
+    margin_m: float = Field(default=0.005, ge=0, le=0.2)
 
 
 class TrialParams(_Frozen):
     """Execution in physics: the whole planned path, close, lift, hold."""
 
-    timestep_s: float = Field(default=1 / 200, gt=0, le=0.02)
-    control_period_s: float = Field(default=1 / 20, gt=0, le=0.2)
+    timestep_s: float = Field(default=1 / 200, ge=1e-4, le=0.02)
+    control_period_s: float = Field(default=1 / 20, ge=0.005, le=0.2)
     object_friction: float = Field(default=0.6, ge=0, le=5)
     finger_friction: float = Field(default=2.0, ge=0, le=5)
     grip_force_n: float = Field(default=40.0, gt=0, le=1000)
@@ -162,6 +162,14 @@ class TrialParams(_Frozen):
     max_slip_m: Metres = 0.03
     # Grasps tried one after the other, each in a fresh scene, until one lifts the target.
     max_attempts: int = Field(default=3, ge=1, le=100)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TrialParams:
+        if self.control_period_s < self.timestep_s:
+            raise ValueError(
+                f"control_period_s {self.control_period_s} is below timestep_s {self.timestep_s}"
+            )
+        return self
 
 
 class Interval(_Frozen):
@@ -187,6 +195,13 @@ class DisturbanceParams(_Frozen):
     base_yaw_std_rad: float = Field(default=0.02, ge=0, le=3.2)
     object_friction: Interval = Interval(low=0.3, high=0.9)
     mass_scale: Interval = Interval(low=0.8, high=1.2)
+
+    @model_validator(mode="after")
+    def _heavy(self) -> DisturbanceParams:
+        # An engine takes no mass for one that nothing moves.
+        if self.mass_scale.low < 0.001:
+            raise ValueError(f"mass_scale.low {self.mass_scale.low} is below 0.001")
+        return self
 
 
 class ArmParams(_Frozen):

@@ -101,7 +101,7 @@ def _recall(world: World, index: int, rows: SceneRows, clock: StageClock) -> _St
     if scene.index != index:
         problem = f"scene {scene.index} is stored where scene {index} belongs"
         raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
-    return _Staged(scene, recall_candidates(rows.samples), rows.record, {})
+    return _Staged(scene, recall_candidates(rows.samples, scene), rows.record, {})
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

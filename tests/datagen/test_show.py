@@ -90,7 +90,7 @@ def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str,
     spec, rows = run.manifest.spec, read_scene(run, 0)
     scene = recall_scene(open_world(spec, "builtin", "builtin"), rows.record)
     for row in range(0, PER_SCENE, 2):
-        again = try_again(scene, recall_candidates(rows.samples), row, spec)
+        again = try_again(scene, recall_candidates(rows.samples, scene), row, spec)
         assert again.trial.outcome == NAMES[rows.samples["outcome"][row]]
         assert again.moves == (rows.samples["path_length_rad"][row] > 0)
         if name != "plan":

@@ -56,6 +56,16 @@ def test_the_hash_survives_a_round_trip_through_json() -> None:
         {"heuristic": {"mu": float("nan")}},
         {"candidates": {"per_scene": 626}},
         {"settle": {"timestep_s": 0}},
+        # Trials that would take for ever, or lift nothing.
+        {"arm": {"trial": {"timestep_s": 1e-9}}},
+        {"arm": {"trial": {"control_period_s": 1e-9}}},
+        {"arm": {"trial": {"timestep_s": 0.02, "control_period_s": 0.01}}},
+        {"arm": {"motion": {"check_step_rad": 1e-300}}},
+        {"arm": {"motion": {"lift_m": 0}}},
+        {"arm": {"motion": {"lift_m": 100}}},
+        {"arm": {"motion": {"pregrasp_m": 100}}},
+        {"arm": {"motion": {"margin_m": 100}}},
+        {"arm": {"disturbance": {"mass_scale": {"low": 0, "high": 1}}}},
         {"houses": {"kind": "a", "digest": "xyz"}},
     ],
 )
