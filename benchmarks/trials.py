@@ -25,7 +25,7 @@ from schemas.specification import DisturbanceParams, Specification, TrialParams
 from workers.labels.trials import arm_of, draw_disturbances
 from workers.trials import physics
 from workers.trials.execute import TrialScene, prepare_trials, run_trial
-from workers.trials.prepared import pedestal_below, still_parts_near
+from workers.trials.prepared import Things, pedestal_below, still_parts_near
 from workers.trials.trial import Disturbance, TrialResult
 
 
@@ -113,7 +113,7 @@ def build_time_s(cases: list[Case], prepared: list[TrialScene], trial: TrialPara
         physics.TrialWorld(
             still_parts_near(scene, case.T_world_base),
             pedestal_below(scene, case.T_world_base),
-            physics.Things(scene.parts_m, scene.mass_kg, scene.T_world_object),
+            Things(scene.parts_m, scene.mass_kg, scene.T_world_object),
             scene.robot,
             scene.articulation,
             case.T_world_base,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from datagen.drawing.film import Told, told_moments
 from schemas.cost import StageClock
-from schemas.identity import Stream, generator
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64
@@ -18,18 +16,18 @@ from workers.labels.trials import (
     ArmInScene,
     CandidateTrial,
     arm_in_scene,
-    draw_disturbances,
+    disturbances_of,
     try_candidate,
 )
 from workers.motion.plan import MotionPlan
-from workers.motion.scene import pose_of_base
+from workers.motion.rrt_connect import dense
 from workers.motion.surroundings import surroundings
 from workers.robots.robot import Robot
 from workers.scenes.scene import SettledScene
 from workers.trials.trial import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
-_STEP_RAD = 0.05  # that a plan advances meanwhile
+_STEP_RAD = 0.08  # that a plan advances meanwhile, over all joints
 _TRIES = 7  # poses shown of an arm that found no plan
 
 
@@ -62,18 +60,13 @@ def try_again(scene: SettledScene, candidates: Candidates, row: int, spec: Speci
     """
     at = arm_in_scene(scene, candidates, row, spec, StageClock())
     trial = try_candidate(at, candidates, row, spec, record=True)
-    T_world_base = pose_of_base(
-        candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, scene.target_center_m
-    )
+    T_world_base = at.base_pose(candidates, row)
     alike = [k for k, result in enumerate(trial.results) if result.outcome == trial.outcome]
     shown = alike[-1] if alike else None
     recording = None if shown is None else trial.results[shown].recording
     if shown is not None and recording is not None:
-        disturbance = at.arm.disturbance
-        if disturbance is not None:
-            rng = generator(spec.seed, Stream.DISTURBANCE, scene.index, scene.retry, row)
-            drawn = draw_disturbances(disturbance, scene.T_world_object[0], rng)
-            T_world_base = T_world_base @ drawn[shown].T_base_moved
+        if disturbances := disturbances_of(at, row, spec):
+            T_world_base = T_world_base @ disturbances[shown].T_base_moved
         kept = _with_sense(recording)
         return Retrial(at.robot, T_world_base, trial, shown, kept, told_moments(kept))
     if trial.plan is not None:
@@ -91,10 +84,8 @@ def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_ob
         ("approach", plan.q_approach_rad),
         ("lift", plan.q_lift_rad),
     ):
-        for start, end in pairwise(path):
-            steps = max(1, int(np.ceil(np.abs(end - start).max() / _STEP_RAD)))
-            q.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
-            phases += [phase] * steps
+        q.append(dense(path, _STEP_RAD)[1:])
+        phases += [phase] * len(q[-1])
     q_rad = np.concatenate(q)
     poses = np.tile(T_world_object, (len(q_rad), 1, 1, 1))
     T_tcp_target = inverse(T_world_base @ robot.T_base_tcp(plan.q_approach_rad[-1])) @ T_world_object[0]

@@ -11,7 +11,6 @@ from workers.bases.candidates import Candidates
 from workers.labels import distance_visibility
 from workers.labels.source import Columns, LabelSource
 from workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, target_tcp, try_candidate
-from workers.motion.scene import pose_of_base
 from workers.scenes.scene import SettledScene
 
 VERSION = 1
@@ -61,10 +60,7 @@ def _write(columns: Columns, row: int, at: ArmInScene, candidates: Candidates, t
     plan = trial.plan
     if plan is None:
         return
-    T_world_base = pose_of_base(
-        candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, at.scene.target_center_m
-    )
-    columns["T_target_tcp"][row] = target_tcp(at, T_world_base, plan)
+    columns["T_target_tcp"][row] = target_tcp(at, at.base_pose(candidates, row), plan)
     columns["grasp_score"][row] = at.grasps.score[plan.grasp]
     columns["q_grasp_rad"][row] = plan.q_approach_rad[-1]
     columns["path_length_rad"][row] = plan.length_rad

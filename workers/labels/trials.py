@@ -80,6 +80,11 @@ class ArmInScene:
         T = self.scene.T_world_object[0]
         return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
 
+    def base_pose(self, candidates: Candidates, row: int) -> F64:
+        """World pose (4, 4) of the mount at candidate `row`, facing the target."""
+        xy = candidates.base_xy_m[row].astype(np.float64)
+        return pose_of_base(xy, self.robot.base_height_m, self.scene.target_center_m)
+
     def is_within_reach(self, T_world_base: F64) -> bool:
         """Whether the arm is long enough for any grasp of the target, in a straight line."""
         shoulder_m = T_world_base[:3, :3] @ self.robot.shoulder_m + T_world_base[:3, 3]
@@ -118,22 +123,17 @@ def try_candidate(
         return CandidateTrial("base_collision")
     if len(at.grasps) == 0:
         return CandidateTrial("no_grasp")
-    T_world_base = pose_of_base(
-        candidates.base_xy_m[row].astype(np.float64), at.robot.base_height_m, at.scene.target_center_m
-    )
+    T_world_base = at.base_pose(candidates, row)
     if not at.is_within_reach(T_world_base):
         return CandidateTrial("out_of_reach")
-    key = (at.scene.index, at.scene.retry, row)
-    rng = generator(spec.seed, Stream.PATH, *key)
+    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, row)
     planning, clock = at.planning, at.clock
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)
     if report.plan is None or at.arm.trial is None:
         return CandidateTrial(report.outcome, report, report.plan)
-    if at.arm.disturbance is not None:
-        disturbance_rng = generator(spec.seed, Stream.DISTURBANCE, *key)
-        T_world_target = at.scene.T_world_object[0]
-        disturbances = draw_disturbances(at.arm.disturbance, T_world_target, disturbance_rng)
+    disturbances = disturbances_of(at, row, spec)
+    if disturbances:
         return _repeat(at, T_world_base, report, report.plan, disturbances, record)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
 
@@ -191,6 +191,14 @@ def _repeat(
         counts = Counter(r.outcome for r in results if r.outcome != "success")
         outcome = max(counts, key=lambda name: (counts[name], _PROGRESS.index(name)))
     return CandidateTrial(outcome, report, plan, tuple(results), successes)
+
+
+def disturbances_of(at: ArmInScene, row: int, spec: Specification) -> list[Disturbance]:
+    """The worlds in which the plan of candidate `row` is executed; none where it is the planned one."""
+    if at.arm.disturbance is None:
+        return []
+    rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, row)
+    return draw_disturbances(at.arm.disturbance, at.scene.T_world_object[0], rng)
 
 
 def draw_disturbances(

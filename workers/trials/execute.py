@@ -10,15 +10,15 @@ import numpy as np
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse
 from workers.motion.plan import MotionPlan
-from workers.trials.physics import Things, TrialWorld
+from workers.trials.physics import TrialWorld
 from workers.trials.prepared import (
     TrialScene,
-    moved_target,
+    disturbed_things,
     pedestal_below,
     prepare_trials,
     still_parts_near,
 )
-from workers.trials.script import PHASES, Tick, pressing_target_m, script_of
+from workers.trials.script import PHASES, Tick, planned_rise_m, pressing_target_m, script_of
 from workers.trials.trial import Disturbance, Recording, TrialResult
 
 __all__ = ["TrialScene", "prepare_trials", "run_trial"]
@@ -79,14 +79,10 @@ class _Trial:
     def __post_init__(self) -> None:
         prepared, plan, params = self.prepared, self.plan, self.prepared.params
         self.steps = max(1, round(params.control_period_s / params.timestep_s))
-        mass_kg = prepared.mass_kg.copy()
-        mass_kg[0] *= self.disturbance.mass_scale
-        T_world_object = prepared.T_world_object.copy()
-        T_world_object[0] = moved_target(prepared, self.disturbance.T_target_moved)
         self.world = TrialWorld(
             still_parts_near(prepared, self.T_world_base),
             pedestal_below(prepared, self.T_world_base),
-            Things(prepared.parts_m, mass_kg, T_world_object),
+            disturbed_things(prepared, self.disturbance),
             prepared.robot,
             prepared.articulation,
             self.T_world_base,
@@ -207,9 +203,7 @@ class _Trial:
     @cached_property
     def rise_m(self) -> float:
         """How far the plan lifts the hand."""
-        T_base_tcp = self.prepared.robot.T_base_tcp
-        before, after = T_base_tcp(self.plan.q_approach_rad[-1]), T_base_tcp(self.plan.q_lift_rad[-1])
-        return float(after[2, 3] - before[2, 3])
+        return planned_rise_m(self.plan, self.prepared.robot)
 
     def _T_world_tcp(self) -> F64:
         return self.T_world_base @ self.prepared.robot.T_base_tcp(self.world.joints[:-2])

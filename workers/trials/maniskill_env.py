@@ -51,11 +51,12 @@ from workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from workers.trials.prepared import TrialScene, moved_target, pedestal_below, still_parts_near
+from workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
 from workers.trials.script import (
     FINGER_DAMPING,
     FINGER_STIFFNESS,
     Tick,
+    planned_rise_m,
     pressing_target_m,
     script_of,
 )
@@ -179,7 +180,7 @@ class DatagenGraspEnv(BaseEnv):
             mend = "Make one environment for each robot and set of parameters"
             raise InputError(ENV_ID, "tasks", "they differ in robot or parameters", mend)
         self.scripts = [_script(task) for task in self.tasks]
-        self.rises_m = [_rise_m(task) for task in self.tasks]
+        self.rises_m = [planned_rise_m(task.plan, self.robot) for task in self.tasks]
         kwargs = {"sim_backend": "physx_cpu", "render_backend": "none", "reconfiguration_freq": 1} | kwargs
         super().__init__(
             *args,
@@ -249,11 +250,9 @@ class DatagenGraspEnv(BaseEnv):
             if pedestal_m is not None:
                 pedestal = still_body([pedestal_m], PEDESTAL, friction)
                 self._build(pedestal, "static", env, np.eye(4), "pedestal")
-            T_world_object = prepared.T_world_object.copy()
-            T_world_object[0] = moved_target(prepared, task.disturbance.T_target_moved)
-            mass_kg = prepared.mass_kg.copy()
-            mass_kg[0] *= task.disturbance.mass_scale
-            for k, (parts, mass, T) in enumerate(zip(prepared.parts_m, mass_kg, T_world_object, strict=True)):
+            things = disturbed_things(prepared, task.disturbance)
+            rows = zip(things.parts_m, things.mass_kg, things.T_world_object, strict=True)
+            for k, (parts, mass, T) in enumerate(rows):
                 body = thing_body(parts, float(mass), friction)
                 actor = self._build(body, "dynamic", env, T, f"thing-{k}")
                 self.things.append((actor, sapien_pose(T)))
@@ -359,11 +358,6 @@ def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
 
 def _script(task: GraspTask) -> list[Tick]:
     return script_of(task.plan, task.prepared.robot, task.prepared.params)
-
-
-def _rise_m(task: GraspTask) -> float:
-    T_base_tcp, plan = task.prepared.robot.T_base_tcp, task.plan
-    return float(T_base_tcp(plan.q_lift_rad[-1])[2, 3] - T_base_tcp(plan.q_approach_rad[-1])[2, 3])
 
 
 def _poses(T: Sequence[F64], device: torch.device) -> Pose:

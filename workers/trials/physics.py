@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Robot
 from workers.settling.sapien_bodies import convex_shape, object_body, pad_material, pose_of, sapien_pose
 from workers.trials.articulation import Articulation
+from workers.trials.prepared import Things
 from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
 
 with warnings.catch_warnings():
@@ -32,15 +32,6 @@ POSITION_ITERATIONS, VELOCITY_ITERATIONS = 40, 8
 # PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
 CONTACT_OFFSET_M = 0.005
 SLEEP_THRESHOLD = 0.005  # PhysX's, joules a kilogram
-
-
-@dataclass(frozen=True, eq=False)
-class Things:
-    """The movable objects of a trial: object 0 is the target."""
-
-    parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
-    mass_kg: F64  # (K,)
-    T_world_object: F64  # (K, 4, 4)
 
 
 def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:

@@ -13,12 +13,22 @@ from workers.objects.merging import merge_parts
 from workers.robots.robot import Robot
 from workers.scenes.scene import SettledScene
 from workers.trials.articulation import Articulation, articulation_of
+from workers.trials.trial import Disturbance
 
 # What stands still takes part where the arm, or a thing that it knocks over, can come: metres.
 _BEYOND_REACH_M = 0.4
 _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.005  # below the mount, so that the arm's own foot does not touch it
 _MOVED_ABOVE_M = 0.0005  # a moved target starts so far above where it would stand
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The movable objects of a trial: object 0 is the target."""
+
+    parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
+    mass_kg: F64  # (K,)
+    T_world_object: F64  # (K, 4, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +96,15 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
     )
 
 
-def moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:
+def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> Things:
+    """The objects as they truly are."""
+    mass_kg, T_world_object = prepared.mass_kg.copy(), prepared.T_world_object.copy()
+    mass_kg[0] *= disturbance.mass_scale
+    T_world_object[0] = _moved_target(prepared, disturbance.T_target_moved)
+    return Things(prepared.parts_m, mass_kg, T_world_object)
+
+
+def _moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:
     """The target's true pose (4, 4), raised where its lowest point would be below where it was."""
     T_planned = prepared.T_world_object[0]
     T = T_planned @ T_target_moved

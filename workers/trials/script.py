@@ -72,6 +72,12 @@ def script_of(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[Tick]
     ]
 
 
+def planned_rise_m(plan: MotionPlan, robot: Robot) -> float:
+    """How far the plan lifts the hand."""
+    grasp, lifted = (robot.T_base_tcp(path[-1]) for path in (plan.q_approach_rad, plan.q_lift_rad))
+    return float(lifted[2, 3] - grasp[2, 3])
+
+
 def pressing_target_m(fingers_m: F64, grip_force_n: float) -> float:
     """Target of both fingers that presses with the grip's force, evenly about the object's middle.
 
