@@ -16,6 +16,7 @@ from workers.motion.collision import (
     Hulls,
     Ints,
     Placed,
+    hits,
     hulls_of,
     joined,
     object_hulls,
@@ -32,6 +33,8 @@ _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount
 ROOM_AROUND_M = 0.25  # how far elbows and the hand reach out beyond the TCP
 _SAME_PART_M = 1e-4
+# Deeper in another object than any settled one; settling allows 5 mm, by hulls of its own.
+_SUNK_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +91,12 @@ def prepare(
     T_world_tcp = np.matmul(T_world_target, grasps.T_object_tcp)
     opening_m = grasps.opening_m.astype(np.float64)
     free = np.zeros(len(grasps), np.bool_)
-    if can_be_lifted(object_hulls(target), T_world_target, static, params.lift_m):
+    hulls = object_hulls(target)
+    # A target within another thing can be held by nothing, whatever the hand alone may do there.
+    is_sunk = (
+        bool(hits(hulls, T_world_target[None, None], joined(others), -_SUNK_M).any()) if others else False
+    )
+    if not is_sunk and can_be_lifted(hulls, T_world_target, static, params.lift_m):
         free = free_grasps(moving.hand, T_world_tcp, opening_m, around, placed_target, params)
     rows = np.flatnonzero(free)
     kept = rows[varied(T_world_tcp[rows], grasps.score[rows], max_grasps)]

@@ -198,6 +198,25 @@ def test_the_pedestal_is_an_obstacle_for_all_but_the_first_links() -> None:
     assert surroundings(thick, base).free_homes(0.08).any()
 
 
+def test_what_the_links_that_stand_cut_is_a_collision() -> None:
+    """A block behind the shoulder, into which no moving link reaches from here."""
+    scene = table_scene()
+    base = front_base(scene)
+    at = (base @ np.array([-0.12, 0.0, 0.05, 1.0]))[:3]
+    block = box_body("block", "furniture", "Box", (0.03, 0.03, 0.03), tuple(at))
+    assert plan_at(scene, base).outcome == "success"
+    assert plan_at(table_scene([block]), base).outcome == "arm_collision"
+
+
+@pytest.mark.parametrize("height_m", [0.95, 1.05, 1.3])
+def test_the_cause_is_that_of_the_grasp_that_came_furthest(height_m: float) -> None:
+    scene = table_scene([wall_in_front(height_m)])
+    ready, base = prepared(scene), front_base(scene, away_m=0.7)
+    report, rows = plan_candidate(ready, base, rng()), set(ready.grasp.tolist())
+    alone = [plan_candidate(ready, base, rng(), frozenset(rows - {row})).outcome for row in rows]
+    assert report.outcome == max(alone, key=STAGES.index)
+
+
 def test_skipped_grasps_are_not_used_again() -> None:
     scene = table_scene()
     ready, base = prepared(scene), front_base(scene)
@@ -280,3 +299,14 @@ def test_the_floor_under_a_low_target_is_no_collision_of_the_mount() -> None:
     report = plan_at(scene, front_base(scene, arm(0.85, 0.5)), robot=arm(0.85, 0.5))
     assert report.outcome == "success"
     assert TABLE_TOP_M > 0.5
+
+
+def test_a_target_deep_within_another_thing_is_taken_by_no_grasp() -> None:
+    free = made(plan_at(scene := table_scene(), front_base(scene)))
+    assert free.grasp >= 0
+    for overlap_m, is_held in ((0.003, False), (0.02, True)):
+        beside = BOX_M[0] / 2 + 0.06 / 2 - overlap_m
+        low = (box_model("low", (0.06, 0.06, 0.05)), TARGET_XY_M[0], TARGET_XY_M[1] + beside)
+        report = plan_at(table_scene(clutter=[low]), front_base(scene))
+        assert (report.outcome == "no_grasp") == is_held, overlap_m
+        assert (report.grasps_free == 0) == is_held
