@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import coal as _library
 import numpy as np
 import numpy.typing as npt
 
 from workers.geometry.mesh import F32, F64
+from workers.robots.polyhedron import coal, polyhedron
 from workers.robots.robot import Gripper
-
-# coal's module fills itself at import time, which type checkers do not see.
-coal: Any = _library
 
 Bools = npt.NDArray[np.bool_]
 
@@ -27,13 +23,13 @@ class HandClearance:
     def __init__(self, parts_m: Sequence[F32], gripper: Gripper) -> None:
         self._tree = coal.DynamicAABBTreeCollisionManager()
         # The tree keeps pointers only.
-        self._object = [coal.CollisionObject(_polyhedron(part)) for part in parts_m]
+        self._object = [coal.CollisionObject(polyhedron(part)) for part in parts_m]
         for part in self._object:
             self._tree.registerObject(part)
         self._tree.setup()
         left, right = gripper.finger_parts_m
         self._hand = [
-            (coal.CollisionObject(_polyhedron(swept(part))), side)
+            (coal.CollisionObject(polyhedron(swept(part))), side)
             # Fingers first: they are the ones that touch.
             for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0))
             for part in parts
@@ -73,10 +69,3 @@ def lowest_m(gripper: Gripper, T_object_tcp: F64, opening_m: F64 | F32) -> F64:
         for part in parts:
             lowest = np.minimum(lowest, (down @ swept(part).T.astype(np.float64)).min(axis=1) + shift)
     return lowest + T_object_tcp[:, 2, 3]
-
-
-def _polyhedron(points_m: F32) -> Any:
-    corners = coal.StdVec_Vec3s()
-    for point in points_m.astype(np.float64):
-        corners.append(point)
-    return coal.ConvexBase.convexHull(corners, True, "Qt")

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import coal as _library
 import numpy as np
 import numpy.typing as npt
 
 from workers.geometry.mesh import F32, F64
 from workers.objects.model import ObjectModel
-
-# coal's module fills itself at import time, which type checkers do not see.
-coal: Any = _library
+from workers.robots.polyhedron import coal, polyhedron
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -69,20 +66,13 @@ class Placed:
         return np.flatnonzero(((self.low_m <= high_m) & (self.high_m >= low_m)).all(axis=1))
 
 
-def convex(part_m: F32 | F64) -> Any:
-    """coal's polyhedron of the corners (V, 3) of a convex part with volume."""
-    points = coal.StdVec_Vec3s()
-    points.extend(list(np.asarray(part_m, np.float64)))
-    return coal.Convex.convexHull(points, False, "")
-
-
 def hulls_of(parts_by_owner: Sequence[Sequence[F32]]) -> Hulls:
     """Parts of owners 0, 1, ..., each (V, 3) in its owner's frame."""
     parts = [p for parts in parts_by_owner for p in parts]
     owner = [k for k, parts in enumerate(parts_by_owner) for _ in parts]
     low = np.array([p.min(axis=0) for p in parts], np.float64).reshape(-1, 3)
     high = np.array([p.max(axis=0) for p in parts], np.float64).reshape(-1, 3)
-    shapes = tuple(convex(p) for p in parts)
+    shapes = tuple(polyhedron(p) for p in parts)
     return Hulls(shapes, np.array(owner, np.int64), (low + high) / 2, (high - low) / 2)
 
 
@@ -91,7 +81,7 @@ def place(parts_m: Sequence[F32 | F64]) -> Placed:
     low = np.array([p.min(axis=0) for p in parts_m], np.float64).reshape(-1, 3)
     high = np.array([p.max(axis=0) for p in parts_m], np.float64).reshape(-1, 3)
     here = coal.Transform3s(np.eye(3), np.zeros(3))
-    return Placed(tuple(convex(p) for p in parts_m), (here,) * len(parts_m), low, high)
+    return Placed(tuple(polyhedron(p) for p in parts_m), (here,) * len(parts_m), low, high)
 
 
 _objects: WeakKeyDictionary[ObjectModel, Hulls] = WeakKeyDictionary()

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.errors import InputError
-from workers.geometry.mesh import F64
+from workers.geometry.mesh import F32, F64, I32
 from workers.robots.robot import Parts
 from workers.robots.urdf import Shape
 
@@ -126,6 +126,16 @@ def excess_m(corners: F64, points: F64) -> float:
     """
     faces = ConvexHull(points).equations
     return float((corners @ faces[:, :3].T + faces[:, 3]).max())
+
+
+def hull_faces(corners_m: F32) -> tuple[I32, F64]:
+    """Triangles (F, 3) of the hull of its corners (V, 3), wound outwards, and their unit normals (F, 3)."""
+    hull = ConvexHull(corners_m)
+    faces, normals = hull.simplices.astype(np.int32), hull.equations[:, :3]
+    a, b, c = (corners_m[faces[:, k]] for k in range(3))
+    inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), normals) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return faces, normals
 
 
 def _outside(points: F64, hull: ConvexHull) -> F64:

@@ -6,11 +6,11 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from workers.geometry.mesh import F32, Mesh, concatenate
 from workers.houses.glb import read_glb
 from workers.robots.assembly import Body
+from workers.robots.hulls import hull_faces
 
 _GREY = 190
 
@@ -31,9 +31,5 @@ def _glb(path: Path) -> Mesh:
 
 
 def _plain(corners_m: F32) -> Mesh:
-    hull = ConvexHull(corners_m)
-    a, b, c = (corners_m[hull.simplices[:, k]] for k in range(3))
-    inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces = hull.simplices.astype(np.int32)
-    faces[inward] = faces[inward][:, ::-1]
+    faces, _ = hull_faces(corners_m)
     return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))

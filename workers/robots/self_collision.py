@@ -5,27 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio
 
-from workers.geometry.mesh import F32, F64
+from workers.geometry.mesh import F64
+from workers.robots.polyhedron import polyhedron
 from workers.robots.robot import Parts
 
 # Its binary modules have no types.
 pin: Any = pinocchio
-_coal: Any = coal
 
 _SAMPLES = 300
 _MOST = 0.5
-
-
-def convex_of(corners_m: F32) -> Any:
-    """The convex hull of corners (V, 3) as coal sees it."""
-    points = _coal.StdVec_Vec3s()
-    for corner in corners_m.astype(np.float64):
-        points.append(corner)
-    return _coal.ConvexBase.convexHull(points, False, "Qt")
 
 
 class SelfCollision:
@@ -50,7 +41,7 @@ class SelfCollision:
             placement = pin.SE3(T_joint_body[b])
             for part in parts:
                 name = f"{b}.{len(body_of)}"
-                shape = pin.GeometryObject(name, joint[b], placement, convex_of(part))
+                shape = pin.GeometryObject(name, joint[b], placement, polyhedron(part))
                 self._geometry.addGeometryObject(shape)
                 body_of.append(b)
         free = {

@@ -17,6 +17,7 @@ from schemas.identity import digest_of
 from workers.content_cache import alone_in, cache_folder, drop_unused, refresh, whole_file
 from workers.geometry.mesh import F32, F64
 from workers.robots.assembly import Assembly, Body
+from workers.robots.hulls import hull_faces
 from workers.robots.robot import Parts
 from workers.robots.urdf import Inertial, Joint, rotation_rpy
 
@@ -108,17 +109,10 @@ def hull_of(parts_m: Parts) -> F32:
 
 
 def _part_file(corners_m: F32, folder: Path) -> Path:
-    hull = ConvexHull(corners_m)
-    triangles = corners_m[hull.simplices]  # (F, 3, 3)
-    normal = hull.equations[:, :3].astype(np.float32)
-    turned = np.einsum(
-        "fi,fi->f", np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), normal
-    )
-    triangles[turned < 0] = triangles[turned < 0][:, ::-1]
-    record = np.zeros(
-        len(triangles), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-    )
-    record["normal"], record["corners"] = normal, triangles
+    faces, normals = hull_faces(corners_m)
+    layout = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    record = np.zeros(len(faces), layout)
+    record["normal"], record["corners"] = normals, corners_m[faces]
     content = bytes(80) + np.uint32(len(record)).tobytes() + record.tobytes()
     return _place(folder / f"{hashlib.sha256(content).hexdigest()[:16]}.stl", content)
 

@@ -103,14 +103,14 @@ def test_only_what_is_long_unused_is_dropped(folder: Path, monkeypatch: pytest.M
 
 
 _CHILD = """
-import time
+import sys, time
 from workers.content_cache import alone_in, drop_unused
 from workers.robots import written
 from workers.robots.arm import Arm
 from workers.robots.panda import PANDA_SCALED
 from workers.robots.urdf import read_urdf
-robots = [Arm(PANDA_SCALED, reach_m, 0.8) for reach_m in (0.6, 0.62, 0.64)]
-for k in range(10):
+robots = [Arm(PANDA_SCALED, reach_m, 0.8) for reach_m in (0.6, *map(float, sys.argv[1:]))]
+for k in range(7):
     if k:
         with alone_in(urdf.parent):
             drop_unused(urdf.parent, 4, 1.0)
@@ -125,9 +125,11 @@ print(written.RobotFiles._n_written)
 
 
 def test_processes_never_miss_a_file_that_they_asked_for(folder: Path) -> None:
-    # A second stands for the hour: every robot is dropped before it is asked for again.
+    # A second stands for the hour: robots of one process are dropped before they are asked for again, and
+    # the one that both ask for is in use now and then.
     started = [
-        subprocess.Popen([sys.executable, "-c", _CHILD], stdout=subprocess.PIPE, text=True) for _ in range(2)
+        subprocess.Popen([sys.executable, "-c", _CHILD, *own], stdout=subprocess.PIPE, text=True)
+        for own in (("0.62", "0.64"), ("0.72", "0.74"))
     ]
     printed = [process.communicate(timeout=60)[0] for process in started]
     assert [process.returncode for process in started] == [0, 0]
