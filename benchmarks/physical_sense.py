@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from benchmarks.options import scene_options
 from datagen.specify import specify
 from schemas.cost import StageClock
 from schemas.identity import Stream, generator
@@ -47,13 +48,7 @@ class Case:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--houses", default="builtin")
-    parser.add_argument("--objects", default="builtin")
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--candidates", type=int, default=40, help="a scene")
-    parser.add_argument("--plans", type=int, default=8, help="most planned candidates taken from a scene")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = plan_options(__doc__)
     parser.add_argument("--timestep-only", action="store_true", help="only the rows of whole labels")
     options = parser.parse_args()
     spec, cases = planned_cases(options)
@@ -63,6 +58,14 @@ def main() -> None:
     if not options.timestep_only:
         print_single(spec, cases, trial)
     print_labels(spec, cases, trial)
+
+
+def plan_options(about: str | None) -> argparse.ArgumentParser:
+    """A parser with what `planned_cases` asks for."""
+    parser = scene_options(about)
+    parser.add_argument("--candidates", type=int, default=40, help="a scene")
+    parser.add_argument("--plans", type=int, default=8, help="most planned candidates taken from a scene")
+    return parser
 
 
 def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case]]:

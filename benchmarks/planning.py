@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.options import scene_options
 from benchmarks.robots import robots_folder
 from datagen.specify import specify
 from schemas.cost import StageClock
@@ -55,13 +56,9 @@ class Spent:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--houses", default="builtin")
-    parser.add_argument("--objects", default="builtin")
+    parser = scene_options(__doc__)
     parser.add_argument("--robot", default="panda-scaled")
-    parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--cells", type=int, default=25, help="of the grid's side")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="3 scenes with 13 x 13 candidates")
     parser.add_argument(
         "--peer", metavar="PYTHON", help="interpreter of an environment with mplib; panda alone"

@@ -12,14 +12,13 @@ and disturbed, and counts the successes that flip.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.physical_sense import Case, planned_cases
+from benchmarks.physical_sense import Case, plan_options, planned_cases
 from schemas.identity import Stream, generator
 from schemas.specification import DisturbanceParams, Specification, TrialParams
 from workers.labels.trials import arm_of, draw_disturbances
@@ -50,13 +49,7 @@ SOLVERS = (
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--houses", default="builtin")
-    parser.add_argument("--objects", default="builtin")
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--candidates", type=int, default=40, help="a scene")
-    parser.add_argument("--plans", type=int, default=8, help="most planned candidates taken from a scene")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = plan_options(__doc__)
     parser.add_argument("--maniskill", type=int, default=0, help="trials to execute in ManiSkill, too")
     parser.add_argument("--solver", action="store_true", help="the table of solver settings")
     options = parser.parse_args()

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.options import scene_options
 from datagen.specify import specify
 from schemas.cost import StageClock
 from workers.geometry.mesh import F64
@@ -55,12 +56,8 @@ class Looks:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--houses", default="builtin")
-    parser.add_argument("--objects", default="builtin")
-    parser.add_argument("--scenes", type=int, default=12)
+    parser = scene_options(__doc__)
     parser.add_argument("--candidates", type=int, default=60, help="a scene")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help="3 scenes with 20 candidates")
     options = parser.parse_args()
     if options.quick:
