@@ -10,12 +10,13 @@ import pytest
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
 from schemas.specification import TrialParams
-from tests.workers.trials.worlds import HandMade, base_before, on_top_m, plan_from_above, scene_with
+from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import TABLE_TOP_M, box_body, box_model
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import translation, yaw_pose
 from workers.motion.plan import MotionPlan
 from workers.robots import open_robot
+from workers.scenes.scene import SettledScene
 from workers.trials.execute import prepare_trials, run_trial
 from workers.trials.trial import Disturbance, TrialResult
 
@@ -25,14 +26,14 @@ BASE = base_before(ROBOT, 0.5)
 PHASES = ("reach", "approach", "close", "lift", "hold")
 
 
-def box(mass_kg: float = 0.3) -> HandMade:
+def box(mass_kg: float = 0.3) -> SettledScene:
     """A box on the table, one more beside it."""
     target, other = box_model("target", (0.05, 0.05, 0.12), mass_kg), box_model("other", (0.06, 0.06, 0.1))
     return scene_with([target, other], [(0.0, 0.0), (0.0, 0.25)])
 
 
 def trial(
-    scene: HandMade,
+    scene: SettledScene,
     disturbance: Disturbance | None = None,
     params: TrialParams = PARAMS,
     base: F64 = BASE,

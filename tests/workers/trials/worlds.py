@@ -3,51 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, on_table, table_house
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse, translation, yaw_pose
 from workers.houses.house import Body
 from workers.motion.plan import MotionPlan
 from workers.objects.model import ObjectModel
-from workers.rendering.rays import RayStage, object_rays
 from workers.robots.robot import Robot
-from workers.world import PreparedHouse
+from workers.scenes.scene import SettledScene
 
 PREGRASP_M, LIFT_M = 0.08, 0.10
 # The fingers come from above, closing along the world's y.
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
-class HandMade:
-    """A `SettledScene` of given objects at given poses."""
-
-    models: tuple[ObjectModel, ...]
-    T_world_object: F64
-    house: PreparedHouse
-    index: int = 0
-    retry: int = 0
-
-    @property
-    def rays(self) -> RayStage:
-        radii_m = np.array([model.radius_m for model in self.models])
-        return RayStage(self.house.rays, [object_rays(m) for m in self.models], radii_m, self.T_world_object)
-
-    @property
-    def target_center_m(self) -> F64:
-        return self.T_world_object[0, :3, 3]
-
-
 def scene_with(
     models: Sequence[ObjectModel], offsets_m: Sequence[tuple[float, float]], furniture: Sequence[Body] = ()
-) -> HandMade:
+) -> SettledScene:
     """Objects upright on the table, each off its middle by its (dx, dy)."""
     poses = [on_table(m, dx, dy) for m, (dx, dy) in zip(models, offsets_m, strict=True)]
-    return HandMade(tuple(models), np.stack(poses), PreparedHouse(table_house(furniture)))
+    return scene_of(table_house(furniture), models, poses)
 
 
 def base_before(robot: Robot, distance_m: float) -> F64:
@@ -91,7 +70,7 @@ def _line(robot: Robot, q_start: F64, poses: Sequence[F64]) -> F64 | None:
     return np.stack(rows)
 
 
-def on_top_m(scene: HandMade, depth_m: float) -> F64:
+def on_top_m(scene: SettledScene, depth_m: float) -> F64:
     """The point (3,) so far below the target's top, over its middle."""
     x, y, _ = scene.target_center_m
     return np.array([x, y, TABLE_TOP_M + scene.models[0].size_m[2] - depth_m])
