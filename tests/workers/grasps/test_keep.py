@@ -82,7 +82,18 @@ def test_flat_things_on_a_table_have_grasps_above_it(size_m: tuple[float, float,
     assert scored.is_clear.sum() >= 10
     low = lowest_m(GRIPPER, scored.T_object_tcp, scored.opening_m)
     np.testing.assert_array_equal(scored.is_clear, low > TABLE_GAP_M - size_m[2] / 2)
+    assert (low[scored.is_clear] > -size_m[2] / 2).all()
     assert scored.score[scored.is_clear].max() == 1.0
+
+
+def test_a_hand_that_is_not_symmetric_is_turned_only_where_it_fits() -> None:
+    """A lug on one side of the palm: turned by half a turn it would cut what stands there."""
+    lug = box_vertices((0.04, 0.02, 0.07), (0.05, 0.0, -0.02))
+    gripper = replace(GRIPPER, palm_parts_m=(*GRIPPER.palm_parts_m, lug))
+    model = box_model("plank", (0.3, 0.04, 0.1))
+    grasps = grasps_of(model, gripper, GraspParams(per_object=24, min_score=0.0))
+    assert len(grasps) >= 8
+    assert HandClearance(model.convex_parts_m, gripper).free(grasps.T_object_tcp, grasps.opening_m).all()
 
 
 def test_what_cannot_be_grasped_gives_none_and_a_reason() -> None:
