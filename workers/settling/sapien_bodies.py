@@ -30,7 +30,7 @@ def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxM
     return physx.PhysxMaterial(pad, pad, 0.0)
 
 
-def add_static(scene: sapien.Scene, parts_m: Sequence[F32], material: physx.PhysxMaterial) -> None:
+def static_body(parts_m: Sequence[F32], material: physx.PhysxMaterial) -> physx.PhysxRigidStaticComponent:
     """One body that never moves, of convex parts (V, 3) each in the world frame."""
     body = physx.PhysxRigidStaticComponent()
     for part in parts_m:
@@ -39,8 +39,13 @@ def add_static(scene: sapien.Scene, parts_m: Sequence[F32], material: physx.Phys
         shape = convex_shape(part - centre_m, material)
         shape.set_local_pose(sapien.Pose(centre_m.tolist()))
         body.attach(shape)
+    return body
+
+
+def add_static(scene: sapien.Scene, parts_m: Sequence[F32], material: physx.PhysxMaterial) -> None:
+    """Adds a `static_body`."""
     entity = sapien.Entity()
-    entity.add_component(body)
+    entity.add_component(static_body(parts_m, material))
     scene.add_entity(entity)
 
 

@@ -10,7 +10,14 @@ import numpy as np
 from schemas.specification import TrialParams
 from workers.geometry.mesh import F32, F64
 from workers.robots.robot import Robot
-from workers.settling.sapien_bodies import convex_shape, object_body, pad_material, pose_of, sapien_pose
+from workers.settling.sapien_bodies import (
+    convex_shape,
+    object_body,
+    pad_material,
+    pose_of,
+    sapien_pose,
+    static_body,
+)
 from workers.trials.articulation import Articulation
 from workers.trials.prepared import Things
 from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
@@ -36,15 +43,9 @@ SLEEP_THRESHOLD = 0.005  # PhysX's, joules a kilogram
 
 def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:
     """What does not move, of convex parts (V, 3) each in the world frame."""
-    material = physx.PhysxMaterial(friction, friction, 0.0)
-    body = physx.PhysxRigidStaticComponent()
-    for part in parts_m:
-        # PhysX wants hulls near their own origin: cooking loses precision far from it.
-        centre_m = part.mean(axis=0)
-        shape = convex_shape(part - centre_m, material)
-        shape.set_local_pose(sapien.Pose(centre_m.tolist()))
+    body = static_body(parts_m, physx.PhysxMaterial(friction, friction, 0.0))
+    for shape in body.get_collision_shapes():
         tune_shape(shape, groups)
-        body.attach(shape)
     return body
 
 
