@@ -7,7 +7,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-STAGES = ("draw", "settle", "observe", "visibility", "grasps", "ik", "plan", "execute", "write")
+STAGES = ("draw", "settle", "observe", "visibility", "grasps", "plan", "execute", "write")
 
 
 @dataclass
