@@ -198,6 +198,17 @@ def test_the_pedestal_is_an_obstacle_for_all_but_the_first_links() -> None:
     assert surroundings(thick, base).free_homes(0.08).any()
 
 
+def test_links_beyond_the_first_meet_the_pedestal_too() -> None:
+    scene, robot = table_scene(), arm()
+    base = front_base(scene, away_m=0.9)
+    thin, thick = (surroundings(prepare(scene, robot, box_grasps(), PARAMS, 40, r), base) for r in (0.1, 0.3))
+    low, high = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    some = np.random.default_rng(0).uniform(low, high, (300, len(low)))[:, None]
+    free = [q for q in some if thin.first_arm_blocked(q, is_target_held=False) == 1]
+    met = [q for q in free if thick.first_arm_blocked(q, is_target_held=False) == 0]
+    assert 0 < len(met) < len(free)
+
+
 def test_what_the_links_that_stand_cut_is_a_collision() -> None:
     """A block behind the shoulder, into which no moving link reaches from here."""
     scene = table_scene()

@@ -107,6 +107,27 @@ def test_mass_decides_where_friction_barely_holds() -> None:
     assert trial(scene, heavy).outcome == "slipped"
 
 
+def test_what_makes_the_arm_sag_is_held_and_not_lifted() -> None:
+    """9 kg that the pads hold: the drives give way, and the target rises by less than four fifths."""
+    scene, sticky = box(mass_kg=9.0), Disturbance.none(5.0)
+    result = trial(scene, sticky)
+    assert result.outcome == "slipped" and result.slip_m < 0.003
+    assert 0.05 < result.lift_m < 0.08
+    assert trial(box(mass_kg=4.0), sticky).outcome == "success"
+
+
+def test_slip_is_bounded_as_asked() -> None:
+    result = trial(box(), params=PARAMS.model_copy(update={"max_slip_m": 1e-6}))
+    assert result.outcome == "slipped" and 1e-6 < result.slip_m < 0.003
+
+
+def test_a_hand_that_lands_on_the_target_has_not_reached_its_grasp() -> None:
+    """5 cm below its top: the palm stands on it 2 cm too high, with each joint nearly where it should be."""
+    scene = box()
+    plan = plan_from_above(ROBOT, BASE, on_top_m(scene, 0.05), 0.07)
+    assert trial(scene, plan=plan).outcome == "not_reached"
+
+
 def test_beside_the_target_nothing_is_held() -> None:
     scene = box()
     aside = on_top_m(scene, 0.03) + [0.0, -0.15, 0.0]
