@@ -16,6 +16,7 @@ from schemas.run_records import Commit
 from schemas.scene_rows import read_scenes
 from schemas.shard_files import encode_shard
 from schemas.storage import storage_error
+from workers.robots import gripper_of
 from workers.run_shard import run_shard
 from workers.world import World, open_world
 
@@ -82,6 +83,9 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
     run = Run.open(place)
     if run.manifest.spec_hash != spec_hash:
         raise InputError(place, "spec_hash", "the run now has another specification", "Submit to a new --out")
+    arm = run.manifest.spec.arm
+    if arm is not None:
+        gripper_of(arm.robot)  # a robot whose files are broken is so for every shard
     return run, open_world(run.manifest.spec, houses, objects)
 
 

@@ -28,6 +28,7 @@ from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.labels import load_label_source
 from workers.objects import open_objects
+from workers.robots import gripper_of
 from workers.scenes.draw import draw_scene
 from workers.world import World, assemble_world, open_world
 
@@ -46,14 +47,23 @@ def submit(
         str | None, Parameter(help="A run whose scenes and candidates are labelled again.")
     ] = None,
     robot: Annotated[
-        str | None, Parameter(help="The arm, and what its candidates are: panda-scaled, panda, ... .")
+        str | None,
+        Parameter(
+            help="The arm: fetch, panda, panda-scaled or xarm7; candidates get its reach, height and base "
+            "[plan, sim: panda-scaled]."
+        ),
     ] = None,
     perturb: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Execute each plan so often in disturbed worlds (sim).")
+        int | None,
+        WHOLE_NUMBER,
+        Parameter(help="Executions of each plan, each in a world disturbed anew (sim) [undisturbed]."),
     ] = None,
     candidates: Annotated[
         Literal["grid", "clear", "in-range"] | None,
-        Parameter(help="All cells, or some where the base is clear, or in reach too [plan, sim: grid]."),
+        Parameter(
+            help="Cells that are drawn: all of the grid, those where the base is clear, or those within the "
+            "arm's reach too [plan, sim: grid]."
+        ),
     ] = None,
     candidates_per_scene: Annotated[
         str | None, Parameter(help="60 drawn from the 25x25 grid, another number, or grid for all 625.")
@@ -126,6 +136,7 @@ def submit(
         house_source, object_source = open_houses(houses), open_objects(objects)
         spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
         world = assemble_world(spec, house_source, object_source, houses, objects)
+        _refuse_broken_robot(spec)
         if address == "local" and spec.observation.renderer == "sapien":
             _refuse_no_render_device()
         if not (Path(out) / "manifest.json").exists():
@@ -136,6 +147,7 @@ def submit(
         spec = specify_again(label_source, stored, config, robot, perturb)
         houses, objects = stored.houses, stored.objects
         open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
+        _refuse_broken_robot(spec)
         existing = Run.open(out).layout if (Path(out) / "manifest.json").exists() else None
         source_url, layout = stored.run.storage.url, existing or layout_again(spec, stored, n)
         refuse_too_few(stored, layout, n)
@@ -154,6 +166,12 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         draw_scene(world, 0, StageClock())
     except InputError as error:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
+
+
+def _refuse_broken_robot(spec: Specification) -> None:
+    """Open the robot here: where its files cannot be used, every shard would fail."""
+    if spec.arm is not None:
+        gripper_of(spec.arm.robot)
 
 
 def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) -> Manifest:

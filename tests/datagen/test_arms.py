@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from datagen import arms
+from datagen import arms, cli
 from datagen.arms import (
     complete_arm,
     narrow_candidates,
@@ -123,3 +123,9 @@ def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.Mo
     monkeypatch.setitem(arms.ARM_PACKAGES, "plan", ("numpy", "no-such-planner"))
     with pytest.raises(InputError, match=r"no-such-planner.*pip install datagen\[sim\]"):
         refuse_missing_packages("plan")
+
+
+def test_the_help_of_submit_names_every_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["submit", "--help"]) == 0
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(name in told for name in ROBOTS)
