@@ -155,7 +155,7 @@ def _name(who: dict[str, Any]) -> str:
 
 
 def _set(candidates: str) -> str:
-    return "grid: all there are" if candidates == "grid" else candidates
+    return "all there are" if candidates == "grid" else candidates
 
 
 def _percent(share: float | None) -> str:
