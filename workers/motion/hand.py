@@ -20,6 +20,8 @@ TOUCH_M = 0.002
 LINE_STEP_M = 0.02
 # The target leaves what it stands on within this rise; only beyond it are contacts counted.
 LIFT_OFF_M = 0.01
+# Grasps whose features are nearer than this are one grasp: a hundredth of a millimetre, or of a degree.
+_SAME = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +100,12 @@ def can_be_lifted(target: Hulls, T_world_target: F64, static: Placed, lift_m: fl
     return not hits(target, T[rises > LIFT_OFF_M], static, -TOUCH_M, first_only=True).any()
 
 
-def varied(T_tcp: F64, score: F32, count: int) -> Ints:
+def best_different(T_tcp: F64, score: F32, count: int) -> Ints:
     """Rows of at most `count` grasps, best first, that differ from each other.
 
     In turns of a finer and finer distance: the best grasp left is taken unless it lies near one already
-    taken. A turn by half about the direction of approach, which changes nothing, is no difference.
+    taken. A turn by half about the direction of approach, which changes nothing, is no difference: of two
+    grasps that differ in nothing else the better one alone is ever taken.
     """
     order = np.argsort(-score, kind="stable")
     features = np.concatenate(
@@ -116,7 +119,7 @@ def varied(T_tcp: F64, score: F32, count: int) -> Ints:
     )
     taken: list[int] = []
     left = [int(k) for k in order]
-    for apart in (2.0, 1.0, 0.5, 0.0):
+    for apart in (2.0, 1.0, 0.5, _SAME):
         rest: list[int] = []
         for k in left:
             if len(taken) == count:

@@ -24,7 +24,7 @@ from workers.motion.collision import (
     place_object,
 )
 from workers.motion.forward import ForwardKinematics, forward_kinematics
-from workers.motion.hand import Hand, can_be_lifted, free_grasps, hand_of, varied
+from workers.motion.hand import Hand, best_different, can_be_lifted, free_grasps, hand_of
 from workers.motion.reach_table import ReachTable, reach_table
 from workers.robots.robot import Robot
 from workers.scenes.scene import SettledScene
@@ -99,7 +99,7 @@ def prepare(
     if not is_sunk and can_be_lifted(hulls, T_world_target, static, params.lift_m):
         free = free_grasps(moving.hand, T_world_tcp, opening_m, around, placed_target, params)
     rows = np.flatnonzero(free)
-    kept = rows[varied(T_world_tcp[rows], grasps.score[rows], max_grasps)]
+    kept = rows[best_different(T_world_tcp[rows], grasps.score[rows], max_grasps)]
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned = np.matmul(T_world_tcp[kept], half_turn)
     fits = free_grasps(moving.hand, turned, opening_m[kept], around, placed_target, params)
