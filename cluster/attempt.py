@@ -22,7 +22,7 @@ from workers.world import World, open_world
 
 # Failures of a disk that no retry cures.
 _FINAL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
-_FINAL_PROBLEMS = {os.strerror(code) for code in _FINAL}
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def run_attempt(task: ShardTask, meter: Meter) -> Product:
@@ -38,7 +38,8 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     with _ends_job():
         run.start_attempt(task.attempt, task.shard)
     stored = None if source is None else read_scenes(source, task.scene_indices)
-    made = run_shard(task.spec, world, task.scene_indices, stored)
+    with _ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
+        made = run_shard(task.spec, world, task.scene_indices, stored)
     with _ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files)
@@ -64,16 +65,17 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
 
 
 @contextmanager
-def _ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
+def _ends_job(every_input_error: bool = False, codes: tuple[int, ...] = _FINAL) -> Generator[None]:
+    """Raise JobCannotGoOn for a full or forbidden disk (`codes`) or, where asked, for any InputError."""
+    problems = {os.strerror(code) for code in codes}
     try:
         yield
     except InputError as error:
-        if every_input_error or error.problem in _FINAL_PROBLEMS:
+        if every_input_error or error.problem in problems:
             raise JobCannotGoOn(str(error)) from error
         raise
     except OSError as error:
-        if error.errno in _FINAL:
+        if error.errno in codes:
             raise JobCannotGoOn(str(storage_error(error.filename or "the run", error))) from error
         raise
 

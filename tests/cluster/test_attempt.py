@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from cluster import attempt
 from cluster.attempt import run_attempt
 from cluster.guard import Meter, guarded
 from cluster.task import JobCannotGoOn, ShardTask
@@ -44,9 +46,9 @@ def spec() -> Specification:
     )
 
 
-def task_on(run: Run, attempt: str, shard: int = 0) -> ShardTask:
+def task_on(run: Run, name: str, shard: int = 0) -> ShardTask:
     return ShardTask(
-        run.storage.url, run.manifest.spec, run.layout, shard, attempt, "builtin", "builtin", deadline_s=300
+        run.storage.url, run.manifest.spec, run.layout, shard, name, "builtin", "builtin", deadline_s=300
     )
 
 
@@ -84,3 +86,19 @@ def test_a_full_disk_ends_the_job_and_commits_nothing(spec: Specification, tmp_p
         assert run.committed() == set()
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("code", "ends_job"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)]
+)
+def test_a_disk_that_is_full_while_scenes_are_made_ends_the_job(
+    code: int, ends_job: bool, spec: Specification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+
+    def full(*arguments: object) -> None:
+        raise OSError(code, os.strerror(code), str(tmp_path / "arm.urdf"))
+
+    monkeypatch.setattr(attempt, "run_shard", full)
+    with pytest.raises(JobCannotGoOn if ends_job else OSError, match="arm"):
+        run_attempt(task_on(run, "a"), Meter())
