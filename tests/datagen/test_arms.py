@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,8 +16,15 @@ from datagen.arms import (
     refuse_unsuited,
     robot_of,
 )
+from datagen.specify import layout_of, specify
+from datagen.stored_scenes import open_stored_scenes, specify_again
+from datagen.submit import manifest_of
 from schemas.errors import InputError
+from schemas.run import Run
 from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Specification, TrialParams
+from schemas.storage import open_storage
+from workers.houses import open_houses
+from workers.objects import open_objects
 from workers.robots import ROBOTS, robot_limits
 
 SOURCES = {"houses": {"kind": "a", "digest": "1" * 64}, "objects": {"kind": "b", "digest": "2" * 64}}
@@ -129,3 +137,15 @@ def test_the_help_of_submit_names_every_robot(capsys: pytest.CaptureFixture[str]
     assert cli.run(["submit", "--help"]) == 0
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert all(name in told for name in ROBOTS)
+
+
+def test_whether_worlds_are_disturbed_is_said_for_each_run(tmp_path: Path) -> None:
+    spec = specify("sim", open_houses("builtin"), open_objects("builtin"), {}, None, repeats=4)
+    assert spec.arm is not None and spec.arm.disturbance is not None
+    manifest = manifest_of(spec, layout_of(spec, 625), {})
+    Run.create_or_open(open_storage(str(tmp_path / "run")), manifest, 625)
+    stored = open_stored_scenes(str(tmp_path / "run"), None, None, {})
+    still, disturbed = specify_again("sim", stored, None), specify_again("sim", stored, None, repeats=2)
+    assert still.arm == spec.arm.model_copy(update={"disturbance": None})
+    assert disturbed.arm is not None and disturbed.arm.disturbance is not None
+    assert disturbed.arm.disturbance.repeats == 2
