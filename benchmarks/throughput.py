@@ -1,12 +1,14 @@
 """The main path from a specification to committed, sealed labels: rates, scaling, memory and size.
 
     python -m benchmarks.throughput [--houses procthor:DIR] [--objects ycb:DIR] [--n 24000]
-                                    [--scenes 2000] [--quick]
+                                    [--scenes 2000] [--arm-scenes 24] [--quick]
 
 Whole runs through the functions of `datagen submit`, with Ray and a real store in a temporary
 folder; all figures come from the commit records. The steady rate of a job is the sum over its workers of
 labels per second from each worker's first commit to its last: it leaves out the start of Ray and
-the opening of sources, which are stated beside it.
+the opening of sources, which are stated beside it. Jobs of `plan` and `sim` label whole grids; the
+first run on a machine also works out the grasps of the objects that it draws, later ones read them
+from the cache.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import zarr
 
 from datagen.job import JobSettings, run_job
 from datagen.specify import layout_of, specify
@@ -57,15 +62,21 @@ class Job:
     peaks_bytes: tuple[int, ...]  # peak resident memory of each attempt of the busiest worker, in order
     stored_bytes: int
     disk_bytes: int  # with the blocks of files and folders
+    workers: int
+    stage_s: dict[str, float]  # wall seconds of all workers in each stage
+    positives: int
+    executed: int  # trials in physics
 
 
-def run(options: argparse.Namespace, n: int, workers: int, per_scene: int | str) -> Job:
+def run(
+    options: argparse.Namespace, n: int, workers: int, per_scene: int | str, source: str = "heuristic"
+) -> Job:
     """Make and seal n labels in a new folder and account for them."""
     houses, objects = open_houses(options.houses), open_objects(options.objects)
     fields: dict[str, Any] = {"seed": options.seed, "candidates.per_scene": per_scene}
     if per_scene == "grid":
         fields["candidates.robots_per_scene"] = 1
-    spec = specify("heuristic", houses, objects, fields, None)
+    spec = specify(source, houses, objects, fields, None)
     with tempfile.TemporaryDirectory(dir=options.folder, prefix="datagen-throughput-") as folder:
         out = f"{folder}/run"
         manifest = manifest_of(
@@ -87,10 +98,13 @@ def run(options: argparse.Namespace, n: int, workers: int, per_scene: int | str)
             sealed_s - started_s,
             ended_s - started_s - summary.elapsed_s,
             sealed_s - ended_s,
+            workers,
         )
 
 
-def account(commits: Sequence[Commit], folder: Path, whole_s: float, ray_s: float, seal_s: float) -> Job:
+def account(
+    commits: Sequence[Commit], folder: Path, whole_s: float, ray_s: float, seal_s: float, workers: int
+) -> Job:
     """The figures of a job from its commits, in order of time, and its folder."""
     by_worker: dict[int, list[Commit]] = defaultdict(list)
     for commit in commits:
@@ -113,6 +127,11 @@ def account(commits: Sequence[Commit], folder: Path, whole_s: float, ray_s: floa
     cpu_s, wall_s = sum(c.cost.cpu_s for c in commits), sum(c.cost.wall_s for c in commits)
     longest = max(by_worker.values(), key=len)
     stored, disk = sizes(folder)
+    stage_s: dict[str, float] = defaultdict(float)
+    for commit in commits:
+        for stage, wall_s_of in commit.cost.stage_wall_s.items():
+            stage_s[stage] += wall_s_of
+    arrays = zarr.open_group(folder / "data.zarr", mode="r")
     return Job(
         labels=labels,
         scenes=sum(c.scenes for c in commits),
@@ -128,6 +147,10 @@ def account(commits: Sequence[Commit], folder: Path, whole_s: float, ray_s: floa
         peaks_bytes=tuple(c.cost.peak_rss_bytes for c in longest),
         stored_bytes=stored,
         disk_bytes=disk,
+        workers=workers,
+        stage_s=dict(stage_s),
+        positives=sum(c.positives for c in commits),
+        executed=int(np.asarray(arrays["attempts"]).sum()) if "attempts" in arrays else 0,
     )
 
 
@@ -154,22 +177,32 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--houses", default="builtin")
     parser.add_argument("--objects", default="builtin")
-    parser.add_argument("--n", type=int, default=24_000, help="labels of the jobs with 60 candidates")
+    parser.add_argument("--n", type=int, default=24_000, help="labels with 60 candidates; 0: none")
     parser.add_argument("--scenes", type=int, default=2000, help="scenes of the memory job; 0 leaves it out")
+    parser.add_argument(
+        "--arm-scenes", type=int, default=24, help="scenes of plan and sim; 0 leaves them out"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="where the runs are written [the temporary folder]")
-    parser.add_argument("--quick", action="store_true", help="96 scenes a job, no memory job")
+    parser.add_argument(
+        "--quick", action="store_true", help="96 scenes a job, 16 of plan and sim, no memory job"
+    )
     options = parser.parse_args()
     if options.quick:
-        options.n, options.scenes = 96 * CANDIDATES, 0
+        options.n, options.scenes, options.arm_scenes = 96 * CANDIDATES, 0, min(options.arm_scenes, 16)
     scenes = -(-options.n // CANDIDATES)
     print(f"load of the machine before: {os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} cores")
-    one = run(options, options.n, 1, CANDIDATES)
-    two = run(options, options.n, 2, CANDIDATES)
-    grid = run(options, scenes * 625, 2, "grid")
-    jobs = {"60, 1 worker": one, "60, 2 workers": two, "grid, 2 workers": grid}
-    print_jobs(jobs)
-    print_targets(one, two, grid)
+    if options.n:
+        one = run(options, options.n, 1, CANDIDATES)
+        two = run(options, options.n, 2, CANDIDATES)
+        grid = run(options, scenes * 625, 2, "grid")
+        print_jobs({"60, 1 worker": one, "60, 2 workers": two, "grid, 2 workers": grid})
+        print_targets(one, two, grid)
+    if options.arm_scenes:
+        labels = options.arm_scenes * 625
+        arms = {f"{source}, grid": run(options, labels, 2, "grid", source) for source in ("plan", "sim")}
+        print_jobs(arms)
+        print_arms(arms["plan, grid"], arms["sim, grid"])
     if options.scenes:
         print_memory(run(options, options.scenes * CANDIDATES, 1, CANDIDATES))
 
@@ -225,6 +258,30 @@ def print_targets(one: Job, two: Job, grid: Job) -> None:
     print(f"{'figure':<26}{'here':>10}{'target':>11}")
     for name, value, target, reached in rows:
         print(f"{name:<26}{value:>10}{target:>11}{'' if reached else '  MISSED'}")
+
+
+def print_arms(plan: Job, sim: Job) -> None:
+    """What an arm's labels cost beside what they should, and where the time goes."""
+    trials_per_s = sim.executed / sim.stage_s["execute"] * sim.workers
+    whole_s = sim.ray_s + sim.opening_s + 12_000 / sim.steady_per_s
+    rows = [
+        ("plan labels/s, grid", f"{plan.steady_per_s:,.0f}", ">= 400", plan.steady_per_s >= 400),
+        ("sim labels/s, grid", f"{sim.steady_per_s:,.0f}", ">= 60", sim.steady_per_s >= 60),
+        ("executed trials/s", f"{trials_per_s:,.1f}", ">= 8", trials_per_s >= 8),
+        ("12,000 sim labels, time", f"{whole_s / 60:.1f} min", "<= 5 min", whole_s <= 300),
+        ("trials executed", f"{sim.executed:,}", "", True),
+        ("positive, plan", f"{100 * plan.positives / plan.labels:.1f}%", "", True),
+        ("positive, sim", f"{100 * sim.positives / sim.labels:.1f}%", "", True),
+    ]
+    print(f"{'figure':<26}{'here':>10}{'target':>11}")
+    for name, value, target, reached in rows:
+        print(f"{name:<26}{value:>10}{target:>11}{'' if reached else '  MISSED'}")
+    print("\nshare of the time of stages")
+    for name, job in (("plan", plan), ("sim", sim)):
+        total_s = sum(job.stage_s.values())
+        shares = sorted(job.stage_s.items(), key=lambda item: -item[1])
+        print(f"{name:<6}" + ", ".join(f"{stage} {100 * s / total_s:.0f}%" for stage, s in shares[:6]))
+    print()
 
 
 def print_memory(job: Job) -> None:
