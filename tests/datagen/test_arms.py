@@ -126,6 +126,14 @@ def test_what_a_file_sets_stays_and_is_refused_where_the_robot_has_it_not(
         refuse_unsuited(spec, robot, "run.toml", "Correct it")
 
 
+def test_candidates_for_a_narrower_base_than_the_robot_has_are_refused() -> None:
+    fields: dict[str, Any] = {"candidates": {"base_radius_m": 0.1}}
+    narrow_candidates(fields, "fetch")
+    spec = Specification.model_validate(SOURCES | fields)
+    with pytest.raises(InputError, match=r"candidates.base_radius_m: .*fetch"):
+        refuse_unsuited(spec, "fetch", "run.toml", "Correct it")
+
+
 def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     refuse_missing_packages("heuristic")
     monkeypatch.setitem(arms.ARM_PACKAGES, "plan", ("numpy", "no-such-planner"))
