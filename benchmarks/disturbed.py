@@ -48,6 +48,8 @@ def main() -> None:
     parser.add_argument("disturbed", metavar="DISTURBED", type=Path, help="the same candidates, disturbed")
     options = parser.parse_args()
     calm, disturbed = columns_of(options.calm), columns_of(options.disturbed)
+    shared = min(len(calm["outcome"]), len(disturbed["outcome"]))  # one run may be longer
+    calm, disturbed = ({name: v[:shared] for name, v in said.items()} for said in (calm, disturbed))
     for name in ("sample_scene_index", "candidate_index"):
         if not np.array_equal(calm[name], disturbed[name]):
             parser.error("the runs do not hold the same candidates: make one with --scenes-from the other")
@@ -66,6 +68,7 @@ def main() -> None:
     print(f"some repeats succeed and some do not: {100 * mixed.sum() / planned.sum():.1f}%")
     counts = np.bincount(disturbed["successes"][planned])
     print("successes among the repeats: " + ", ".join(f"{k}: {n}" for k, n in enumerate(counts)))
+    print(f"variance of these over chance's alone: {over_chance(disturbed, planned):.2f}")
     print_rate("grasp's score", disturbed["grasp_score"][planned], rate[planned], SCORE_EDGES)
     share = (disturbed["mount_distance_m"] / disturbed["arm_reach_m"])[planned]
     print_rate("distance / reach", share, rate[planned], SHARE_EDGES)
@@ -85,6 +88,16 @@ def entropy(said: np.ndarray[Any, Any]) -> float:
     """Bits that one label carries: 1 where half are good, 0 where all are alike."""
     share = float(said.mean())
     return float(sum(-p * np.log2(p) for p in (share, 1 - share) if p > 0))
+
+
+def over_chance(disturbed: Columns, planned: np.ndarray[Any, Any]) -> float:
+    """Variance of successes among the repeats over that of a binomial with one rate for all.
+
+    1 where it does not matter which candidate it is, and up to the number of repeats where nothing else does.
+    """
+    successes, repeats = disturbed["successes"][planned], int(disturbed["trials"].max())
+    rate = float(successes.mean()) / repeats
+    return float(successes.var(ddof=1)) / (repeats * rate * (1 - rate))
 
 
 def print_rate(name: str, values: np.ndarray[Any, Any], rate: F64, edges: Sequence[float]) -> None:
