@@ -33,7 +33,7 @@ ARM = """
 arm_reach_m = {low = 0.9, high = 1.0}
 robots_per_scene = 1
 [arm.grasps]
-per_object = 40
+per_object = 300
 per_scene = 10
 """
 
@@ -43,7 +43,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same candidates of one scene, labelled by each source; `disturbed` executes each plan twice."""
     folder = tmp_path_factory.mktemp("shown")
     scene, arm = ARM.split("[arm.grasps]")
-    choices = ["--candidates", "in-range", "--seed", "4"]
+    choices = ["--candidates", "in-range", "--seed", "5"]
     source = make_small_run(folder / "run", PER_SCENE, *choices, config=CONFIG + scene, per_scene=PER_SCENE)
     made = {"heuristic": source}
     (folder / "arm.toml").write_text("[arm.grasps]" + arm)
