@@ -16,7 +16,6 @@ from workers.labels.trials import (
     ArmInScene,
     CandidateTrial,
     arm_in_scene,
-    disturbances_of,
     try_candidate,
 )
 from workers.motion.plan import MotionPlan
@@ -65,8 +64,7 @@ def try_again(scene: SettledScene, candidates: Candidates, row: int, spec: Speci
     shown = alike[-1] if alike else None
     recording = None if shown is None else trial.results[shown].recording
     if shown is not None and recording is not None:
-        if disturbances := disturbances_of(at, row, spec):
-            T_world_base = T_world_base @ disturbances[shown].T_base_moved
+        T_world_base = trial.T_world_base[shown]
         kept = _with_sense(recording)
         return Retrial(at.robot, T_world_base, trial, shown, kept, told_moments(kept))
     if trial.plan is not None:

@@ -56,7 +56,9 @@ def submit(
     perturb: Annotated[
         int | None,
         WHOLE_NUMBER,
-        Parameter(help="Executions of each plan, each in a world disturbed anew (sim) [undisturbed]."),
+        Parameter(
+            help="Arrivals at each candidate, each off it and in a world disturbed anew (sim) [undisturbed]."
+        ),
     ] = None,
     candidates: Annotated[
         Literal["grid", "clear", "in-range"] | None,

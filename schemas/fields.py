@@ -307,8 +307,8 @@ PLAN_FIELDS = (
 SIM_FIELDS = (
     *PLAN_FIELDS,
     Field("attempts", "int16", (), "1", "", "grasps that were executed", 0),
-    Field("trials", "int16", (), "1", "", "executions counted for the label; 1 without disturbance", 0),
-    Field("successes", "int16", (), "1", "", "those that lifted and held the target", 0),
+    Field("trials", "int16", (), "1", "", "what the label is a rate of: repeats, or 1; 0 without a plan", 0),
+    Field("successes", "int16", (), "1", "", "those in which the target was lifted and held", 0),
     Field("lift_m", "float32", (), "m", "world", "rise of the target in the last execution", -100, 100),
     Field("slip_m", "float32", (), "m", "tcp", "motion of the target in the hand from closing on", 0, 100),
     Field("disturbed_m", "float32", (), "m", "world", "largest motion of any other object", 0, 100),

@@ -186,13 +186,16 @@ class Interval(_Frozen):
 
 
 class DisturbanceParams(_Frozen):
-    """What the planner does not know: each candidate's plan is executed `repeats` times so."""
+    """A robot sent to a candidate `repeats` times: it arrives nearby and plans from there.
+
+    Where it stands it knows; the target's error, friction and mass it does not.
+    """
 
     repeats: int = Field(default=5, ge=1, le=1000)
-    target_position_std_m: Metres = 0.01
+    target_position_std_m: Metres = 0.005
     target_yaw_std_rad: float = Field(default=0.05, ge=0, le=3.2)
-    base_position_std_m: Metres = 0.02
-    base_yaw_std_rad: float = Field(default=0.02, ge=0, le=3.2)
+    base_position_std_m: Metres = 0.03
+    base_yaw_std_rad: float = Field(default=0.05, ge=0, le=3.2)
     object_friction: Interval = Interval(low=0.3, high=0.9)
     mass_scale: Interval = Interval(low=0.8, high=1.2)
 

@@ -9,7 +9,6 @@ from schemas.specification import Specification
 from workers.bases.candidates import Candidates
 from workers.labels import plan
 from workers.labels.source import Columns, LabelSource
-from workers.labels.trials import CandidateTrial
 from workers.scenes.scene import SettledScene
 
 VERSION = 1
@@ -18,14 +17,13 @@ VERSION = 1
 def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
     """The columns of `plan`, decided by execution, and what the trials measured."""
     columns, trials = plan.label_with_trials(scene, candidates, spec, clock)
-    disturbed = spec.arm is not None and spec.arm.disturbance is not None
 
     def column(dtype: str, values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
 
     columns |= {
         "attempts": column("int16", [len(t.results) for t in trials]),
-        "trials": column("int16", [_counted(t, disturbed) for t in trials]),
+        "trials": column("int16", [t.trials for t in trials]),
         "successes": column("int16", [t.successes for t in trials]),
         "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),
         "slip_m": column("float32", [t.results[-1].slip_m if t.results else 0.0 for t in trials]),
@@ -33,11 +31,6 @@ def label(scene: SettledScene, candidates: Candidates, spec: Specification, cloc
         "simulated_s": column("float32", [sum(r.simulated_s for r in t.results) for t in trials]),
     }
     return columns
-
-
-def _counted(trial: CandidateTrial, disturbed: bool) -> int:
-    """Executions that the label is a rate of: every repeat, or the candidate's attempts together as one."""
-    return len(trial.results) if disturbed else min(len(trial.results), 1)
 
 
 SIM = LabelSource("sim", VERSION, "sim", label)

@@ -1,13 +1,13 @@
 """What the label sources `plan` and `sim` share: candidate by candidate, to the stage that decides.
 
 base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
--> executed in physics, up to `max_attempts` grasps, or `repeats` times in a disturbed world   (`sim`)
+-> executed in physics, up to `max_attempts` grasps, or `repeats` times where a robot arrived nearby   (`sim`)
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,11 +18,13 @@ from schemas.fields import OUTCOMES
 from schemas.identity import Stream, generator
 from schemas.specification import ArmParams, DisturbanceParams, Specification
 from workers.bases.candidates import Candidates
+from workers.bases.clearance import base_clearance_m
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse, translation, yaw_pose
 from workers.grasps.grasp import GraspSet
 from workers.grasps.keep import grasps_of
 from workers.motion.candidate import plan_candidate
+from workers.motion.collision import Bools
 from workers.motion.plan import MotionPlan, PlanReport
 from workers.motion.scene import PlanningScene, pose_of_base, prepare
 from workers.robots import open_robot
@@ -41,8 +43,10 @@ class CandidateTrial:
     outcome: str
     report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
     plan: MotionPlan | None = None  # the last one that was made
-    results: tuple[TrialResult, ...] = ()
+    results: tuple[TrialResult, ...] = ()  # of the executions
+    T_world_base: tuple[F64, ...] = ()  # (4, 4) each, where the mount stood in them
     successes: int = 0
+    trials: int = 0  # what the label is a rate of: 1, or the disturbed repeats; 0 where nothing was planned
 
 
 @dataclass(eq=False)
@@ -134,7 +138,8 @@ def try_candidate(
         return CandidateTrial(report.outcome, report, report.plan)
     disturbances = disturbances_of(at, row, spec)
     if disturbances:
-        return _repeat(at, T_world_base, report, report.plan, disturbances, record)
+        fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
+        return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
 
 
@@ -153,12 +158,16 @@ def _attempt(
     failed: set[int] = set()
     planning, trials, clock = at.planning, at.trials, at.clock
     undisturbed = Disturbance.none(trial.object_friction)
+
+    def bases() -> tuple[F64, ...]:
+        return (T_world_base,) * len(results)
+
     while True:
         with clock.stage("execute"):
             results.append(run_trial(trials, T_world_base, plan, undisturbed, record))
         failed.add(plan.grasp)
         if results[-1].outcome == "success":
-            return CandidateTrial("success", report, plan, tuple(results), 1)
+            return CandidateTrial("success", report, plan, tuple(results), bases(), 1, 1)
         if len(results) == trial.max_attempts:
             break
         with clock.stage("plan"):
@@ -167,34 +176,69 @@ def _attempt(
             break
         plan = next_plan
     outcome = max((r.outcome for r in results), key=_PROGRESS.index)
-    return CandidateTrial(outcome, report, plan, tuple(results), 0)
+    return CandidateTrial(outcome, report, plan, tuple(results), bases(), 0, 1)
 
 
 def _repeat(
     at: ArmInScene,
     T_world_base: F64,
     report: PlanReport,
-    plan: MotionPlan,
     disturbances: list[Disturbance],
+    fits: Bools,
+    rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """One plan, executed once in each disturbed world; good where at least half of them lift."""
-    trials, clock = at.trials, at.clock
+    """Arrive near the candidate once for each disturbance; good where at least half of them lift.
+
+    The robot knows where it has arrived, since it sees the target from there, and plans anew. Where
+    `fits` (K,) is false its body does not fit; what else differs it does not know.
+    """
+    planning, trials, clock = at.planning, at.trials, at.clock
     results: list[TrialResult] = []
-    for disturbance in disturbances:
+    bases: list[F64] = []
+    ends: list[str] = []
+    for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
+        T_arrived = T_world_base @ disturbance.T_base_moved
+        if not does_fit:
+            ends.append("base_collision")
+            continue
+        with clock.stage("plan"):
+            found = plan_candidate(planning, T_arrived, rng)
+        if found.plan is None:
+            ends.append(found.outcome)
+            continue
         with clock.stage("execute"):
-            results.append(run_trial(trials, T_world_base, plan, disturbance, record))
-    successes = sum(r.outcome == "success" for r in results)
-    if 2 * successes >= len(results):
+            unknown = replace(disturbance, T_base_moved=np.eye(4))
+            results.append(run_trial(trials, T_arrived, found.plan, unknown, record))
+        bases.append(T_arrived)
+        ends.append(results[-1].outcome)
+    successes = ends.count("success")
+    if 2 * successes >= len(ends):
         outcome = "success"
     else:
-        counts = Counter(r.outcome for r in results if r.outcome != "success")
+        counts = Counter(end for end in ends if end != "success")
         outcome = max(counts, key=lambda name: (counts[name], _PROGRESS.index(name)))
-    return CandidateTrial(outcome, report, plan, tuple(results), successes)
+    return CandidateTrial(outcome, report, report.plan, tuple(results), tuple(bases), successes, len(ends))
+
+
+def _fits(
+    at: ArmInScene,
+    T_world_base: F64,
+    disturbances: list[Disturbance],
+    candidates: Candidates,
+    row: int,
+    spec: Specification,
+) -> Bools:
+    """Whether the robot's body fits (K,) where each disturbance lets it arrive."""
+    xy = np.array([(T_world_base @ d.T_base_moved)[:2, 3] for d in disturbances], np.float32)
+    height_m, camera_m = (
+        np.repeat(column[row], len(xy)) for column in (candidates.base_height_m, candidates.camera_height_m)
+    )
+    return base_clearance_m(xy, height_m, camera_m, at.scene.house.obstacles, spec.candidates) >= 0
 
 
 def disturbances_of(at: ArmInScene, row: int, spec: Specification) -> list[Disturbance]:
-    """The worlds in which the plan of candidate `row` is executed; none where it is the planned one."""
+    """The worlds that candidate `row` is tried in; none where it is the planned one."""
     if at.arm.disturbance is None:
         return []
     rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, row)

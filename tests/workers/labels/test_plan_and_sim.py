@@ -145,20 +145,31 @@ def test_every_attempt_takes_another_grasp_and_the_one_that_came_furthest_counts
 
 def test_repeats_are_counted(labelled: dict[str, Any]) -> None:
     at = scene()
-    still = DisturbanceParams(repeats=2, target_position_std_m=0.0, base_position_std_m=0.0)
-    wild = DisturbanceParams(repeats=2, base_position_std_m=0.04)
-    for disturbance in (still, wild):
-        spec = specification(trial=TrialParams(), disturbance=disturbance)
-        columns = load_label_source("sim").label(at, candidates(at), spec, StageClock())
-        planned = columns["path_length_rad"] > 0
-        np.testing.assert_array_equal(columns["trials"], np.where(planned, 2, 0))
-        np.testing.assert_array_equal(columns["attempts"], columns["trials"])
-        good = 2 * columns["successes"] >= columns["trials"]
-        np.testing.assert_array_equal(columns["label"] == 1, planned & good)
-        if disturbance is wild:
-            halves = columns["successes"] == 1
-            assert halves.any() and (columns["label"][halves] == 1).all()
-            assert (columns["label"][planned] == 0).any()
+    wild = DisturbanceParams(repeats=4, target_position_std_m=0.02, base_position_std_m=0.15)
+    columns = load_label_source("sim").label(
+        at, candidates(at), specification(trial=TrialParams(), disturbance=wild), StageClock()
+    )
+    planned = columns["path_length_rad"] > 0
+    np.testing.assert_array_equal(columns["trials"], np.where(planned, 4, 0))
+    assert (columns["successes"] <= columns["attempts"]).all()
+    assert (columns["attempts"] <= columns["trials"]).all()
+    # Some arrive where the body does not fit or the arm does not reach, some close beside the target.
+    assert columns["successes"].sum() < columns["attempts"].sum() < columns["trials"].sum()
+    good = 2 * columns["successes"] >= columns["trials"]
+    np.testing.assert_array_equal(columns["label"] == 1, planned & good)
+
+
+def test_a_robot_plans_from_where_it_arrives(labelled: dict[str, Any]) -> None:
+    at = scene()
+    near = DisturbanceParams(
+        repeats=2, target_position_std_m=0.0, target_yaw_std_rad=0.0, base_position_std_m=0.03
+    )
+    columns = load_label_source("sim").label(
+        at, candidates(at), specification(trial=TrialParams(), disturbance=near), StageClock()
+    )
+    # Executed blindly, errors of 3 cm at the base would miss most grasps.
+    np.testing.assert_array_equal(columns["successes"][:3], [2, 2, 2])
+    np.testing.assert_array_equal(columns["q_grasp_rad"][:3], labelled["plan"]["q_grasp_rad"][:3])
 
 
 def test_the_clock_has_its_stages() -> None:
