@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,10 @@ from datagen import cli
 from datagen.stored_scenes import open_stored_scenes, specify_again
 from schemas.fields import OUTCOMES
 from schemas.run import Run
+from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run
 
-pytestmark = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("pinocchio", "coal", "mani_skill", "sapien")),
-    reason="the extra `sim` is not installed",
-)
+pytestmark = needs_sim
 
 PER_SCENE, SCENES = 8, 2
 N = PER_SCENE * SCENES

@@ -5,18 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from schemas.run import Run
+from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, make_small_run
 
-pytestmark = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("pinocchio", "coal", "mani_skill", "sapien")),
-    reason="the extra `sim` is not installed",
-)
+pytestmark = needs_sim
 
 
 @pytest.fixture

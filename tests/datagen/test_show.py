@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,14 +15,12 @@ from schemas.fields import OUTCOMES
 from schemas.run import Run
 from schemas.scene_rows import read_scene
 from tests.refusals import refused
+from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, make_small_run
 from workers.scenes.recall import recall_candidates, recall_scene
 from workers.world import open_world
 
-pytestmark = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("pinocchio", "coal", "ompl", "mani_skill", "sapien")),
-    reason="the extra `sim` is not installed",
-)
+pytestmark = needs_sim
 
 PER_SCENE = 12
 NAMES = tuple(OUTCOMES)

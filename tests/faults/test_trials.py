@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,10 @@ from datagen import cli
 from schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.trials import FaultyTrials, attempt_with_faults
+from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, assert_equal_runs, make_small_run
 
-pytestmark = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("pinocchio", "coal", "ompl", "mani_skill", "sapien")),
-    reason="the extra `sim` is not installed",
-)
+pytestmark = needs_sim
 
 SHARDS, PER_SCENE = 6, 6
 N = SHARDS * PER_SCENE

@@ -1,0 +1,14 @@
+"""Tests of plan and sim labels where the extra `sim` is installed; elsewhere a skip that says so."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+
+from workers.registry import SIM_MODULES
+
+needs_sim = pytest.mark.skipif(
+    any(find_spec(name) is None for name in (*SIM_MODULES, "sapien")),
+    reason="the extra `sim` is not installed",
+)
