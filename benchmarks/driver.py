@@ -61,7 +61,7 @@ def ledger(entries: int) -> float:
             entry = LedgerEntry(
                 attempt=f"a{i}", shard=i, outcome="committed", ended=utc_now(), cost=Cost(wall_s=1, cpu_s=1)
             )
-            run.end_attempt(entry)
+            run.ledger.end(entry)
         return (time.perf_counter() - start_s) / entries * 1e3
 
 

@@ -36,7 +36,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
         run, world = _open(task.run, spec_hash, task.houses, task.objects)
         source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
     with _ends_job():
-        run.start_attempt(task.attempt, task.shard)
+        run.ledger.start(task.attempt, task.shard)
     stored = None if source is None else read_scenes(source, task.scene_indices)
     with _ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
         made = run_shard(task.spec, world, task.scene_indices, stored)

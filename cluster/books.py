@@ -16,7 +16,7 @@ class RunBooks:
 
     def close(self, entry: LedgerEntry) -> None:
         """Note how an attempt ended. An end that was noted before stands, unless it was a guess."""
-        self._run.end_attempt(entry)
+        self._run.ledger.end(entry)
 
     def quarantine(self, shard: int, trouble: Trouble) -> None:
         """Give a shard up, with all that is needed to run it alone."""
@@ -50,7 +50,7 @@ def close_lost_attempts(run: Run) -> int:
     that resumes.
     """
     books, quarantined, closed = RunBooks(run), run.quarantined(), 0
-    for start in run.unfinished_attempts():
+    for start in run.ledger.unfinished():
         commit = books.commit_of(start.shard)
         if commit is None and start.shard not in quarantined:
             continue

@@ -72,7 +72,7 @@ def account_for(runs: Iterable[Run]) -> Books:
     books = Books()
     for run in runs:
         # The ledger first: whatever it calls committed then has its commit, also while a job goes on.
-        ledger, unfinished = list(run.ledger()), run.unfinished_attempts()
+        ledger, unfinished = list(run.ledger.ends()), run.ledger.unfinished()
         committed: set[str] = set()
         for commit in run.commits():
             committed.add(commit.attempt)

@@ -32,11 +32,11 @@ def status_report(run: Run) -> dict[str, Any]:
     commits = list(run.commits())
     outcomes: Counter[str] = Counter()
     causes: Counter[str] = Counter()
-    for entry in run.ledger():
+    for entry in run.ledger.ends():
         outcomes[entry.outcome] += 1
         if entry.cause:
             causes[f"{entry.outcome}: {entry.cause}"] += 1
-    unfinished = {start.attempt for start in run.unfinished_attempts()} - {c.attempt for c in commits}
+    unfinished = {start.attempt for start in run.ledger.unfinished()} - {c.attempt for c in commits}
     done = [c for c in commits if c.shard in planned]
     root, absent = sealed_root(run), sorted(set(planned) - committed)
     return {

@@ -22,6 +22,7 @@ RUN/
   plans/<k>.json                 samples wanted; the highest k counts, a run only grows
   shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
   commits/<shard>.json           written last, create-only: the attempt, every file's size and sha256, cost
+  copies/...                     second copies of manifest and plans; a commit's is in its attempt's folder
   ledger/<attempt>.start.json    an attempt began
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a shard given up: seeds, causes, stacks

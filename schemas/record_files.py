@@ -1,10 +1,13 @@
-"""The JSON records of a run as files: written readably, read back with suspicion."""
+"""The JSON records of a run as files: written readably with their own digest, read back with suspicion."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TypeVar
+from hashlib import sha256
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -12,7 +15,10 @@ from schemas.errors import InputError
 from schemas.storage import Storage
 
 MAX_RECORD_BYTES = 16 * 2**20
-_MEND = "Restore the file from a copy; if there is none, remove it"
+_MEND = "Mend it with `datagen repair`, or restore the file from a copy"
+# The last line of a record: the sha256 of every byte before it. What is left of it is JSON but for a brace.
+_TRAILER = re.compile(rb',\n "sha256": "([0-9a-f]{64})"\n}\n\Z')
+_TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64
 
 Record = TypeVar("Record", bound=BaseModel)
 
@@ -23,28 +29,43 @@ def now() -> str:
 
 
 def encode_record(record: BaseModel) -> bytes:
-    """The record as indented JSON."""
-    return (json.dumps(record.model_dump(mode="json"), indent=1, allow_nan=False) + "\n").encode()
+    """The record as indented JSON whose last key is the sha256 of all bytes before it."""
+    return signed_json(record.model_dump(mode="json"))
 
 
-def read_record(storage: Storage, key: str, model: type[Record]) -> Record | None:
-    """The validated record, or None when there is no such file.
+def signed_json(fields: Mapping[str, Any]) -> bytes:
+    """A record's file from its fields, as `encode_record` writes it."""
+    text = json.dumps(fields, indent=1, allow_nan=False).encode()
+    body = text.removesuffix(b"\n}")
+    return body + b',\n "sha256": "' + sha256(body).hexdigest().encode() + b'"\n}\n'
 
-    InputError names the file and the field when it is not JSON, has unknown or missing fields,
-    values out of range, or more bytes than a record can have.
+
+def decode_record(place: str, data: bytes, model: type[Record]) -> Record:
+    """The validated record of a file at `place`.
+
+    InputError names the file and the field when its bytes are not those that were written, when it is
+    not JSON, or has unknown or missing fields or values out of range.
     """
-    data = storage.get(key, MAX_RECORD_BYTES)
-    if data is None:
-        return None
-    place = f"{storage.url}/{key}"
+    trailer = _TRAILER.search(data, max(0, len(data) - _TRAILER_BYTES))
+    if trailer is None:
+        raise InputError(place, "sha256", "not a whole record: it does not end with its sha256", _MEND)
+    body = data[: trailer.start()]
+    if sha256(body).hexdigest().encode() != trailer[1]:
+        raise InputError(place, "sha256", "does not match: the file is damaged or was edited", _MEND)
     try:
-        return model.model_validate_json(data)
+        return model.model_validate_json(body + b"\n}")
     except ValidationError as e:
         first = e.errors(include_url=False, include_context=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         given = repr(first.get("input"))[:60]
         problem = f"{first['msg']} (it is {given})" if where else first["msg"]
         raise InputError(place, where, problem, _MEND) from e
+
+
+def read_record(storage: Storage, key: str, model: type[Record]) -> Record | None:
+    """The validated record, or None when there is no such file. InputError as `decode_record`."""
+    data = storage.get(key, MAX_RECORD_BYTES)
+    return None if data is None else decode_record(f"{storage.url}/{key}", data, model)
 
 
 def different_fields(ours: object, theirs: object, path: str = "") -> list[tuple[str, object, object]]:

@@ -13,14 +13,13 @@ from pathlib import Path
 
 from schemas.errors import InputError
 from schemas.fields import RecordSchema, sized_schema
-from schemas.record_files import different_fields, encode_record, now, read_record
+from schemas.ledger import MAX_STACK_CHARS, Ledger
+from schemas.record_files import MAX_RECORD_BYTES, different_fields, encode_record, now, read_record
 from schemas.run_records import (
     FORMAT_VERSION,
-    AttemptStart,
     Commit,
     FileEntry,
     Layout,
-    LedgerEntry,
     Manifest,
     Plan,
     QuarantineRecord,
@@ -28,7 +27,6 @@ from schemas.run_records import (
 from schemas.storage import Storage, open_storage
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
-MAX_STACK_CHARS = 20_000
 
 
 class Run:
@@ -40,6 +38,7 @@ class Run:
     def __init__(self, storage: Storage, manifest: Manifest) -> None:
         self.storage = storage
         self.manifest = manifest
+        self.ledger = Ledger(storage)
         self._commits: dict[int, Commit] = {}  # immutable once written, so read at most once
 
     def __repr__(self) -> str:
@@ -54,7 +53,7 @@ class Run:
         """
         if not storage.exists("manifest.json"):
             _refuse_foreign(storage)
-            storage.put_new("manifest.json", encode_record(manifest))
+            publish(storage, "manifest.json", encode_record(manifest))
         run = cls.open(storage)
         run._refuse_other(manifest)
         run.grow(n)
@@ -118,7 +117,7 @@ class Run:
             if wanted >= n:
                 return
             # Losing this race means that another plan appeared: look again.
-            self.storage.put_new(f"plans/{number + 1}.json", encode_record(Plan(n=n, created=now())))
+            publish(self.storage, f"plans/{number + 1}.json", encode_record(Plan(n=n, created=now())))
 
     def _newest_plan(self) -> tuple[int, int]:
         numbers = self._numbers("plans", width=1)
@@ -182,9 +181,19 @@ class Run:
         return entries
 
     def commit(self, commit: Commit) -> bool:
-        """Publish a shard. False when another attempt has won; its files then are garbage."""
+        """Publish a shard. False when another attempt has won; its files then are garbage.
+
+        The attempt's folder keeps a copy of the record, from which a damaged one is restored.
+        """
         self.check_files(commit)
-        return self.storage.put_new(commit_key(commit.shard), encode_record(commit))
+        record = encode_record(commit)
+        copy = commit_copy_key(commit.shard, commit.attempt)
+        self.storage.put(copy, record)
+        self.storage.sync([copy])
+        won = self.storage.put_new(commit_key(commit.shard), record)
+        if not won:
+            self.storage.delete([copy])
+        return won
 
     def check_files(self, commit: Commit) -> None:
         """Refuse a commit whose files are absent or of another size (bytes are not read)."""
@@ -215,47 +224,7 @@ class Run:
                     f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
                 )
 
-    # Ledger and quarantine.
-
-    def start_attempt(self, attempt: str, shard: int) -> None:
-        """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
-        record = AttemptStart(attempt=attempt, shard=shard, started=now())
-        if not self.storage.put_new(f"ledger/{attempt}.start.json", encode_record(record)):
-            place = f"{self.storage.url}/ledger/{attempt}.start.json"
-            raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")
-
-    def end_attempt(self, entry: LedgerEntry) -> bool:
-        """Note how an attempt ended; False when its end was noted before. Long stacks are cut.
-
-        An attempt that another job took for lost may still answer: its account replaces the guess.
-        """
-        kept = entry.model_copy(
-            update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
-        )
-        key = f"ledger/{entry.attempt}.json"
-        if self.storage.put_new(key, encode_record(kept)):
-            return True
-        noted = read_record(self.storage, key, LedgerEntry)
-        if kept.cost is None or noted is None or noted.outcome != "lost" or noted.cost is not None:
-            return False
-        self.storage.put(key, encode_record(kept))
-        self.storage.sync([key])
-        return True
-
-    def ledger(self) -> Iterator[LedgerEntry]:
-        """Ends of all attempts, in order of their names."""
-        for name in sorted(self._ledger_names()):
-            if not name.endswith(".start"):
-                entry = read_record(self.storage, f"ledger/{name}.json", LedgerEntry)
-                if entry is not None:
-                    yield entry
-
-    def unfinished_attempts(self) -> list[AttemptStart]:
-        """Attempts that began and left no end: running elsewhere, or lost."""
-        names = self._ledger_names()
-        open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
-        found = (read_record(self.storage, f"ledger/{name}.json", AttemptStart) for name in open_)
-        return [start for start in found if start is not None]
+    # Quarantine.
 
     def quarantine(self, record: QuarantineRecord) -> bool:
         """Give a shard up; False when it was before."""
@@ -281,10 +250,6 @@ class Run:
             if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
                 numbers.add(int(found.group(1)))
         return numbers
-
-    def _ledger_names(self) -> set[str]:
-        names = {f.key.rsplit("/", 1)[-1] for f in self.storage.list("ledger")}
-        return {name.removesuffix(".json") for name in names if name.endswith(".json")}
 
     def _refuse_other(self, manifest: Manifest) -> None:
         ours = manifest.model_dump(mode="json")
@@ -319,8 +284,29 @@ def commit_key(shard: int) -> str:
     return f"commits/{shard:06d}.json"
 
 
+def commit_copy_key(shard: int, attempt: str) -> str:
+    """Key of the copy of a commit record in its attempt's folder."""
+    return f"{shard_folder(shard, attempt)}/commit.json"
+
+
+def copy_key(key: str) -> str:
+    """Key of the copy of a record at the run's root."""
+    return f"copies/{key}"
+
+
+def publish(storage: Storage, key: str, record: bytes) -> None:
+    """Write a record of the run's root once: its copy first, then the record with the copy's bytes.
+
+    The copy decides races, so that both are always equal; one that was killed in between is completed
+    by the next.
+    """
+    storage.put_new(copy_key(key), record)
+    kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
+    storage.put_new(key, record if kept is None else kept)
+
+
 def _refuse_foreign(storage: Storage) -> None:
-    ours = re.compile(r"^(manifest\.json|plans/|shards/|commits/|ledger/|\.probe-)")
+    ours = re.compile(r"^(manifest\.json|plans/|copies/|shards/|commits/|ledger/|\.probe-)")
     for file in storage.list(""):
         if not ours.match(file.key):
             raise InputError(

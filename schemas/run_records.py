@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.specification import Specification
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 # One file name without folders, and a path of such names: neither can leave the run.
 AttemptName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -71,6 +71,13 @@ class Plan(_Record):
     created: str
 
 
+class Merged(_Record):
+    """merged.json: a run made of others, each whole below parts/, in the order of their rows."""
+
+    format_version: int = FORMAT_VERSION
+    parts: tuple[Digest, ...] = Field(min_length=2)  # specification hashes, ascending
+
+
 class FileEntry(_Record):
     """One file of a committed attempt, relative to the attempt's folder."""
 
@@ -126,6 +133,7 @@ class AttemptStart(_Record):
     attempt: AttemptName
     shard: int = Field(ge=0)
     started: str
+    host: str = ""
 
 
 class LedgerEntry(_Record):

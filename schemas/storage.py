@@ -71,8 +71,18 @@ class Storage:
         except _FAILURES as e:
             self._refuse(key, e)
 
+    def below(self, key: str) -> Storage:
+        """The storage whose root is a folder of this one."""
+        if self.folder is None:
+            return open_storage(f"{self.url}/{key}", probe=False)
+        return _open_folder(self.folder / key, create=True)
+
     def put_new(self, key: str, data: bytes) -> bool:
-        """Write a file durably unless the key exists; False when it does. One racer wins."""
+        """Write a file durably unless the key exists; False when it does with other bytes.
+
+        One racer wins. A store may write and yet answer with an error, and the repeated request then
+        finds the key taken: by these very bytes, which is a success.
+        """
         try:
             if self.folder is None:
                 obstore.put(self._store, key, data, mode="create", use_multipart=False)
@@ -88,7 +98,7 @@ class Storage:
                 self.delete([draft])
             self.sync([key])
         except AlreadyExistsError:
-            return False
+            return self.get(key, 2**40) == data
         except InputError:
             raise
         except _FAILURES as e:

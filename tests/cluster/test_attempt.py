@@ -13,7 +13,7 @@ from cluster import attempt
 from cluster.attempt import run_attempt
 from cluster.guard import Meter, guarded
 from cluster.task import JobCannotGoOn, ShardTask
-from schemas.run import Run, shard_folder
+from schemas.run import Run, commit_key, shard_folder
 from schemas.run_records import Layout
 from schemas.specification import CandidateParams, ObservationParams, SceneParams, Source, Specification
 from tests.made_runs import make_run, small_spec
@@ -61,11 +61,12 @@ def test_an_attempt_commits_and_a_second_one_is_superseded(spec: Specification, 
     assert commit.samples == first.labels == 10 and commit.cost.stage_wall_s["write"] > 0
     assert commit.cost.written_bytes == sum(f.size for f in commit.files) > 0
     run.check_digests(commit)
-    # The same shard made twice is the same bytes.
+    # The same shard made twice is the same bytes; only the winner keeps its claim.
     digests = {}
     for name in ("first", "second"):
         keys = [f.key for f in run.storage.list(shard_folder(0, name))]
         digests[name] = {key.rsplit(name, 1)[1]: run.storage.get(key, 10**8) for key in keys}
+    assert digests["first"].pop("/commit.json") == run.storage.get(commit_key(0), 10**8)
     assert digests["first"] == digests["second"]
 
 

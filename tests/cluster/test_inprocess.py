@@ -31,7 +31,7 @@ def play(run: Run, folder: Path, words: dict[int, tuple[str, ...]], stop: StopRe
     notes.mkdir(exist_ok=True)
 
     def commit_after(task: ScriptedTask, meter: Meter) -> Product:
-        run.start_attempt(task.attempt, task.shard)
+        run.ledger.start(task.attempt, task.shard)
         product = perform(task, meter)
         commit = write(run, task.shard, task.attempt).model_copy(update={"cost": product.cost})
         return Product(run.commit(commit), commit.samples, commit.positives, product.cost)
@@ -50,9 +50,9 @@ def test_a_job_on_a_real_run_leaves_commits_ledger_and_quarantine(tmp_path: Path
     record = run.quarantine_records()[0]
     assert record.first_scene == 6 and record.scenes == 2 and len(record.stacks) == 3
     assert all("misbehave" in stack for stack in record.stacks)
-    ledger = list(run.ledger())
+    ledger = list(run.ledger.ends())
     assert sorted(e.outcome for e in ledger) == ["committed"] * 4 + ["failed"] * 4 + ["out_of_memory"]
-    assert run.unfinished_attempts() == [] and summary.exit_code == 0
+    assert run.ledger.unfinished() == [] and summary.exit_code == 0
     # The account closes: ledger = commits + waste.
     spent_s = sum(e.cost.wall_s for e in ledger if e.cost)
     useful_s = sum(c.cost.wall_s for c in run.commits())
@@ -83,15 +83,15 @@ def test_a_shard_that_another_driver_committed_is_superseded(tmp_path: Path) -> 
 def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=())
     for attempt, shard in (("lost-one", 0), ("won-one", 1), ("orphan", 2)):
-        run.start_attempt(attempt, shard)
+        run.ledger.start(attempt, shard)
     run.commit(write(run, 0, "by-the-next-driver"))
     run.commit(write(run, 1, "won-one"))
     # Nobody knows yet whether the orphan will reach its commit.
     assert close_lost_attempts(run) == 2 and close_lost_attempts(run) == 0
-    assert [start.attempt for start in run.unfinished_attempts()] == ["orphan"]
+    assert [start.attempt for start in run.ledger.unfinished()] == ["orphan"]
     run.commit(write(run, 2, "orphan"))
     assert close_lost_attempts(run) == 1
-    ended = {e.attempt: e for e in run.ledger()}
+    ended = {e.attempt: e for e in run.ledger.ends()}
     assert {name: e.outcome for name, e in ended.items()} == {
         "lost-one": "lost", "won-one": "committed", "orphan": "committed",
     }  # fmt: skip
@@ -101,14 +101,14 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
 def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Path) -> None:
     """Two drivers at once: the first to end closes what the other still has in flight."""
     run = make_run(tmp_path / "run", shards=())
-    run.start_attempt("slow", 0)
+    run.ledger.start("slow", 0)
     run.commit(write(run, 0, "fast"))
     assert close_lost_attempts(run) == 1
     books, cost = RunBooks(run), Cost(wall_s=7.0, cpu_s=6.0)
     for seconds in (7.0, 9.0):  # an account stands, whoever comes later
         told = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=seconds, cpu_s=6))
         books.close(told)
-    (entry,) = run.ledger()
+    (entry,) = run.ledger.ends()
     assert (entry.outcome, entry.cost) == ("superseded", cost)
 
 

@@ -20,9 +20,9 @@ class _RunThatGrows(Run):
         yield from list(super().commits())
         for shard in self.missing()[:1]:
             commit = write(self, shard, "meanwhile")
-            self.start_attempt("meanwhile", shard)
+            self.ledger.start("meanwhile", shard)
             assert self.commit(commit)
-            self.end_attempt(
+            self.ledger.end(
                 LedgerEntry(attempt="meanwhile", shard=shard, outcome="committed", cost=commit.cost)
             )
 

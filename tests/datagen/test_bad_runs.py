@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from datagen import cli
+from schemas.record_files import signed_json
 from schemas.run import Run
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments
@@ -66,8 +67,9 @@ def test_a_bad_picture(
 
 def _edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     record = json.loads(path.read_text())
+    del record["sha256"]
     change(record)
-    path.write_text(json.dumps(record))
+    path.write_bytes(signed_json(record))
 
 
 def _cut(path: Path) -> None:

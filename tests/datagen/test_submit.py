@@ -175,7 +175,7 @@ def test_status_tells_an_older_seal(
 def test_the_audit_adds_up(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (report,) = json_of(capsys, ["audit", str(finished)])["sources"]
     run, arrays = Run.open(finished), arrays_of(finished)
-    ledger = [e.cost for e in run.ledger() if e.cost is not None]
+    ledger = [e.cost for e in run.ledger.ends() if e.cost is not None]
     paid_s = sum(cost.wall_s for cost in ledger)
     wasted_s = sum(account["wall_s"] for account in report["waste"].values())
     assert report["useful"]["wall_s"] + wasted_s == pytest.approx(paid_s, rel=1e-9)
@@ -240,7 +240,7 @@ def test_a_killed_driver_resumes_to_the_same_arrays(finished_long: Path, tmp_pat
     job.wait_until_committed(2)
     while True:  # look at it while it stands still, and kill it in the middle of an attempt
         job.process.send_signal(signal.SIGSTOP)
-        lost = Run.open(run).unfinished_attempts()
+        lost = Run.open(run).ledger.unfinished()
         if lost and lost[0].shard not in Run.open(run).committed():
             break
         job.process.send_signal(signal.SIGCONT)
@@ -254,10 +254,10 @@ def test_a_killed_driver_resumes_to_the_same_arrays(finished_long: Path, tmp_pat
     assert cli.run(submit_arguments(run, LONG_N)) == 0
     assert kept.items() <= files_of(run, "commits", "shards").items()
     assert_equal_runs(arrays_of(run), arrays_of(finished_long))
-    ends = {entry.attempt: entry for entry in Run.open(run).ledger()}
+    ends = {entry.attempt: entry for entry in Run.open(run).ledger.ends()}
     assert Counter(entry.outcome for entry in ends.values()) == {"committed": 8, "lost": 1}
     assert ends[lost[0].attempt].outcome == "lost" and ends[lost[0].attempt].cost is None
-    assert Run.open(run).unfinished_attempts() == []
+    assert Run.open(run).ledger.unfinished() == []
 
 
 def test_ctrl_c_says_how_to_resume_and_that_command_completes(finished_long: Path, tmp_path: Path) -> None:
@@ -268,7 +268,7 @@ def test_ctrl_c_says_how_to_resume_and_that_command_completes(finished_long: Pat
     _, told = job.process.communicate(timeout=120)
     assert job.process.returncode == 130
     assert "Traceback" not in told and "interrupted" in told
-    assert 2 <= len(Run.open(run).committed()) < 8 and Run.open(run).unfinished_attempts() == []
+    assert 2 <= len(Run.open(run).committed()) < 8 and Run.open(run).ledger.unfinished() == []
     (line,) = [line for line in told.splitlines() if line.strip().startswith("datagen ")]
     assert cli.run(shlex.split(line)[1:]) == 0
     assert_equal_runs(arrays_of(run), arrays_of(finished_long))

@@ -39,7 +39,7 @@ class RandomRows:
 def make_rows(task: RandomRows, meter: Meter) -> Product:
     """Write and commit the shard."""
     run = Run.open(task.run)
-    run.start_attempt(task.attempt, task.shard)
+    run.ledger.start(task.attempt, task.shard)
     time.sleep(task.seconds)
     commit = write(run, task.shard, task.attempt).model_copy(update={"cost": meter.cost()})
     return Product(run.commit(commit), commit.samples, commit.positives, commit.cost)

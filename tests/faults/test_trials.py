@@ -103,7 +103,7 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
         summary = drive(run.missing(), make_task, executor, RunBooks(run), policy, Heard(), StopRequest())
     assert summary.end == "complete" and not close_lost_attempts(run)
 
-    ends = {shard: [e.outcome for e in run.ledger() if e.shard == shard] for shard in range(SHARDS)}
+    ends = {shard: [e.outcome for e in run.ledger.ends() if e.shard == shard] for shard in range(SHARDS)}
     assert ends == {
         0: ["crashed", "committed"],
         1: ["hung", "committed"],

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from schemas.errors import InputError
+from schemas.record_files import signed_json
 from schemas.run import Run
 from schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
 from schemas.storage import open_storage
@@ -104,15 +105,15 @@ def test_a_commit_without_its_files_is_refused(tmp_path: Path):
 def test_the_ledger_knows_who_began_and_who_never_ended(tmp_path: Path):
     run = make_run(tmp_path, shards=[])
     for name in ("a", "b", "c"):
-        run.start_attempt(name, 1)
+        run.ledger.start(name, 1)
     with pytest.raises(InputError, match="already begun"):
-        run.start_attempt("a", 1)
+        run.ledger.start("a", 1)
     end = LedgerEntry(attempt="a", shard=1, outcome="crashed", cause="x", stack="y" * 10**6)
-    assert run.end_attempt(end)
-    assert not run.end_attempt(end.model_copy(update={"outcome": "failed"}))
-    (entry,) = run.ledger()
+    assert run.ledger.end(end)
+    assert not run.ledger.end(end.model_copy(update={"outcome": "failed"}))
+    (entry,) = run.ledger.ends()
     assert (entry.outcome, len(entry.stack)) == ("crashed", 20_000)
-    assert [s.attempt for s in run.unfinished_attempts()] == ["b", "c"]
+    assert [s.attempt for s in run.ledger.unfinished()] == ["b", "c"]
 
 
 def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_path: Path):
@@ -121,7 +122,7 @@ def test_quarantine_takes_a_shard_from_the_missing_until_it_is_committed(tmp_pat
         shard=2, seed=0, first_scene=4, scenes=2, attempts=("a",), causes=("c",), stacks=("s",), created="now"
     )
     assert run.quarantine(record)
-    assert not run.quarantine(record)
+    assert not run.quarantine(record.model_copy(update={"created": "later"}))
     assert (run.missing(), run.quarantined()) == ([1], {2})
     assert run.quarantine_records() == [record]
     assert run.commit(write(run, 2, "again"))
@@ -146,9 +147,10 @@ def test_other_names_in_commits_do_not_count(tmp_path: Path):
 
 def edit(path: Path, **changes: Any) -> None:
     record = json.loads(path.read_text())
+    del record["sha256"]
     for key, value in changes.items():
         record[key] = value
-    path.write_text(json.dumps(record))
+    path.write_bytes(signed_json(record))
 
 
 FILE = {"path": "label/c.0", "size": 1, "sha256": "0" * 64}
@@ -225,6 +227,9 @@ def test_an_edited_specification_is_noticed(tmp_path: Path):
     make_run(tmp_path, shards=[])
     path = tmp_path / "manifest.json"
     path.write_text(path.read_text().replace('"seed": 0', '"seed": 1'))
+    with pytest.raises(InputError, match="sha256"):
+        Run.open(tmp_path)
+    edit(path)  # signed anew
     with pytest.raises(InputError, match="spec_hash"):
         Run.open(tmp_path)
 
@@ -232,9 +237,9 @@ def test_an_edited_specification_is_noticed(tmp_path: Path):
 def test_runs_of_other_formats_and_versions_are_refused(tmp_path: Path):
     make_run(tmp_path, shards=[])
     edit(tmp_path / "manifest.json", format_version=99)
-    with pytest.raises(InputError, match="format_version: 99, and this program reads 1"):
+    with pytest.raises(InputError, match="format_version: 99, and this program reads 2"):
         Run.open(tmp_path)
-    edit(tmp_path / "manifest.json", format_version=1, schema_version=99)
+    edit(tmp_path / "manifest.json", format_version=2, schema_version=99)
     with pytest.raises(InputError, match="schema_version"):
         _ = Run.open(tmp_path).schema
     edit(tmp_path / "manifest.json", schema_name="dreams")

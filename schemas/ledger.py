@@ -1,0 +1,76 @@
+"""The ledger of a run: every attempt that began, and how it ended and what it cost."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator
+
+from schemas.errors import InputError
+from schemas.record_files import encode_record, now, read_record
+from schemas.run_records import AttemptStart, LedgerEntry
+from schemas.storage import Storage
+
+MAX_STACK_CHARS = 20_000
+
+
+class Ledger:
+    """Two records an attempt, its start and its end, under `ledger/` of a run's storage."""
+
+    def __init__(self, storage: Storage) -> None:
+        self._storage = storage
+
+    def start(self, attempt: str, shard: int) -> None:
+        """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
+        record = AttemptStart(attempt=attempt, shard=shard, started=now(), host=platform.node())
+        if not self._storage.put_new(start_key(attempt), encode_record(record)):
+            place = f"{self._storage.url}/{start_key(attempt)}"
+            raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")
+
+    def end(self, entry: LedgerEntry) -> bool:
+        """Note how an attempt ended; False when its end was noted before. Long stacks are cut.
+
+        An attempt that another job took for lost may still answer: its account replaces the guess.
+        """
+        kept = entry.model_copy(
+            update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
+        )
+        key = end_key(entry.attempt)
+        if self._storage.put_new(key, encode_record(kept)):
+            return True
+        noted = self.end_of(entry.attempt)
+        if kept.cost is None or noted is None or noted.outcome != "lost" or noted.cost is not None:
+            return False
+        self._storage.put(key, encode_record(kept))
+        self._storage.sync([key])
+        return True
+
+    def end_of(self, attempt: str) -> LedgerEntry | None:
+        """How an attempt ended; None while it has not."""
+        return read_record(self._storage, end_key(attempt), LedgerEntry)
+
+    def ends(self) -> Iterator[LedgerEntry]:
+        """Ends of all attempts, in order of their names."""
+        for name in sorted(self._names()):
+            if not name.endswith(".start") and (entry := self.end_of(name)) is not None:
+                yield entry
+
+    def unfinished(self) -> list[AttemptStart]:
+        """Attempts that began and left no end: running elsewhere, or lost."""
+        names = self._names()
+        open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
+        found = (read_record(self._storage, f"ledger/{name}.json", AttemptStart) for name in open_)
+        return [start for start in found if start is not None]
+
+    def _names(self) -> set[str]:
+        names = {f.key.rsplit("/", 1)[-1] for f in self._storage.list("ledger")}
+        return {name.removesuffix(".json") for name in names if name.endswith(".json")}
+
+
+def start_key(attempt: str) -> str:
+    """Key of the record that an attempt began."""
+    return f"ledger/{attempt}.start.json"
+
+
+def end_key(attempt: str) -> str:
+    """Key of the record of how an attempt ended."""
+    return f"ledger/{attempt}.json"
