@@ -10,7 +10,7 @@ import errno
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -39,10 +39,15 @@ _FAILURES = (BaseError, OSError, ValueError)
 
 @dataclass(frozen=True)
 class StoredFile:
-    """One listed file: its key below the storage's root and its size in bytes."""
+    """One listed file: its key below the storage's root, its size in bytes, and its change stamp.
+
+    Equal stamps of one key mean equal bytes: the store's entity tag, or what the file system notes of
+    the file (inode, time and size).
+    """
 
     key: str
     size: int
+    stamp: str = ""
 
 
 class Storage:
@@ -140,7 +145,7 @@ class Storage:
         try:
             for group in obstore.list(self._store, prefix):
                 for entry in group:
-                    yield StoredFile(str(entry["path"]), int(entry["size"]))
+                    yield StoredFile(str(entry["path"]), int(entry["size"]), _stamp(entry))
         except _FAILURES as e:
             self._refuse(prefix, e)
 
@@ -166,6 +171,37 @@ class Storage:
         except _FAILURES as e:
             self._refuse(target, e)
 
+    def put_many(self, files: Mapping[str, bytes]) -> None:
+        """Write many files whole, as `put` does each; remote storage takes several at once."""
+        for key, data in files.items():
+            self.put(key, data)
+
+    def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
+        """(key, bytes) of many files, as `get` gives each, in the order of the keys."""
+        for key in keys:
+            yield key, self.get(key, limit_bytes)
+
+    def adopt(self, source: Storage, source_key: str, key: str, limit_bytes: int = 2**31) -> None:
+        """Take over a file of another storage; one of that name is replaced. Not durable before `sync`.
+
+        No byte is moved where it can be helped: a hard link on one file system. InputError when there
+        is no such file, or where bytes must be moved and they are more than the limit.
+        """
+        if self.folder is not None and source.folder is not None:
+            path = self.folder / key
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.unlink(missing_ok=True)
+                os.link(source.folder / source_key, path)
+                return
+            except OSError as e:
+                if e.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP):
+                    self._refuse(key, e)
+        data = source.get(source_key, limit_bytes)
+        if data is None:
+            raise InputError(f"{source.url}/{source_key}", "", "no such file", "Restore it from a copy")
+        self.put(key, data)
+
     def sync(self, keys: Iterable[str]) -> None:
         """Make files and the folders that name them survive a power cut.
 
@@ -190,6 +226,10 @@ class Storage:
 
     def _refuse(self, key: str, error: Exception) -> NoReturn:
         raise storage_error(f"{self.url}/{key}" if key else self.url, error) from error
+
+
+def _stamp(entry: Mapping[str, Any]) -> str:
+    return str(entry["e_tag"] or f"{entry['last_modified'].isoformat()}-{entry['size']}")
 
 
 def storage_error(place: str | Path, error: Exception) -> InputError:

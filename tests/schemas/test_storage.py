@@ -35,6 +35,29 @@ def test_files_come_back_and_listing_tells_their_sizes(tmp_path: Path):
     assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
 
 
+def test_stamps_change_with_the_bytes_and_with_nothing_else(tmp_path: Path):
+    s = open_storage(tmp_path)
+    s.put("a/b", b"12")
+    s.put("a/c", b"12")
+    before = {f.key: f.stamp for f in s.list("")}
+    assert before == {f.key: f.stamp for f in s.list("")} and all(before.values())
+    s.put("a/b", b"13")
+    after = {f.key: f.stamp for f in s.list("")}
+    assert after["a/c"] == before["a/c"] and after["a/b"] != before["a/b"]
+
+
+def test_a_file_of_another_storage_is_adopted_by_a_link(tmp_path: Path):
+    ours, theirs = open_storage(tmp_path / "ours"), open_storage(tmp_path / "theirs")
+    theirs.put("x/y", b"theirs")
+    ours.put("a/b", b"replaced")
+    ours.adopt(theirs, "x/y", "a/b")
+    ours.adopt(theirs, "x/y", "a/b")
+    assert (tmp_path / "ours/a/b").samefile(tmp_path / "theirs/x/y")
+    assert dict(ours.get_many(["a/b", "none"], 9)) == {"a/b": b"theirs", "none": None}
+    with pytest.raises(InputError, match="No such file|no such file"):
+        ours.adopt(theirs, "x/none", "a/c")
+
+
 def test_it_travels_to_another_process(tmp_path: Path):
     s: Storage = pickle.loads(pickle.dumps(open_storage(tmp_path)))
     assert s.put_new("k", b"v")
