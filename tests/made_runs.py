@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from schemas.fields import Field, RecordSchema, sized_schema
+from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, sized_schema
+from schemas.identity import sample_ids
 from schemas.record_files import now
 from schemas.run import Run
-from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, Manifest
+from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
 from schemas.shard_files import encode_shard
 from schemas.specification import ObservationParams, SceneParams, Source, Specification
 from schemas.storage import open_storage
@@ -57,18 +58,42 @@ def make_run(
     layout = Layout(scenes_per_shard=scenes_per_shard, candidates_per_scene=candidates_per_scene)
     run = Run.create_or_open(open_storage(folder), manifest_of(spec or small_spec(), layout), n)
     for shard in run.missing() if shards is None else shards:
-        assert run.commit(write(run, shard, f"a-{shard}"))
+        assert attempt(run, shard, f"a-{shard}")
     return run
+
+
+def attempt(run: Run, shard: int, name: str) -> bool:
+    """One whole attempt at a shard with its account in the ledger; whether it won."""
+    run.ledger.start(name, shard)
+    commit = write(run, shard, name)
+    won = run.commit(commit)
+    outcome = "committed" if won else "superseded"
+    run.ledger.end(
+        LedgerEntry(
+            attempt=name, shard=shard, outcome=outcome, ended=now(), cost=commit.cost, host=commit.host
+        )
+    )
+    return won
 
 
 def write(run: Run, shard: int, attempt: str) -> Commit:
     """Write a shard of random rows; its commit record, not yet published."""
-    scenes, samples = tables_of(run.schema, run.layout, run.manifest.spec.seed, shard)
+    scenes, samples = rows_of(run, shard)
     files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
-    return commit_of(run, shard, attempt, run.write_shard(shard, attempt, files), int(samples["label"].sum()))
+    sums = dict(zip(REDRAW_CAUSES, scenes["redraws"].sum(axis=0).tolist(), strict=True))
+    redraws = {cause: count for cause, count in sums.items() if count}
+    entries = run.write_shard(shard, attempt, files)
+    return commit_of(run, shard, attempt, entries, int(samples["label"].sum()), redraws)
 
 
-def commit_of(run: Run, shard: int, attempt: str, files: tuple[FileEntry, ...], positives: int = 0) -> Commit:
+def commit_of(
+    run: Run,
+    shard: int,
+    attempt: str,
+    files: tuple[FileEntry, ...],
+    positives: int = 0,
+    redraws: Mapping[str, int] | None = None,
+) -> Commit:
     return Commit(
         shard=shard,
         attempt=attempt,
@@ -76,7 +101,7 @@ def commit_of(run: Run, shard: int, attempt: str, files: tuple[FileEntry, ...], 
         scenes=run.layout.scenes_per_shard,
         samples=run.layout.samples_per_shard,
         positives=positives,
-        redraws={},
+        redraws=dict(redraws or {}),
         files=files,
         cost=Cost(wall_s=1.0, cpu_s=1.0),
         host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
@@ -84,11 +109,18 @@ def commit_of(run: Run, shard: int, attempt: str, files: tuple[FileEntry, ...], 
     )
 
 
-def tables_of(schema: RecordSchema, layout: Layout, seed: int, shard: int) -> Tables:
+def rows_of(run: Run, shard: int) -> Tables:
+    """The rows that `write` gives this shard."""
+    return tables_of(run.schema, run.layout, run.manifest.spec.seed, shard, run.manifest.spec_hash)
+
+
+def tables_of(
+    schema: RecordSchema, layout: Layout, seed: int, shard: int, spec_hash: str = "0" * 64
+) -> Tables:
     """The rows of one shard. A scene's rows depend on seed and scene alone, as in a real run."""
     first = shard * layout.scenes_per_shard
     each = [
-        _scene(schema, layout.candidates_per_scene, seed, scene)
+        _scene(schema, layout.candidates_per_scene, seed, scene, spec_hash)
         for scene in range(first, first + layout.scenes_per_shard)
     ]
     scenes, samples = (
@@ -97,13 +129,14 @@ def tables_of(schema: RecordSchema, layout: Layout, seed: int, shard: int) -> Ta
     return scenes, samples
 
 
-def _scene(schema: RecordSchema, candidates: int, seed: int, scene: int) -> Tables:
+def _scene(schema: RecordSchema, candidates: int, seed: int, scene: int, spec_hash: str) -> Tables:
     rng = np.random.default_rng([seed, scene])
     scenes = {f.name: values_of(schema, f, 1, rng) for f in schema.scene_fields}
     samples = {f.name: values_of(schema, f, candidates, rng) for f in schema.sample_fields}
     scenes["scene_index"][:] = scene
     samples["sample_scene_index"][:] = scene
     samples["candidate_index"][:] = np.arange(candidates)
+    samples["sample_id"][:] = sample_ids(spec_hash, scene, np.arange(candidates))
     return scenes, samples
 
 

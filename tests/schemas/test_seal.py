@@ -15,11 +15,11 @@ from schemas import shard_files
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.seal import SEALED, seal
-from tests.made_runs import files_of, make_run, small_spec, tables_of, write
+from tests.made_runs import files_of, make_run, rows_of, small_spec, write
 
 
 def expected(run: Run, shards: list[int], scenes: int, samples: int) -> dict[str, np.ndarray]:
-    tables = [tables_of(run.schema, run.layout, run.manifest.spec.seed, shard) for shard in shards]
+    tables = [rows_of(run, shard) for shard in shards]
     out: dict[str, np.ndarray] = {}
     for t, rows in ((0, scenes), (1, samples)):
         out |= {k: np.concatenate([each[t][k] for each in tables])[:rows] for k in tables[0][t]}

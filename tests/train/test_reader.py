@@ -11,7 +11,7 @@ import pytest
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.seal import seal
-from tests.made_runs import make_run, small_spec, tables_of
+from tests.made_runs import make_run, rows_of, small_spec
 from train.reader import Batch, SampleReader
 
 ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
@@ -22,8 +22,8 @@ def ids(batches: list[Batch]) -> np.ndarray:
     return np.concatenate([b["sample_id"] for b in batches])
 
 
-def rows_of(run: Run) -> dict[str, np.ndarray]:
-    tables = [tables_of(run.schema, run.layout, run.manifest.spec.seed, k) for k in sorted(run.committed())]
+def stored_samples(run: Run) -> dict[str, np.ndarray]:
+    tables = [rows_of(run, k) for k in sorted(run.committed())]
     return {k: np.concatenate([t[1][k] for t in tables])[: run.n] for k in tables[0][1]}
 
 
@@ -33,7 +33,7 @@ def test_stored_order_gives_the_committed_rows_with_their_scenes(tmp_path: Path)
     assert (len(reader), reader.n_scenes) == (43, 9)
     batches = list(reader.epoch(10, buffer_shards=2))
     assert [len(b["label"]) for b in batches] == [10, 10, 10, 10, 3]
-    truth = rows_of(run)
+    truth = stored_samples(run)
     for name in SAMPLES:
         np.testing.assert_array_equal(np.concatenate([b[name] for b in batches]), truth[name])
     for b in batches:
@@ -47,7 +47,7 @@ def test_clouds_belong_to_their_samples_across_buffers(tmp_path: Path):
     reader = SampleReader([tmp_path], ("points_m",), SAMPLES)
     clouds: dict[int, np.ndarray] = {}
     for shard in run.committed():
-        scenes, _ = tables_of(run.schema, run.layout, 0, shard)
+        scenes, _ = rows_of(run, shard)
         clouds |= dict(zip(scenes["scene_index"].tolist(), scenes["points_m"], strict=True))
     for batch in reader.epoch(7, np.random.default_rng(0), buffer_shards=2):
         for scene, row in zip(batch["sample_scene_index"], batch["scene_row"], strict=True):
@@ -62,7 +62,7 @@ def test_a_seed_decides_the_order_and_an_epoch_has_every_sample_once(tmp_path: P
     )
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
-    truth = sorted(map(bytes, rows_of(run)["sample_id"]))
+    truth = sorted(map(bytes, stored_samples(run)["sample_id"]))
     assert sorted(map(bytes, one)) == sorted(map(bytes, other)) == truth
 
 
@@ -80,7 +80,7 @@ def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
     batches = list(sealed.shards())
     assert [len(b["label"]) for b in batches] == [10, 10, 8]
     assert len(sealed) == 28
-    truth = rows_of(run)
+    truth = stored_samples(run)
     np.testing.assert_array_equal(
         np.concatenate([b["distance_m"] for b in batches]), truth["distance_m"][:28]
     )
