@@ -50,7 +50,7 @@ def main() -> None:
         else:
             run = Run.open(options.run)
         started = time.perf_counter()
-        seal(run)
+        seal(run.storage)
         print(f"sealed {len(run.committed())} shards in {time.perf_counter() - started:.2f} s")
         _print_sizes(run)
         _print_rates(Path(run.storage.url))

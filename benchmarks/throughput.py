@@ -89,7 +89,7 @@ def run(
         ended_s = time.perf_counter()
         if summary.end != "complete":
             raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Mend that first")
-        seal(made)
+        seal(made.storage)
         sealed_s = time.perf_counter()
         commits = sorted(made.commits(), key=lambda c: c.created)
         return account(

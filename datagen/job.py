@@ -111,7 +111,7 @@ def finish(run: Run, summary: JobSummary, out: str) -> int:
         )
         rows.append(("quarantined", shown))
     if summary.end in ("complete", "failed") and run.committed():
-        sealed = seal(run)
+        sealed = seal(run.storage)
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
     print_rows(f"{summary.end}: {out}", rows)
     if summary.end == "aborted":

@@ -38,7 +38,8 @@ def status_report(run: Run) -> dict[str, Any]:
             causes[f"{entry.outcome}: {entry.cause}"] += 1
     unfinished = {start.attempt for start in run.ledger.unfinished()} - {c.attempt for c in commits}
     done = [c for c in commits if c.shard in planned]
-    root, absent = sealed_root(run), sorted(set(planned) - committed)
+    root, absent = sealed_root(run.storage), sorted(set(planned) - committed)
+    part = root.part(run.manifest.spec_hash) if root else None
     return {
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
@@ -60,8 +61,8 @@ def status_report(run: Run) -> dict[str, Any]:
         "attempts_without_end": len(unfinished),
         "causes": dict(causes.most_common(20)),
         # An older seal, of a shorter run or with fewer shards, does not count.
-        "sealed": root is not None and (root.n, root.missing_shards) == (run.n, absent),
-        "sealed_labels": root.n if root else None,
+        "sealed": part is not None and (part.n, part.missing_shards) == (run.n, absent),
+        "sealed_labels": part.n if part else None,
         "complete": len(committed & set(planned)) == len(planned),
     }
 

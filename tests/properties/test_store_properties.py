@@ -104,7 +104,7 @@ def test_metadata_of_any_bytes_is_read_or_refused(data: bytes):
 def test_shard_size_changes_no_sealed_array(n: int, one: int, other: int):
     with tempfile.TemporaryDirectory() as folder:
         groups = [
-            zarr.open(seal(make_run(Path(folder) / str(i), n=n, scenes_per_shard=size)), mode="r")
+            zarr.open(seal(make_run(Path(folder) / str(i), n=n, scenes_per_shard=size).storage), mode="r")
             for i, size in enumerate((one, other))
         ]
         assert set(groups[0].array_keys()) == set(groups[1].array_keys())
@@ -119,7 +119,7 @@ def test_the_order_of_commits_changes_no_byte_of_the_sealed_store(one: list[int]
     with tempfile.TemporaryDirectory() as folder:
         stores: list[dict[str, bytes]] = []
         for i, order in enumerate((one, other)):
-            path = seal(make_run(Path(folder) / str(i), n=27, shards=order))
+            path = Path(seal(make_run(Path(folder) / str(i), n=27, shards=order).storage))
             stores.append({str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()})
         assert stores[0] == stores[1]
 

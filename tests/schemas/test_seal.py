@@ -34,8 +34,8 @@ def assert_equal(group: zarr.Group, arrays: dict[str, np.ndarray]) -> None:
 
 def test_stock_zarr_reads_every_row_in_order(tmp_path: Path):
     run = make_run(tmp_path, n=43, shards=[4, 0, 2, 1, 3])
-    path = seal(run)
-    assert path == tmp_path / SEALED
+    path = seal(run.storage)
+    assert path == str(tmp_path / SEALED)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         group = zarr.open(path, mode="r")
@@ -47,7 +47,7 @@ def test_stock_zarr_reads_every_row_in_order(tmp_path: Path):
 
 def test_stock_xarray_reads_dimensions_units_and_values_without_a_warning(tmp_path: Path):
     run = make_run(tmp_path, n=43)
-    path = seal(run)
+    path = seal(run.storage)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         data = xarray.open_zarr(path, chunks=None)
@@ -64,35 +64,35 @@ def test_stock_xarray_reads_dimensions_units_and_values_without_a_warning(tmp_pa
 
 def test_missing_shards_are_packed_and_named(tmp_path: Path):
     run = make_run(tmp_path, n=48, shards=[1, 4])
-    group = zarr.open(seal(run), mode="r")
+    group = zarr.open(seal(run.storage), mode="r")
     assert_equal(group, expected(run, [1, 4], 4, 18))
     assert group.attrs["missing_shards"] == [0, 2, 3]
 
 
 def test_sealing_again_after_growth_replaces_the_store(tmp_path: Path):
     run = make_run(tmp_path, n=13)
-    seal(run)
+    seal(run.storage)
     grown = make_run(tmp_path, n=37)
-    assert_equal(zarr.open(seal(grown), mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
+    assert_equal(zarr.open(seal(grown.storage), mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
 
 
 def test_chunks_are_links_that_cannot_be_written(tmp_path: Path):
     run = make_run(tmp_path, n=20)
-    path = seal(run)
-    linked, own = path / "label" / "c.1", tmp_path / "shards/000001/a-1/label/c.0"
+    path = seal(run.storage)
+    linked, own = Path(path) / "label" / "c.1", tmp_path / "shards/000001/a-1/label/c.0"
     assert linked.samefile(own)
     assert own.stat().st_mode & 0o777 == 0o444
 
 
 def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_store(tmp_path: Path):
     with pytest.raises(InputError, match="no shard is committed"):
-        seal(make_run(tmp_path / "empty", shards=[]))
+        seal(make_run(tmp_path / "empty", shards=[]).storage)
     run = make_run(tmp_path / "run", n=20)
-    before = files_of(seal(run))
+    before = files_of(Path(seal(run.storage)))
     (tmp_path / "run/shards/000001/a-1/rgb/c.0.0.0").unlink()
     with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: missing"):
-        seal(run)
+        seal(run.storage)
     assert files_of(tmp_path / "run" / SEALED) == before
 
 
@@ -101,13 +101,13 @@ def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):
     commit = write(run, 1, "b")
     assert run.commit(commit.model_copy(update={"files": commit.files[:-1]}))
     with pytest.raises(InputError, match="lacks or adds 1 files"):
-        seal(run)
+        seal(run.storage)
 
 
 def test_what_a_killed_seal_leaves_does_not_disturb(tmp_path: Path):
     run = make_run(tmp_path, n=20)
     (tmp_path / f"{SEALED}.0123.partial" / "label").mkdir(parents=True)
-    assert_equal(zarr.open(seal(run), mode="r"), expected(run, [0, 1], 4, 20))
+    assert_equal(zarr.open(seal(run.storage), mode="r"), expected(run, [0, 1], 4, 20))
     assert Run.open(tmp_path).committed() == {0, 1}
 
 
@@ -120,7 +120,7 @@ def test_large_clouds_in_several_chunks_a_shard(tmp_path: Path):
         run.grow(75)
         for shard in run.missing():
             assert run.commit(write(run, shard, "a"))
-        group = zarr.open(seal(run), mode="r")
+        group = zarr.open(seal(run.storage), mode="r")
         assert_equal(group, expected(run, [0, 1, 2], 15, 75))
         assert group["points_m"].chunks[0] == 2
     shard_files._metadata.cache_clear()
@@ -145,12 +145,12 @@ def test_a_disk_that_fills_up_keeps_what_is_committed_and_goes_on_with_room(tiny
     for commit in Run.open(tiny_disk).commits():
         run.check_digests(commit)
     with pytest.raises(InputError, match="No space left on device"):
-        seal(run)
+        seal(run.storage)
     assert [p.name for p in tiny_disk.iterdir() if p.name.startswith(SEALED)] == []
     subprocess.run(["mount", "-o", "remount,size=64m", str(tiny_disk)], check=True)
     for shard in run.missing()[:2]:
         assert run.commit(write(run, shard, "b"))
-    group = zarr.open(seal(run), mode="r")
+    group = zarr.open(seal(run.storage), mode="r")
     shards = [*done, len(done), len(done) + 1]
     assert_equal(group, expected(run, shards, 2 * len(shards), 10 * len(shards)))
 
@@ -158,19 +158,19 @@ def test_a_disk_that_fills_up_keeps_what_is_committed_and_goes_on_with_room(tiny
 def test_two_jobs_that_seal_at_the_same_time_leave_one_whole_store(tmp_path: Path):
     """As when two drivers of one run see its last commit together."""
     run = make_run(tmp_path, n=20)
-    seal(run)
+    seal(run.storage)
     renames: list[Path] = []
     plain = Path.rename
 
     def rename(path: Path, target: Path) -> Path:
         if target == tmp_path / SEALED and not renames:
             renames.append(path)
-            seal(Run.open(tmp_path))  # the other one, between this one's two steps
+            seal(Run.open(tmp_path).storage)  # the other one, between this one's two steps
         return plain(path, target)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Path, "rename", rename)
-        seal(run)
+        seal(run.storage)
     assert renames
     assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(run, [0, 1], 4, 20))
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]

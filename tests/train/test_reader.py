@@ -74,7 +74,7 @@ def test_dropping_the_last_gives_equal_batches(tmp_path: Path):
 
 def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
     run = make_run(tmp_path / "run", n=48, shards=[0, 2, 4])
-    shutil.copytree(seal(run), tmp_path / "alone.zarr")
+    shutil.copytree(seal(run.storage), tmp_path / "alone.zarr")
     shutil.rmtree(tmp_path / "run/shards/000002")
     sealed = SampleReader([tmp_path / "alone.zarr"], ALL, SAMPLES)
     batches = list(sealed.shards())
@@ -159,7 +159,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     "text", ["", "{}", "[]", '{"attributes": {}}', '{"attributes": 3}', "[" * 100_000, '{"attributes": null}']
 )
 def test_a_sealed_store_with_a_broken_root_is_refused(tmp_path: Path, text: str):
-    path = seal(make_run(tmp_path, n=20))
+    path = Path(seal(make_run(tmp_path, n=20).storage))
     (path / "zarr.json").write_text(text)
     with pytest.raises(InputError, match="not the root of a sealed store"):
         SampleReader([path])
@@ -182,7 +182,7 @@ def test_a_sealed_store_with_a_broken_root_is_refused(tmp_path: Path, text: str)
     ],
 )
 def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path, old: str, new: str):
-    path = seal(make_run(tmp_path, n=20))
+    path = Path(seal(make_run(tmp_path, n=20).storage))
     meta = path / "distance_m" / "zarr.json"
     text = meta.read_text()
     assert old in text
@@ -193,6 +193,6 @@ def test_hostile_metadata_of_a_sealed_store_is_refused(tmp_path: Path, old: str,
 
 def test_a_run_may_be_named_like_a_store(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run.zarr", n=50)
-    seal(run)
+    seal(run.storage)
     assert len(SampleReader([tmp_path / "run.zarr"])) == 50
     assert len(SampleReader([tmp_path / "run.zarr" / "data.zarr"])) == 50

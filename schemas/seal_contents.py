@@ -1,0 +1,153 @@
+"""What a sealed store holds: which shards, in which order, and where their files lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+
+from schemas.errors import InputError
+from schemas.fields import Field, RecordSchema, Table
+from schemas.merged import open_runs, part_folder
+from schemas.run import Run, shard_folder
+from schemas.run_records import Commit, Layout
+from schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
+from schemas.storage import Storage
+
+
+@dataclass(frozen=True)
+class SealedShard:
+    """One committed shard and the rows that the store has of it."""
+
+    folder: str  # of its files, below the place
+    scenes: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class SealedRun:
+    """What one run gives to the store. `n` is read once: the run may grow meanwhile."""
+
+    run: Run
+    n: int
+    shards: tuple[int, ...]
+    missing_shards: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The rows of a store. `digests[k]` is over the bytes of the files of its first k shards."""
+
+    place: Storage
+    runs: tuple[SealedRun, ...]
+    shards: tuple[SealedShard, ...]
+    digests: tuple[str, ...]
+    schema: RecordSchema
+    layout: Layout
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether the rows are those of several runs."""
+        return len(self.runs) > 1
+
+    def rows(self, table: Table) -> int:
+        """Rows of a table in the whole store."""
+        return sum(shard.scenes if table == "scene" else shard.samples for shard in self.shards)
+
+    def chunks(self, field: Field) -> Iterator[tuple[int, str, str]]:
+        """Every chunk of an array: (its shard's place in the store, its key in the place, its file's name).
+
+        The name is that in the array's folder of the store.
+        """
+        table: Table = "scene" if field in self.schema.scene_fields else "sample"
+        rows = rows_per_shard(self.layout, table)
+        step = chunk_rows(self.schema, field, rows)
+        for position, shard in enumerate(self.shards):
+            wanted = shard.scenes if table == "scene" else shard.samples
+            for i in range(-(-wanted // step)):
+                source = f"{shard.folder}/{field.name}/{chunk_key(field, i)}"
+                yield position, source, chunk_key(field, position * (rows // step) + i)
+
+
+def read_contents(place: Storage, check: bool = True) -> Contents:
+    """What a store over the run or the merged runs at `place` holds now.
+
+    Rows of a run are those of its committed shards among the planned ones, in order; runs follow each
+    other. Only where the store ends are rows beyond n cut: all shards before are whole.
+
+    With `check`, InputError when a committed file is missing or of another size. Always when nothing is
+    committed, when a commit names other files than a shard has, or when merged runs cannot share arrays.
+    """
+    runs = open_runs(place)
+    first = runs[0]
+    for run in runs[1:]:
+        _refuse_other_arrays(first, run)
+    sealed: list[SealedRun] = []
+    shards: list[SealedShard] = []
+    digest = sha256()
+    digests = [digest.hexdigest()]
+    for run in runs:
+        n, done = run.n, list[int]()
+        below = f"{part_folder(run.manifest.spec_hash)}/" if len(runs) > 1 else ""
+        expected = _files_of_a_shard(run)
+        for commit in run.commits():
+            if commit.shard >= run.layout.shards_for(n):
+                continue
+            if check:
+                run.check_files(commit)
+            _refuse_odd_files(run, commit, expected)
+            done.append(commit.shard)
+            shards.append(
+                SealedShard(below + shard_folder(commit.shard, commit.attempt), commit.scenes, commit.samples)
+            )
+            digest.update(f"{run.manifest.spec_hash} {commit.shard}\n".encode())
+            for entry in sorted(commit.files, key=lambda e: e.path):
+                digest.update(f"{entry.path} {entry.sha256}\n".encode())
+            digests.append(digest.hexdigest())
+        absent = sorted(set(range(run.layout.shards_for(n))) - set(done))
+        sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
+    if not shards:
+        raise InputError(place.url, "commits", "no shard is committed", "Submit the run again")
+    last = next(part for part in reversed(sealed) if part.shards)
+    scenes, samples = last.run.layout.rows_wanted(last.shards[-1], last.n)
+    shards[-1] = SealedShard(shards[-1].folder, scenes, samples)
+    return Contents(place, tuple(sealed), tuple(shards), tuple(digests), first.schema, first.layout)
+
+
+def _refuse_other_arrays(first: Run, run: Run) -> None:
+    ours, theirs = first.schema, run.schema
+    pairs = {
+        "schema_name": (ours.name, theirs.name),
+        "schema_version": (ours.version, theirs.version),
+        "layout": (first.layout, run.layout),
+        "spec": (dict(ours.sizes), dict(theirs.sizes)),
+    }
+    for field, (one, other) in pairs.items():
+        if one != other:
+            raise InputError(
+                f"{run.storage.url}/manifest.json",
+                field,
+                f"{other}, where {first.storage.url} has {one}: one store cannot hold both",
+                "Read them as two runs",
+            )
+
+
+def _files_of_a_shard(run: Run) -> frozenset[str]:
+    files = set(group_metadata(run.schema, run.layout, run.manifest.spec_hash))
+    for table in TABLES:
+        rows = rows_per_shard(run.layout, table)
+        for field in run.schema.table(table):
+            count = rows // chunk_rows(run.schema, field, rows)
+            files |= {f"{field.name}/{chunk_key(field, i)}" for i in range(count)}
+    return frozenset(files)
+
+
+def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> None:
+    odd = sorted(expected ^ {entry.path for entry in commit.files})
+    if odd:
+        raise InputError(
+            f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}",
+            "files",
+            f"the commit lacks or adds {len(odd)} files, first {odd[0]}",
+            "Remove this shard's commit and submit the run again",
+        )

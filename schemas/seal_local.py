@@ -1,0 +1,151 @@
+"""A sealed store on a local disk: hard links to the shards' files, put in place by one rename."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from schemas.errors import InputError
+from schemas.fields import Field
+from schemas.seal_contents import Contents
+from schemas.seal_metadata import SEALED
+from schemas.shard_files import TABLES
+from schemas.storage import storage_error
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+_TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
+# What a kernel or a file system answers that cannot exchange two names.
+_CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+
+
+def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes]) -> None:
+    """Make `folder`/data.zarr from the chunks of the contents and the metadata, at once and whole.
+
+    The store is completed and made durable beside it, as data.zarr.<hex>.partial, and then takes the
+    name. Where one stands, the two exchange their names in one step (Linux: renameat2), so that every
+    moment has a whole store under the name; only where that is not to be had, the old one steps aside
+    first, and a kill between the two renames leaves none. InputError when the disk refuses.
+    """
+    draft = draft_of(folder)
+    try:
+        _write(draft, metadata)
+        for table in TABLES:
+            for field in contents.schema.table(table):
+                _link(contents, field, draft)
+        _sync_folders(draft)
+        old = _take_the_name(draft, folder / SEALED)
+        _sync_folder(folder)
+        remove_tree(old)
+    except OSError as e:
+        raise storage_error(e.filename or draft, e) from e
+    finally:
+        remove_tree(draft)
+
+
+def unseal_folder(folder: Path) -> None:
+    """Remove `folder`/data.zarr: first its name, then what it was. InputError when the disk refuses."""
+    draft = draft_of(folder)
+    try:
+        (folder / SEALED).rename(draft)
+        _sync_folder(folder)
+    except FileNotFoundError:
+        return  # another process was first
+    except OSError as e:
+        raise storage_error(folder / SEALED, e) from e
+    remove_tree(draft)
+
+
+def draft_of(folder: Path) -> Path:
+    """A new name for a store that is not complete or not wanted any more; `gc` knows such names."""
+    return folder / f"{SEALED}.{secrets.token_hex(8)}.partial"
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder, a file or a link as far as the disk lets."""
+    if path.is_symlink() or path.is_file():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _write(draft: Path, files: Mapping[str, bytes]) -> None:
+    for path, data in files.items():
+        target = draft / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("xb") as f:
+            f.write(data)
+            f.flush()
+            os.fsync(f.fileno())
+
+
+def _link(contents: Contents, field: Field, draft: Path) -> None:
+    for _, source, name in contents.chunks(field):
+        contents.place.link_or_copy(source, f"{draft.name}/{field.name}/{name}")
+        target = draft / field.name / name
+        mode = target.lstat().st_mode
+        if not stat.S_ISREG(mode):
+            place = f"{contents.place.url}/{source}"
+            raise InputError(place, "", "not a plain file", "Restore the file from a copy")
+        if mode & 0o777 != 0o444:
+            target.chmod(0o444)
+
+
+def _sync_folders(draft: Path) -> None:
+    for path in (*(p for p in draft.iterdir() if p.is_dir()), draft):
+        _sync_folder(path)
+
+
+def _sync_folder(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _take_the_name(draft: Path, sealed: Path) -> Path:
+    """Give the finished store its name; what an older one is called by then.
+
+    Whoever unseals, or seals for another job of the run, may be between any two lines here.
+    """
+    while True:
+        try:
+            draft.rename(sealed)  # onto nothing, or onto an empty folder
+            return draft
+        except OSError as e:
+            if e.errno not in _TAKEN:
+                raise
+        with suppress(FileNotFoundError):
+            if _exchange(draft, sealed):
+                return draft
+            old = draft_of(sealed.parent)
+            sealed.rename(old)
+            try:
+                draft.rename(sealed)
+                return old
+            except OSError as e:
+                if e.errno not in _TAKEN:
+                    old.rename(sealed)
+                    raise
+                remove_tree(old)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two existing files or folders exchange their names in one step; False where that is unknown."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in _CANNOT_EXCHANGE:
+        return False
+    raise OSError(code, os.strerror(code), str(one), None, str(other))

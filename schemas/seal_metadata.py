@@ -1,0 +1,85 @@
+"""The zarr.json files of a sealed store, and what its root says of the runs below it."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from typing import Any
+
+import zarr
+from pydantic import BaseModel, ValidationError
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore
+
+from schemas.record_files import MAX_RECORD_BYTES
+from schemas.seal_contents import Contents, SealedRun
+from schemas.shard_files import TABLES, root_attributes, zarr_metadata
+from schemas.storage import Storage
+
+SEALED = "data.zarr"
+ROOT = "zarr.json"
+
+
+class SealedPart(BaseModel):
+    """One run in a sealed store: what it wanted, and the shards among them that were not there."""
+
+    spec_hash: str
+    n: int
+    missing_shards: list[int]
+
+
+class SealedRoot(BaseModel):
+    """What the root zarr.json of a sealed store says; one part for an ordinary run."""
+
+    parts: list[SealedPart]
+    # sha256 over the digests of all files that its shards have, in order; "" where it is not told.
+    rows_sha256: str = ""
+
+    def part(self, spec_hash: str) -> SealedPart | None:
+        """What it says of one run; None where it has nothing of it."""
+        return next((part for part in self.parts if part.spec_hash == spec_hash), None)
+
+
+def sealed_root(place: Storage) -> SealedRoot | None:
+    """What data.zarr at `place` says of itself, or None where it does not exist or is not ours."""
+    data = place.get(f"{SEALED}/{ROOT}", MAX_RECORD_BYTES)
+    if data is None:
+        return None
+    try:
+        attributes = json.loads(data)["attributes"]
+        if "parts" not in attributes:  # an ordinary run's
+            attributes = {"parts": [attributes], "rows_sha256": attributes.get("rows_sha256", "")}
+        return SealedRoot.model_validate(attributes)
+    except (ValueError, KeyError, TypeError, RecursionError, ValidationError):
+        return None
+
+
+def sealed_metadata(contents: Contents) -> dict[str, bytes]:
+    """zarr.json files of the store by path, the root's with consolidated metadata."""
+    first = contents.runs[0]
+    attributes = root_attributes(contents.schema, contents.layout, first.run.manifest.spec_hash)
+    if contents.is_merged:
+        del attributes["spec_hash"]
+        attributes["parts"] = [_part(run) for run in contents.runs]
+    else:
+        attributes |= _part(first)
+    attributes["rows_sha256"] = contents.digests[-1]
+    rows = {table: contents.rows(table) for table in TABLES}
+    files = zarr_metadata(contents.schema, contents.layout, rows, attributes)
+    make = default_buffer_prototype().buffer.from_bytes
+    store = {path: make(data) for path, data in files.items()}
+    with warnings.catch_warnings():
+        # Consolidated metadata is not yet in the Zarr v3 text; every reader we name knows it.
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(MemoryStore(store), zarr_format=3)
+    return {path: buffer.to_bytes() for path, buffer in store.items()}
+
+
+def _part(sealed: SealedRun) -> dict[str, Any]:
+    return {
+        "spec_hash": sealed.run.manifest.spec_hash,
+        "n": sealed.n,
+        "shards": len(sealed.shards),
+        "missing_shards": list(sealed.missing_shards),
+        "specification": sealed.run.manifest.spec.model_dump(mode="json"),
+    }
