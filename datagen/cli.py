@@ -28,6 +28,8 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
 VERBS: dict[str, tuple[str, str]] = {
     "submit": ("datagen.submit:submit", "Make labels: start a run, or resume it."),
     "status": ("datagen.status:status", "How far a run is, and what failed."),
+    "seal": ("datagen.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
+    "unseal": ("datagen.seal:unseal", "Remove that store; the run keeps every shard."),
     "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
     "show": ("datagen.show:show", "A picture of one scene of a run."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),

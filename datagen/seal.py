@@ -1,0 +1,63 @@
+"""`datagen seal` and `datagen unseal`: make or remove the one store that stock readers open."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from datagen.console import print_rows
+from schemas.merged import open_runs
+from schemas.seal import SEALED, SealedRoot, sealed_root
+from schemas.seal import seal as seal_place
+from schemas.seal import unseal as unseal_place
+from schemas.storage import open_storage
+
+
+def seal(
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+) -> int:
+    """Lay one flat Zarr store, data.zarr, over the committed shards, also of an unfinished run.
+
+    Chunks are hard links, or copies by the S3 server. An older store stays whole until the new one is.
+    """
+    storage = open_storage(run, probe=False, create=False)
+    address = seal_place(storage)
+    rows = [("store", f"{address}: zarr.open or xarray.open_zarr reads it")]
+    root = sealed_root(storage)
+    if root is not None:
+        rows += _told(root)
+    print_rows(f"sealed: {run}", rows)
+    return 0
+
+
+def unseal(
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+) -> int:
+    """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again."""
+    storage = open_storage(run, probe=False, create=False)
+    open_runs(storage)  # a folder that is no run is not touched
+    root = sealed_root(storage)
+    was_there = next(iter(storage.list(SEALED)), None) is not None
+    unseal_place(storage)
+    rows = (
+        [("removed", f"{storage.url}/{SEALED}")] if was_there else [("nothing to do", f"no {SEALED} there")]
+    )
+    if root is not None:
+        rows += _told(root)
+    print_rows(f"unsealed: {run}", rows)
+    return 0
+
+
+def _told(root: SealedRoot) -> list[tuple[str, str]]:
+    """What a store holds and lacks, run by run."""
+    rows: list[tuple[str, str]] = []
+    for part in root.parts:
+        head = f"run {part.spec_hash[:16]}"
+        absent = part.missing_shards
+        if absent:
+            shown = ", ".join(map(str, absent[:10])) + (", ..." if len(absent) > 10 else "")
+            rows.append((head, f"{part.n:,} labels wanted; without {len(absent)} of its shards: {shown}"))
+        else:
+            rows.append((head, f"{part.n:,} labels, every shard"))
+    return rows
