@@ -42,12 +42,13 @@ class StoredFile:
     """One listed file: its key below the storage's root, its size in bytes, and its change stamp.
 
     Equal stamps of one key mean equal bytes: the store's entity tag, or what the file system notes of
-    the file (inode, time and size).
+    the file (inode, time and size). `modified_s` is when it was last written, in seconds since 1970 UTC.
     """
 
     key: str
     size: int
     stamp: str = ""
+    modified_s: float = 0.0
 
 
 class Storage:
@@ -145,7 +146,8 @@ class Storage:
         try:
             for group in obstore.list(self._store, prefix):
                 for entry in group:
-                    yield StoredFile(str(entry["path"]), int(entry["size"]), _stamp(entry))
+                    modified_s = entry["last_modified"].timestamp()
+                    yield StoredFile(str(entry["path"]), int(entry["size"]), _stamp(entry), modified_s)
         except _FAILURES as e:
             self._refuse(prefix, e)
 
