@@ -91,7 +91,7 @@ def specify(
             raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
     load_settler(spec.settle.engine)
     load_renderer(spec.observation.renderer)
-    return spec.model_copy(update={"engines": _scene_engines(spec) | label_engines(spec.label_source)})
+    return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
 
 
 def read_fields(config: Path | None) -> dict[str, Any]:
@@ -148,7 +148,8 @@ def label_engines(label_source: str) -> dict[str, str]:
     }
 
 
-def _scene_engines(spec: Specification) -> dict[str, str]:
+def scene_engines(spec: Specification) -> dict[str, str]:
+    """Versions here of what moves bits of the scenes and candidates of this specification."""
     packages = sorted(scene_engine_names(spec) - {"scenes"})
     return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 

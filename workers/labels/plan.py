@@ -2,33 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from schemas.cost import StageClock
 from schemas.fields import OUTCOMES
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates
+from workers.geometry.mesh import F64
 from workers.labels import distance_visibility
 from workers.labels.source import Columns, LabelSource
 from workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, target_tcp, try_candidate
+from workers.motion.plan import MotionPlan
 from workers.scenes.scene import SettledScene
 
 VERSION = 1
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
 
-def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
-    """The columns of the heuristic, and what planning found out about every candidate."""
-    return label_with_trials(scene, candidates, spec, clock)[0]
+def label(
+    scene: SettledScene,
+    candidates: Candidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
+) -> Columns:
+    """The columns of the heuristic, and what planning found out; `rows` chooses candidates."""
+    return label_with_trials(scene, candidates, spec, clock, rows)[0]
 
 
 def label_with_trials(
-    scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock
+    scene: SettledScene,
+    candidates: Candidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
 ) -> tuple[Columns, list[CandidateTrial]]:
-    """The columns of `plan`, and the trials they were read from, one a candidate."""
+    """The columns of `plan`, and the trials they were read from, one a candidate of `rows` (default: all)."""
     columns = distance_visibility.label(scene, candidates, spec, clock)
+    if rows is None:
+        rows = range(len(candidates))
+    else:
+        columns = {name: values[list(rows)] for name, values in columns.items()}
     columns["heuristic_label"] = columns["label"]
-    n = len(candidates)
+    n = len(rows)
     columns |= {
         "outcome": np.zeros(n, np.uint8),
         "grasps_free": np.zeros(n, np.int16),
@@ -41,30 +59,32 @@ def label_with_trials(
     }
     arms: dict[tuple[float, float], ArmInScene] = {}
     trials: list[CandidateTrial] = []
-    for row in range(n):
+    for k, row in enumerate(rows):
         key = (float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row]))
         if key not in arms:
             arms[key] = arm_in_scene(scene, candidates, row, spec, clock)
         trial = try_candidate(arms[key], candidates, row, spec)
         trials.append(trial)
-        _write(columns, row, arms[key], candidates, trial)
+        _write(columns, k, trial)
+        if trial.plan is not None:
+            _write_plan(columns, k, arms[key], arms[key].base_pose(candidates, row), trial.plan)
     columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
     return columns, trials
 
 
-def _write(columns: Columns, row: int, at: ArmInScene, candidates: Candidates, trial: CandidateTrial) -> None:
-    columns["outcome"][row] = _CODES[trial.outcome]
+def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:
+    columns["outcome"][k] = _CODES[trial.outcome]
     if trial.report is not None:
-        columns["grasps_free"][row] = trial.report.grasps_free
-        columns["grasps_tried"][row] = trial.report.grasps_tried
-    plan = trial.plan
-    if plan is None:
-        return
-    columns["T_target_tcp"][row] = target_tcp(at, at.base_pose(candidates, row), plan)
-    columns["grasp_score"][row] = at.grasps.score[plan.grasp]
-    columns["q_grasp_rad"][row] = plan.q_approach_rad[-1]
-    columns["path_length_rad"][row] = plan.length_rad
-    columns["path_clearance_m"][row] = plan.clearance_m
+        columns["grasps_free"][k] = trial.report.grasps_free
+        columns["grasps_tried"][k] = trial.report.grasps_tried
 
 
-PLAN = LabelSource("plan", VERSION, "plan", label)
+def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> None:
+    columns["T_target_tcp"][k] = target_tcp(at, T_world_base, plan)
+    columns["grasp_score"][k] = at.grasps.score[plan.grasp]
+    columns["q_grasp_rad"][k] = plan.q_approach_rad[-1]
+    columns["path_length_rad"][k] = plan.length_rad
+    columns["path_clearance_m"][k] = plan.clearance_m
+
+
+PLAN = LabelSource("plan", VERSION, "plan", label, label)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from schemas.cost import StageClock
@@ -14,9 +16,15 @@ from workers.scenes.scene import SettledScene
 VERSION = 1
 
 
-def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
-    """The columns of `plan`, decided by execution, and what the trials measured."""
-    columns, trials = plan.label_with_trials(scene, candidates, spec, clock)
+def label(
+    scene: SettledScene,
+    candidates: Candidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
+) -> Columns:
+    """The columns of `plan`, decided by execution, and what trials measured; `rows` chooses candidates."""
+    columns, trials = plan.label_with_trials(scene, candidates, spec, clock, rows)
 
     def column(dtype: str, values: list[float]) -> np.ndarray:
         return np.array(values, dtype)
@@ -33,4 +41,4 @@ def label(scene: SettledScene, candidates: Candidates, spec: Specification, cloc
     return columns
 
 
-SIM = LabelSource("sim", VERSION, "sim", label)
+SIM = LabelSource("sim", VERSION, "sim", label, label)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,10 +22,22 @@ class LabelSource:
 
     `label` returns, one row a candidate, the columns of the schema that the candidate alone does
     not decide: `label` and whatever explains it. `schema` names the record schema of its store,
-    and `version` rises whenever the same input may give another label.
+    and `version` rises whenever the same input may give another label. Where labels are slow,
+    `label_rows` gives those of some candidates alone, with the same values.
     """
 
     name: str
     version: int
     schema: str
     label: Callable[[SettledScene, Candidates, Specification, StageClock], Columns]
+    label_rows: (
+        Callable[[SettledScene, Candidates, Specification, StageClock, Sequence[int]], Columns] | None
+    ) = None
+
+    def columns(
+        self, scene: SettledScene, candidates: Candidates, spec: Specification, rows: Sequence[int]
+    ) -> Columns:
+        """The columns of the candidates `rows`, as `label` gives them among all."""
+        if self.label_rows is not None:
+            return self.label_rows(scene, candidates, spec, StageClock(), rows)
+        return {name: a[list(rows)] for name, a in self.label(scene, candidates, spec, StageClock()).items()}

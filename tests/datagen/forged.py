@@ -1,0 +1,43 @@
+"""Runs whose every digest is right and whose rows are not: what only a recomputation finds."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.record_files import encode_record
+from schemas.run import Run, commit_copy_key, commit_key, shard_folder
+from schemas.shard_files import encode_shard
+from schemas.shard_reading import committed_place, read_metadata
+
+Columns = dict[str, np.ndarray[Any, Any]]
+
+
+def forge(source: Path, out: Path, shard: int, change: Callable[[Columns], None]) -> Run:
+    """A copy of a run in which `change` has altered the arrays of one shard, with a commit that says so."""
+    shutil.copytree(source, out)
+    run = Run.open(out)
+    arrays = arrays_of_shard(run, shard)
+    change(arrays)
+    scenes = {f.name: arrays[f.name] for f in run.schema.scene_fields}
+    samples = {f.name: arrays[f.name] for f in run.schema.sample_fields}
+    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+    commit = run.commit_of(shard)
+    entries = run.write_shard(shard, "forged", files)
+    forged = encode_record(commit.model_copy(update={"attempt": "forged", "files": entries}))
+    for key in (commit_copy_key(shard, "forged"), commit_key(shard)):
+        run.storage.put(key, forged)
+    return Run.open(out)
+
+
+def arrays_of_shard(run: Run, shard: int) -> Columns:
+    """All arrays of a committed shard, writable."""
+    commit = run.commit_of(shard)
+    folder = shard_folder(shard, commit.attempt)
+    place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)
+    names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
+    return {k: v.copy() for k, v in place.read(read_metadata(run.storage, folder, names).values()).items()}
