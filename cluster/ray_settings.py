@@ -65,6 +65,7 @@ def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
         "--include-dashboard=true",
         "--dashboard-host=127.0.0.1",
         f"--dashboard-port={dashboard_port}",
+        "--dashboard-agent-listen-port=0",
         # Fixed by default: two heads on one machine would share the port, and each other's clients.
         f"--ray-client-server-port={_free_port()}",
         f"--num-cpus={workers}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 from cluster.task import AttemptReport
@@ -56,6 +56,12 @@ class Tally:
         self.quarantined += 1
         if len(self.quarantined_shards) < _NAMED:
             self.quarantined_shards.append(shard)
+
+    def plus(self, other: Tally) -> Tally:
+        """Both together, as the tally of one job over several runs."""
+        sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(Tally)}
+        sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
+        return Tally(**sums)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,52 @@
+"""Giving shards that were given up another chance: the record steps aside and stays as history."""
+
+from __future__ import annotations
+
+import re
+from itertools import count
+
+from schemas.errors import InputError
+from schemas.record_files import MAX_RECORD_BYTES, read_record
+from schemas.run import Run
+from schemas.run_records import QuarantineRecord
+
+_LIFTED = re.compile(r"quarantine/([0-9]{6,18})\.lifted-([1-9][0-9]{0,8})\.json")
+
+
+def lift_quarantine(run: Run) -> list[int]:
+    """Let every shard in quarantine be tried again; their numbers.
+
+    A record moves to `quarantine/<shard>.lifted-<k>.json`. It is written there first, so that a kill
+    in between leaves the shard in quarantine and nothing doubled.
+    """
+    shards = sorted(run.quarantined())
+    for shard in shards:
+        key = f"quarantine/{shard:06d}.json"
+        data = run.storage.get(key, MAX_RECORD_BYTES)
+        if data is None:
+            continue  # somebody else lifted it
+        # A store of these very bytes is one that was cut short: it succeeds.
+        next(k for k in count(1) if run.storage.put_new(_lifted_key(shard, k), data))
+        run.storage.delete([key])
+    return shards
+
+
+def lifted_records(run: Run) -> list[QuarantineRecord]:
+    """Records of quarantines that were lifted, in order of shards and time. InputError as `read_record`."""
+    found: list[tuple[int, int]] = []
+    for file in run.storage.list("quarantine"):
+        if name := _LIFTED.fullmatch(file.key):
+            found.append((int(name[1]), int(name[2])))
+    records: list[QuarantineRecord] = []
+    for shard, k in sorted(found):
+        record = read_record(run.storage, _lifted_key(shard, k), QuarantineRecord)
+        if record is not None and record.shard != shard:
+            place = f"{run.storage.url}/{_lifted_key(shard, k)}"
+            raise InputError(place, "shard", f"{record.shard}, not {shard}", "Remove this foreign file")
+        if record is not None:
+            records.append(record)
+    return records
+
+
+def _lifted_key(shard: int, k: int) -> str:
+    return f"quarantine/{shard:06d}.lifted-{k}.json"
