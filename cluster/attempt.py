@@ -39,7 +39,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
         run.ledger.start(task.attempt, task.shard)
     stored = None if source is None else read_scenes(source, task.scene_indices)
     with _ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
-        made = run_shard(task.spec, world, task.scene_indices, stored)
+        made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with _ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files)

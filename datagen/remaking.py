@@ -48,7 +48,7 @@ def remake(run: Run, shard: int, origin: Origin) -> ShardResult:
     first = shard * run.layout.scenes_per_shard
     scenes = range(first, first + run.layout.scenes_per_shard)
     stored = None if origin.scenes is None else read_scenes(origin.scenes, scenes)
-    return run_shard(run.manifest.spec, origin.world, scenes, stored)
+    return run_shard(run.manifest.spec, origin.world, scenes, stored, run.schema.version)
 
 
 def remade_files(run: Run, made: ShardResult) -> dict[str, bytes]:

@@ -9,17 +9,31 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from cluster.ray_executor import refuse_unreachable
 from datagen import __version__
 from datagen.arms import arm_versions, refuse_missing_packages
-from datagen.doctor.engines import probe_render_device
-from datagen.job import JobSettings, finish, run_job
+from datagen.detach import detach_job
+from datagen.going_on import go_on, refuse_unusable_engines
+from datagen.job import Work
+from datagen.job_options import (
+    DEFAULT_SHARE,
+    Address,
+    Detach,
+    JsonLines,
+    MaxQuarantined,
+    Placing,
+    Workers,
+    absolute_place,
+    absolute_source,
+    resumable,
+    words_of,
+)
 from datagen.specify import layout_of, specify
 from datagen.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
+from schemas.merged import MERGED
 from schemas.record_files import now
 from schemas.run import Run
 from schemas.run_records import Layout, Manifest
@@ -28,7 +42,6 @@ from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.labels import load_label_source
 from workers.objects import open_objects
-from workers.robots import gripper_of
 from workers.scenes.draw import draw_scene
 from workers.world import World, assemble_world, open_world
 
@@ -88,15 +101,11 @@ def submit(
     ] = None,
     noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
-    workers: Annotated[
-        int | None,
-        WHOLE_NUMBER,
-        Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
-    ] = None,
-    address: Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")] = "local",
-    json: Annotated[
-        bool, Parameter(negative=(), help="Report progress as JSON lines, also on a terminal.")
-    ] = False,
+    workers: Workers = None,
+    address: Address = "local",
+    max_quarantined: MaxQuarantined = DEFAULT_SHARE,
+    detach: Detach = False,
+    json: JsonLines = False,
 ) -> int:
     """Make labels: start a run, or go on with the one that is in the folder.
 
@@ -108,12 +117,29 @@ def submit(
     load_label_source(label_source)  # refuses an unknown one
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
-    if workers is not None and not 0 <= workers <= 4096:
-        raise InputError(
-            "--workers", str(workers), "is not between 0 and 4096", "Leave it out for one a core"
-        )
-    if workers != 0:
-        refuse_unreachable(address)
+    placing = Placing(workers, address, json, max_quarantined, detach)
+    placing.refuse_bad()
+    said = {
+        "--n": n,
+        "--out": absolute_place(out),
+        "--houses": houses and absolute_source(houses),
+        "--objects": objects and absolute_source(objects),
+        "--scenes-from": scenes_from and absolute_place(scenes_from),
+        "--robot": robot,
+        "--perturb": perturb,
+        "--candidates": candidates,
+        "--candidates-per-scene": candidates_per_scene,
+        "--robots-per-scene": robots_per_scene,
+        "--split": split,
+        "--seed": seed,
+        "--settler": settler,
+        "--renderer": renderer,
+        "--noise": noise,
+        "--config": config and config.expanduser().absolute(),
+    }
+    words = ["submit", label_source, *words_of(said), *placing.words()]
+    if detach and address != "local":
+        return detach_job(words, out, placing)  # sources lie where the cluster is
     decide_scenes = {
         "--seed": seed,
         "--split": split,
@@ -133,33 +159,44 @@ def submit(
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
     }
-    if scenes_from is None:
-        houses, objects = houses or "builtin", objects or "builtin"
-        house_source, object_source = open_houses(houses), open_objects(objects)
-        spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
-        world = assemble_world(spec, house_source, object_source, houses, objects)
-        _refuse_broken_robot(spec)
-        if address == "local" and spec.observation.renderer == "sapien":
-            _refuse_no_render_device()
-        if not (Path(out) / "manifest.json").exists():
-            _refuse_no_scene(world, houses)
-        source_url, layout = "", layout_of(spec, n)
-    else:
-        stored = open_stored_scenes(scenes_from, houses, objects, decide_scenes)
-        spec = specify_again(label_source, stored, config, robot, perturb)
-        houses, objects = stored.houses, stored.objects
-        open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
-        _refuse_broken_robot(spec)
-        existing = Run.open(out).layout if (Path(out) / "manifest.json").exists() else None
-        source_url, layout = stored.run.storage.url, existing or layout_again(spec, stored, n)
-        refuse_too_few(stored, layout, n)
-    settings = JobSettings(_absolute(houses), _absolute(objects), workers, address, json, source_url)
-    sources = {"houses": settings.houses, "objects": settings.objects}
-    if source_url:
-        sources["scenes_from"] = source_url
-    run = Run.create_or_open(open_storage(out), manifest_of(spec, layout, sources), n)
-    summary = run_job(run, settings)
-    return finish(run, summary, out)
+    with resumable([*words, *words_of({"--address": None if address == "local" else address})]):
+        if scenes_from is None:
+            houses, objects = houses or "builtin", objects or "builtin"
+            house_source, object_source = open_houses(houses), open_objects(objects)
+            spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
+            world = assemble_world(spec, house_source, object_source, houses, objects)
+            refuse_unusable_engines(spec, address)
+            if _layout_there(out) is None:
+                _refuse_no_scene(world, houses)
+            source_url, layout = "", layout_of(spec, n)
+        else:
+            stored = open_stored_scenes(scenes_from, houses, objects, decide_scenes)
+            spec = specify_again(label_source, stored, config, robot, perturb)
+            houses, objects = stored.houses, stored.objects
+            open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
+            refuse_unusable_engines(spec, address)
+            source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
+            refuse_too_few(stored, layout, n)
+        sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
+        if source_url:
+            sources["scenes_from"] = source_url
+        run = Run.create_or_open(open_storage(out), manifest_of(spec, layout, sources), n)
+    if detach:
+        return detach_job(words, out, placing)
+    work = Work(run, sources["houses"], sources["objects"], source_url)
+    return go_on(run.storage, out, [work], placing)
+
+
+def _layout_there(out: str) -> Layout | None:
+    """The layout of the run that is there; None where there is none yet. InputError for merged runs."""
+    try:
+        storage = open_storage(out, probe=False, create=False)
+    except InputError:
+        return None  # nothing there, or what `open_storage` will refuse with its own words
+    if storage.exists(MERGED):
+        mend = "Give it more with `datagen extend`, or choose another --out"
+        raise InputError(out, "", "runs were merged here, and each has a specification of its own", mend)
+    return Run.open(storage).layout if storage.exists("manifest.json") else None
 
 
 def _refuse_no_scene(world: World, houses: str) -> None:
@@ -170,20 +207,20 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 
 
-def _refuse_broken_robot(spec: Specification) -> None:
-    """Open the robot here: where its files cannot be used, every shard would fail."""
-    if spec.arm is not None:
-        gripper_of(spec.arm.robot)
+def manifest_of(
+    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
+) -> Manifest:
+    """The manifest of a new run in shards of this layout.
 
-
-def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) -> Manifest:
-    """The manifest of a new run in shards of this layout."""
+    `schema_version` is that of the run whose scenes are taken: what their rows lack cannot be stored.
+    """
     source = load_label_source(spec.label_source)
+    newest = SCHEMAS[source.schema].version
     return Manifest(
         spec=spec,
         spec_hash=spec.hash(),
         schema_name=source.schema,
-        schema_version=SCHEMAS[source.schema].version,
+        schema_version=newest if schema_version is None else min(schema_version, newest),
         layout=layout,
         code_version=__version__,
         libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
@@ -191,18 +228,6 @@ def manifest_of(spec: Specification, layout: Layout, sources: dict[str, str]) ->
         created=now(),
         sources=sources,
     )
-
-
-def _refuse_no_render_device() -> None:
-    """Every scene would fail, and a run of another renderer is another run: better now."""
-    device = probe_render_device()
-    if not device.succeeded:
-        raise InputError(
-            "--renderer",
-            "sapien",
-            f"no render device here ({device.text})",
-            "Take embree, or see `datagen doctor`",
-        )
 
 
 def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:
@@ -228,11 +253,3 @@ def _per_scene(text: str | None) -> int | str | None:
             "--candidates-per-scene", text, "is neither grid nor a number from 1 to 625", "Give 60, or grid"
         )
     return int(text)
-
-
-def _absolute(ref: str) -> str:
-    """A source reference with its file or folder made absolute: workers run elsewhere."""
-    kind, _, text = ref.partition(":")
-    # What names no file is a parameter of the source, as in builtin:400.
-    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
-    return f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref

@@ -7,7 +7,7 @@ from the tables below.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +16,10 @@ from schemas.errors import InputError, choices
 from schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
+
+# Of all schemas. It rises when fields are added, which then say so by `since`; fields never go or change.
+SCHEMA_VERSION = 2
+OLDEST_SCHEMA_VERSION = 2
 
 # Causes for which a scene is drawn again; their order is part of the data format.
 REDRAW_CAUSES = (
@@ -56,7 +60,8 @@ class Field:
     """One array of a store.
 
     `dims` names the axes after the table's own ("scene" or "sample"); their lengths are given by
-    `RecordSchema.sizes`. `low` and `high` bound every finite value (closed interval).
+    `RecordSchema.sizes`. `low` and `high` bound every finite value (closed interval). `since` is the
+    schema version that brought it: runs of an older one go on without it.
     """
 
     name: str
@@ -68,6 +73,7 @@ class Field:
     low: float | None = None
     high: float | None = None
     codes: tuple[str, ...] = ()  # what the values 0, 1, ... mean
+    since: int = OLDEST_SCHEMA_VERSION
 
     @property
     def is_text(self) -> bool:
@@ -76,13 +82,17 @@ class Field:
 
 @dataclass(frozen=True)
 class RecordSchema:
-    """The arrays of one label source and the lengths of their axes."""
+    """The arrays of one label source and the lengths of their axes.
+
+    `later` names the fields that newer versions have; they are made and not stored.
+    """
 
     name: str
     version: int
     scene_fields: tuple[Field, ...]
     sample_fields: tuple[Field, ...]
     sizes: Mapping[str, int] = field(default_factory=dict)
+    later: frozenset[str] = frozenset()
 
     def table(self, table: Table) -> tuple[Field, ...]:
         return self.scene_fields if table == "scene" else self.sample_fields
@@ -93,8 +103,17 @@ class RecordSchema:
 
     def sized(self, **sizes: int) -> RecordSchema:
         """The schema with axis lengths of one specification (points, objects)."""
-        merged = {**self.sizes, **sizes}
-        return RecordSchema(self.name, self.version, self.scene_fields, self.sample_fields, merged)
+        return replace(self, sizes={**self.sizes, **sizes})
+
+    def at(self, version: int) -> RecordSchema:
+        """The schema as that version had it."""
+        scene, sample = (
+            tuple(f for f in fields if f.since <= version)
+            for fields in (self.scene_fields, self.sample_fields)
+        )
+        kept = {f.name for f in (*scene, *sample)}
+        later = frozenset(f.name for f in (*self.scene_fields, *self.sample_fields)) - kept
+        return replace(self, version=version, scene_fields=scene, sample_fields=sample, later=later)
 
     def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Refuse a batch that lacks a field, has a foreign one, or breaks dtype, shape or range."""
@@ -321,14 +340,27 @@ _SIZES = {
 }  # fmt: skip
 
 SCHEMAS: dict[str, RecordSchema] = {
-    "heuristic": RecordSchema("heuristic", 2, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
-    "plan": RecordSchema("plan", 1, SCENE_FIELDS, PLAN_FIELDS, _SIZES),
-    "sim": RecordSchema("sim", 1, SCENE_FIELDS, SIM_FIELDS, _SIZES),
+    "heuristic": RecordSchema("heuristic", SCHEMA_VERSION, SCENE_FIELDS, SAMPLE_FIELDS, _SIZES),
+    "plan": RecordSchema("plan", SCHEMA_VERSION, SCENE_FIELDS, PLAN_FIELDS, _SIZES),
+    "sim": RecordSchema("sim", SCHEMA_VERSION, SCENE_FIELDS, SIM_FIELDS, _SIZES),
 }
 
 
-def sized_schema(name: str, spec: Specification) -> RecordSchema:
-    """The named schema with the specification's axis lengths. InputError for an unknown name."""
+def sized_schema(name: str, spec: Specification, version: int | None = None) -> RecordSchema:
+    """The named schema with the specification's axis lengths, as `version` had it (default: the present).
+
+    InputError for an unknown name, and for a version that this program does not know.
+    """
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
-    return SCHEMAS[name].sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)
+    schema = SCHEMAS[name]
+    if version is not None and version != schema.version:
+        if not OLDEST_SCHEMA_VERSION <= version < schema.version:
+            raise InputError(
+                name,
+                "schema_version",
+                f"{version}, and this program knows {OLDEST_SCHEMA_VERSION} to {schema.version}",
+                "Use the version of the program that made the run, or start a new run",
+            )
+        schema = schema.at(version)
+    return schema.sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)

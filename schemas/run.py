@@ -90,16 +90,15 @@ class Run:
 
     @property
     def schema(self) -> RecordSchema:
-        """The record schema with this run's axis lengths."""
-        schema = sized_schema(self.manifest.schema_name, self.manifest.spec)
-        if schema.version != self.manifest.schema_version:
-            raise InputError(
-                f"{self.storage.url}/manifest.json",
-                "schema_version",
-                f"{self.manifest.schema_version}, and this program writes {schema.version}",
-                "Use the version of the program that made the run, or start a new run",
-            )
-        return schema
+        """The record schema of this run's version, with its axis lengths.
+
+        A run keeps the version it was begun with. InputError for one that this program does not know.
+        """
+        manifest = self.manifest
+        try:
+            return sized_schema(manifest.schema_name, manifest.spec, manifest.schema_version)
+        except InputError as e:
+            raise InputError(f"{self.storage.url}/manifest.json", e.field, e.problem, e.mend) from e
 
     # Plans: how far to go.
 
@@ -252,9 +251,10 @@ class Run:
         return numbers
 
     def _refuse_other(self, manifest: Manifest) -> None:
+        _ = self.schema  # refuses a version that this program does not know
         ours = manifest.model_dump(mode="json")
         theirs = self.manifest.model_dump(mode="json")
-        keys = ("spec", "schema_name", "schema_version")
+        keys = ("spec", "schema_name")  # not its version: a run goes on in the one it was begun with
         rows = different_fields({k: ours[k] for k in keys}, {k: theirs[k] for k in keys})
         if self.layout.candidates_per_scene != manifest.layout.candidates_per_scene:
             raise InputError(

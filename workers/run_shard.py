@@ -59,15 +59,17 @@ def run_shard(
     world: World,
     scene_indices: Sequence[int],
     stored: Iterable[SceneRows] | None = None,
+    schema_version: int | None = None,
 ) -> ShardResult:
     """Make the scenes of these indices, or take them from `stored`, and label their candidates.
 
     The same specification and index give the same bytes, whatever else is in the shard. Stored
-    scenes keep theirs. Raises InputError where a stored scene is another one than its index says, or
-    its house and objects are not those of the world.
+    scenes keep theirs. What an older `schema_version` does not store is left out. Raises InputError
+    where a stored scene is another one than its index says, or its house and objects are not those of
+    the world.
     """
     source, spec_hash = load_label_source(spec.label_source), spec.hash()
-    schema = sized_schema(source.schema, spec)
+    schema = sized_schema(source.schema, spec, schema_version)
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
@@ -84,7 +86,9 @@ def run_shard(
         redraws.update(staged.redraws)
 
     scenes = {f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields}
-    samples = {name: np.concatenate([b[name] for b in sample_blocks]) for name in sample_blocks[0]}
+    # All that the source gave: a column that no version knows is its defect.
+    names = [name for name in sample_blocks[0] if name not in schema.later]
+    samples = {name: np.concatenate([b[name] for b in sample_blocks]) for name in names}
     schema.check("scene", len(scene_rows), scenes)
     schema.check("sample", sum(len(b["label"]) for b in sample_blocks), samples)
     return ShardResult(scenes, samples, clock, dict(redraws))

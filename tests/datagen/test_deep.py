@@ -40,7 +40,7 @@ def test_a_sound_run_has_no_findings(source: Path) -> None:
 
 
 def test_nothing_is_checked_where_nothing_is_asked_or_committed(source: Path, tmp_path: Path) -> None:
-    run = forge(source, tmp_path / "run", 0, lambda a: a["label"].__isub__(a["label"] - 1))
+    run = forge(source, tmp_path / "run", 0, flip_label)
     assert findings(run, 0) == []
     for record in (tmp_path / "run/commits").iterdir():
         record.unlink()
