@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeVar
+
+from pydantic import BaseModel
 
 from schemas.errors import InputError
-from schemas.record_files import encode_record, now, read_record
+from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
 from schemas.run_records import AttemptStart, LedgerEntry
 from schemas.storage import Storage
 
 MAX_STACK_CHARS = 20_000
+Record = TypeVar("Record", bound=BaseModel)
 
 
 class Ledger:
@@ -44,26 +48,42 @@ class Ledger:
         self._storage.sync([key])
         return True
 
+    def attempts(self) -> set[str]:
+        """Names of all attempts that began or ended, by listing."""
+        return {name.removesuffix(".start") for name in self.stamps()}
+
+    def start_of(self, attempt: str) -> AttemptStart | None:
+        """The record that an attempt began; None where there is none."""
+        return read_record(self._storage, start_key(attempt), AttemptStart)
+
     def end_of(self, attempt: str) -> LedgerEntry | None:
         """How an attempt ended; None while it has not."""
         return read_record(self._storage, end_key(attempt), LedgerEntry)
 
     def ends(self) -> Iterator[LedgerEntry]:
         """Ends of all attempts, in order of their names."""
-        for name in sorted(self._names()):
-            if not name.endswith(".start") and (entry := self.end_of(name)) is not None:
-                yield entry
+        names = sorted(name for name in self.stamps() if not name.endswith(".start"))
+        yield from self._read(names, LedgerEntry)
 
-    def unfinished(self) -> list[AttemptStart]:
-        """Attempts that began and left no end: running elsewhere, or lost."""
-        names = self._names()
+    def unfinished(self, stamps: Mapping[str, str] | None = None) -> list[AttemptStart]:
+        """Attempts that began and left no end: running elsewhere, or lost. `stamps` saves a listing."""
+        names = self.stamps() if stamps is None else stamps
         open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
-        found = (read_record(self._storage, f"ledger/{name}.json", AttemptStart) for name in open_)
-        return [start for start in found if start is not None]
+        return list(self._read(open_, AttemptStart))
 
-    def _names(self) -> set[str]:
-        names = {f.key.rsplit("/", 1)[-1] for f in self._storage.list("ledger")}
-        return {name.removesuffix(".json") for name in names if name.endswith(".json")}
+    def stamps(self) -> dict[str, str]:
+        """Change stamps of all records by their names, by listing; those of starts end in `.start`."""
+        return {
+            file.key[len("ledger/") : -len(".json")]: file.stamp
+            for file in self._storage.list("ledger")
+            if file.key.endswith(".json")
+        }
+
+    def _read(self, names: Iterable[str], model: type[Record]) -> Iterator[Record]:
+        keys = (f"ledger/{name}.json" for name in names)
+        for key, data in self._storage.get_many(keys, MAX_RECORD_BYTES):
+            if data is not None:
+                yield decode_record(f"{self._storage.url}/{key}", data, model)
 
 
 def start_key(attempt: str) -> str:

@@ -14,7 +14,14 @@ from pathlib import Path
 from schemas.errors import InputError
 from schemas.fields import RecordSchema, sized_schema
 from schemas.ledger import MAX_STACK_CHARS, Ledger
-from schemas.record_files import MAX_RECORD_BYTES, different_fields, encode_record, now, read_record
+from schemas.record_files import (
+    MAX_RECORD_BYTES,
+    decode_record,
+    different_fields,
+    encode_record,
+    now,
+    read_record,
+)
 from schemas.run_records import (
     FORMAT_VERSION,
     Commit,
@@ -24,9 +31,12 @@ from schemas.run_records import (
     Plan,
     QuarantineRecord,
 )
+from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
+# A commit with its file entries takes some 30 kB of memory.
+_COMMITS_KEPT = 1000
 
 
 class Run:
@@ -39,7 +49,7 @@ class Run:
         self.storage = storage
         self.manifest = manifest
         self.ledger = Ledger(storage)
-        self._commits: dict[int, Commit] = {}  # immutable once written, so read at most once
+        self._commits: dict[int, Commit] = {}  # those read last; immutable once written
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
@@ -136,36 +146,53 @@ class Run:
         """Indices of committed shards, by listing."""
         return self._numbers("commits")
 
-    def missing(self) -> list[int]:
+    def commit_stamps(self) -> dict[str, str]:
+        """Change stamps of all commit records by their names (the shard in six digits), by listing."""
+        return dict(self._numbered("commits"))
+
+    def missing(self) -> ShardRanges:
         """Planned shards that are neither committed nor in quarantine, in order."""
-        return sorted(set(self.planned()) - self.committed() - self.quarantined())
+        decided = (int(name) for folder in ("commits", "quarantine") for name, _ in self._numbered(folder))
+        return ShardRanges.of(self.planned()).without(ShardRanges.of(decided))
 
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
         if shard not in self._commits:
             key = commit_key(shard)
-            commit = read_record(self.storage, key, Commit)
-            place = f"{self.storage.url}/{key}"
-            if commit is None:
+            data = self.storage.get(key, MAX_RECORD_BYTES)
+            if data is None:
+                place = f"{self.storage.url}/{key}"
                 raise InputError(place, "", "no such commit", "Submit the run again to make the shard")
-            expected = {
-                "shard": shard,
-                "spec_hash": self.manifest.spec_hash,
-                "scenes": self.layout.scenes_per_shard,
-                "samples": self.layout.samples_per_shard,
-            }
-            for field, value in expected.items():
-                if (given := getattr(commit, field)) != value:
-                    raise InputError(
-                        place, field, f"{given}, where this run has {value}", "Remove this foreign commit"
-                    )
-            self._commits[shard] = commit
+            while len(self._commits) >= _COMMITS_KEPT:
+                del self._commits[next(iter(self._commits))]
+            self._commits[shard] = self.decode_commit(shard, data)
         return self._commits[shard]
+
+    def decode_commit(self, shard: int, data: bytes) -> Commit:
+        """The commit record in the bytes of a shard's file, checked against the manifest."""
+        place = f"{self.storage.url}/{commit_key(shard)}"
+        commit = decode_record(place, data, Commit)
+        expected = {
+            "shard": shard,
+            "spec_hash": self.manifest.spec_hash,
+            "scenes": self.layout.scenes_per_shard,
+            "samples": self.layout.samples_per_shard,
+        }
+        for field, value in expected.items():
+            if (given := getattr(commit, field)) != value:
+                raise InputError(
+                    place, field, f"{given}, where this run has {value}", "Remove this foreign commit"
+                )
+        return commit
 
     def commits(self) -> Iterator[Commit]:
         """Commit records of all committed shards, in order of their shards."""
-        for shard in sorted(self.committed()):
-            yield self.commit_of(shard)
+        shards = sorted(self.committed())
+        for shard, (_, data) in zip(
+            shards, self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES), strict=True
+        ):
+            if data is not None:  # else it was withdrawn since the listing
+                yield self.decode_commit(shard, data)
 
     def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
         """Write an attempt's files durably; its entries for the commit. Nothing counts before it."""
@@ -242,13 +269,15 @@ class Run:
         return [record for record in found if record is not None]
 
     def _numbers(self, folder: str, width: int = 6) -> set[int]:
-        numbers: set[int] = set()
+        return {int(name) for name, _ in self._numbered(folder, width)}
+
+    def _numbered(self, folder: str, width: int = 6) -> Iterator[tuple[str, str]]:
+        """(name, change stamp) of a folder's records that have a number for a name."""
         for file in self.storage.list(folder):
             name = file.key.removeprefix(f"{folder}/")
             # Only names that this program gives: not drafts, and not "7.json" for "000007.json".
             if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
-                numbers.add(int(found.group(1)))
-        return numbers
+                yield found.group(1), file.stamp
 
     def _refuse_other(self, manifest: Manifest) -> None:
         _ = self.schema  # refuses a version that this program does not know

@@ -1,0 +1,265 @@
+"""Heads of commits and of closed attempts: what sums need of a record, and tables of them as files.
+
+A commit names some sixty files and their digests; a head leaves those out, and stacks and times too.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import isfinite
+from typing import Literal, get_args
+
+from pydantic import BaseModel, ConfigDict
+
+from schemas.record_files import compact_record, decode_record
+from schemas.run_records import FORMAT_VERSION, Commit, Cost, Digest, Host, LedgerEntry, Outcome
+
+_STAGES = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s")
+_OUTCOMES: frozenset[str] = frozenset(get_args(Outcome))
+# Longer causes and larger numbers stay in their records alone: a table keeps floats.
+_MAX_CAUSE_CHARS = 1000
+_MAX_INTEGER = 2**53
+# What one table file may unpack to. A file of our own stays far below.
+_MAX_TABLE_BYTES = 128 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class CommitHead:
+    """What a commit record says of its shard, without its files."""
+
+    shard: int
+    attempt: str
+    scenes: int
+    samples: int
+    positives: int
+    redraws: Mapping[str, int]
+    cost: Cost
+    host: Host
+
+
+@dataclass(frozen=True, slots=True)
+class EndHead:
+    """How an attempt ended, without its stack."""
+
+    attempt: str
+    shard: int
+    outcome: Outcome
+    cause: str
+    cost: Cost | None
+
+
+Kind = Literal["commits", "ends"]
+
+
+def head_of_commit(commit: Commit) -> CommitHead:
+    """The commit's head."""
+    return CommitHead(
+        commit.shard,
+        commit.attempt,
+        commit.scenes,
+        commit.samples,
+        commit.positives,
+        commit.redraws,
+        commit.cost,
+        commit.host,
+    )
+
+
+def head_of_end(entry: LedgerEntry) -> EndHead:
+    """The ledger entry's head."""
+    return EndHead(entry.attempt, entry.shard, entry.outcome, entry.cause, entry.cost)
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class _Words(_Record):
+    """A column of text: its different words, and which of them each row has."""
+
+    words: list[str]
+    rows: list[int]
+
+
+class _TableFile(_Record):
+    format_version: int = FORMAT_VERSION
+    spec_hash: Digest
+    kind: Kind
+    names: list[str]
+    stamps: list[str]
+    texts: dict[str, _Words]
+    numbers: dict[str, list[float | None]]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadTable:
+    """Rows of heads by columns. A row's name is its record's file name without `.json`."""
+
+    kind: Kind
+    names: Sequence[str]
+    stamps: Sequence[str]  # the change stamp that the record had when its head was taken
+    texts: Mapping[str, Sequence[str]]
+    numbers: Mapping[str, Sequence[float | None]]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def take(self, rows: Sequence[int]) -> HeadTable:
+        """Some of the rows."""
+        return HeadTable(
+            self.kind,
+            [self.names[i] for i in rows],
+            [self.stamps[i] for i in rows],
+            {name: [column[i] for i in rows] for name, column in self.texts.items()},
+            {name: [column[i] for i in rows] for name, column in self.numbers.items()},
+        )
+
+    def head(self, row: int) -> CommitHead | EndHead:
+        """The head in a row. ValueError, KeyError or TypeError where the columns do not make one."""
+        numbers: dict[str, float] = {}
+        parts: dict[str, dict[str, float]] = {name: {} for name in (*_STAGES, "redraws")}
+        for name, column in self.numbers.items():
+            value = column[row]
+            if value is not None:
+                group, dot, key = name.partition(".")
+                if dot:
+                    parts[group][key] = value
+                else:
+                    numbers[name] = value
+        cost = None
+        if "wall_s" in numbers:
+            cost = Cost.model_construct(
+                wall_s=numbers["wall_s"],
+                cpu_s=numbers["cpu_s"],
+                stage_wall_s=parts["stage_wall_s"],
+                stage_cpu_s=parts["stage_cpu_s"],
+                stage_gpu_s=parts["stage_gpu_s"],
+                peak_rss_bytes=int(numbers["peak_rss_bytes"]),
+                written_bytes=int(numbers["written_bytes"]),
+            )
+        attempt, shard = self.texts["attempt"][row], int(numbers["shard"])
+        if self.kind == "ends":
+            outcome = self.texts["outcome"][row]
+            if outcome not in _OUTCOMES:
+                raise ValueError(outcome)
+            return EndHead(attempt, shard, outcome, self.texts["cause"][row], cost)  # type: ignore[arg-type]
+        if cost is None:
+            raise ValueError("a commit without its cost")
+        return CommitHead(
+            shard,
+            attempt,
+            int(numbers["scenes"]),
+            int(numbers["samples"]),
+            int(numbers["positives"]),
+            {name: int(count) for name, count in parts["redraws"].items()},
+            cost,
+            _host(self.texts["host"][row]),
+        )
+
+
+@lru_cache(maxsize=256)
+def _host(text: str) -> Host:
+    return Host.model_validate_json(text)
+
+
+def table_of(kind: Kind, rows: Sequence[tuple[str, str, CommitHead | EndHead]]) -> HeadTable:
+    """A table of (name, stamp, head). Heads that a table cannot hold exactly are left out."""
+    kept = [row for row in rows if _fits(row[2])]
+    numbers: dict[str, list[float | None]] = {}
+    texts: dict[str, list[str]] = {}
+    for i, (_, _, head) in enumerate(kept):
+        for name, value in _numbers(head).items():
+            if name not in numbers:
+                numbers[name] = [None] * len(kept)
+            numbers[name][i] = value
+        for name, text in _texts(head).items():
+            texts.setdefault(name, []).append(text)
+    return HeadTable(kind, [name for name, _, _ in kept], [stamp for _, stamp, _ in kept], texts, numbers)
+
+
+def joined(first: HeadTable, second: HeadTable) -> HeadTable:
+    """The rows of two tables of one kind."""
+
+    def numbers(table: HeadTable, name: str) -> list[float | None]:
+        return list(table.numbers.get(name, [None] * len(table)))
+
+    names = dict.fromkeys([*first.numbers, *second.numbers])
+    texts = dict.fromkeys([*first.texts, *second.texts])
+    return HeadTable(
+        first.kind,
+        [*first.names, *second.names],
+        [*first.stamps, *second.stamps],
+        {name: [*first.texts.get(name, ()), *second.texts.get(name, ())] for name in texts},
+        {name: numbers(first, name) + numbers(second, name) for name in names},
+    )
+
+
+def _fits(head: CommitHead | EndHead) -> bool:
+    if isinstance(head, EndHead) and len(head.cause) > _MAX_CAUSE_CHARS:
+        return False
+    values = _numbers(head).values()
+    return all(value <= _MAX_INTEGER if isinstance(value, int) else isfinite(value) for value in values)
+
+
+def _numbers(head: CommitHead | EndHead) -> dict[str, float]:
+    numbers: dict[str, float] = {"shard": head.shard}
+    if isinstance(head, CommitHead):
+        numbers |= {"scenes": head.scenes, "samples": head.samples, "positives": head.positives}
+        numbers |= {f"redraws.{name}": count for name, count in head.redraws.items()}
+    cost = head.cost
+    if cost is not None:
+        numbers |= {"wall_s": cost.wall_s, "cpu_s": cost.cpu_s}
+        numbers |= {"peak_rss_bytes": cost.peak_rss_bytes, "written_bytes": cost.written_bytes}
+        for stages, seconds in zip(
+            _STAGES, (cost.stage_wall_s, cost.stage_cpu_s, cost.stage_gpu_s), strict=True
+        ):
+            numbers |= {f"{stages}.{stage}": value for stage, value in seconds.items()}
+    return numbers
+
+
+def _texts(head: CommitHead | EndHead) -> dict[str, str]:
+    if isinstance(head, CommitHead):
+        return {"attempt": head.attempt, "host": head.host.model_dump_json()}
+    return {"attempt": head.attempt, "outcome": head.outcome, "cause": head.cause}
+
+
+def encode_table(table: HeadTable, spec_hash: str) -> bytes:
+    """The table's file: a signed record, packed by gzip."""
+    record = _TableFile(
+        spec_hash=spec_hash,
+        kind=table.kind,
+        names=list(table.names),
+        stamps=list(table.stamps),
+        texts={name: _words(column) for name, column in table.texts.items()},
+        numbers={name: list(column) for name, column in table.numbers.items()},
+    )
+    packer = zlib.compressobj(1, wbits=31)
+    return packer.compress(compact_record(record)) + packer.flush()
+
+
+def decode_table(place: str, data: bytes, spec_hash: str) -> HeadTable:
+    """The table of a file at `place`.
+
+    InputError or ValueError when it is damaged, foreign, or unpacks to more than any of ours would.
+    """
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        text = unpacker.decompress(data, _MAX_TABLE_BYTES)
+    except zlib.error as e:
+        raise ValueError(str(e)) from e
+    record = decode_record(place, text, _TableFile)
+    if record.spec_hash != spec_hash or record.format_version != FORMAT_VERSION:
+        raise ValueError("of another run")
+    texts = {name: [column.words[i] for i in column.rows] for name, column in record.texts.items()}
+    columns = (record.stamps, *texts.values(), *record.numbers.values())
+    if any(len(column) != len(record.names) for column in columns):
+        raise ValueError("columns of different lengths")
+    return HeadTable(record.kind, record.names, record.stamps, texts, record.numbers)
+
+
+def _words(column: Sequence[str]) -> _Words:
+    words = {word: i for i, word in enumerate(dict.fromkeys(column))}
+    return _Words(words=list(words), rows=[words[word] for word in column])

@@ -1,0 +1,104 @@
+"""Sets of shards as ranges: a run of a million shards costs as much as its gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, overload
+
+import numpy as np
+
+Bounds = np.ndarray[Any, np.dtype[np.int64]]
+
+
+class ShardRanges(Sequence[int]):
+    """Shard numbers in ascending order, each once. Immutable; 16 bytes a range of neighbours.
+
+    `bounds` is an int64 array (ranges, 2): first and one past the last shard of each, ascending, apart.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self.bounds = bounds
+        self._ends = np.cumsum(bounds[:, 1] - bounds[:, 0])  # shards up to the end of each range
+
+    @classmethod
+    def of(cls, shards: Iterable[int]) -> ShardRanges:
+        """The set of the given shards, in any order."""
+        if isinstance(shards, ShardRanges):
+            return shards
+        if isinstance(shards, range) and shards.step == 1:
+            bounds = [(shards.start, shards.stop)] if shards else []
+            return cls(np.array(bounds, np.int64).reshape(-1, 2))
+        numbers = np.unique(np.fromiter(shards, np.int64))
+        if not len(numbers):
+            return cls(np.empty((0, 2), np.int64))
+        breaks = np.flatnonzero(np.diff(numbers) > 1)
+        first = numbers[np.concatenate([[0], breaks + 1])]
+        last = numbers[np.concatenate([breaks, [len(numbers) - 1]])]
+        return cls(np.stack([first, last + 1], axis=1))
+
+    def without(self, others: ShardRanges) -> ShardRanges:
+        """The shards of this set that are not in the other."""
+        return self._where(others, +1, -1)
+
+    def within(self, others: ShardRanges) -> ShardRanges:
+        """The shards of both sets."""
+        return self._where(others, +1, +1)
+
+    def _where(self, others: ShardRanges, ours: int, theirs: int) -> ShardRanges:
+        # Sweep over all bounds: a stretch counts where the depth is that of what is wanted.
+        wanted = ours + max(theirs, 0)
+        places = np.concatenate(
+            [self.bounds[:, 0], self.bounds[:, 1], others.bounds[:, 0], others.bounds[:, 1]]
+        )
+        steps = np.repeat([ours, -ours, theirs, -theirs], [len(self.bounds)] * 2 + [len(others.bounds)] * 2)
+        order = np.argsort(places, kind="stable")
+        places, depth = places[order], np.cumsum(steps[order])
+        last = np.append(places[1:] != places[:-1], True) if len(places) else np.empty(0, bool)
+        places, inside = places[last], (depth[last] == wanted)
+        edges = np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8))
+        first, past = places[np.flatnonzero(edges == 1)], places[np.flatnonzero(edges == -1)]
+        return ShardRanges(np.stack([first, past], axis=1).reshape(-1, 2))
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __iter__(self) -> Iterator[int]:
+        for first, past in self.bounds:
+            yield from range(int(first), int(past))
+
+    @overload
+    def __getitem__(self, index: int) -> int: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[int]: ...
+
+    def __getitem__(self, index: int | slice) -> int | list[int]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        at = index % len(self)
+        row = int(np.searchsorted(self._ends, at, side="right"))
+        return int(self.bounds[row, 1] - (self._ends[row] - at))
+
+    def __contains__(self, shard: object) -> bool:
+        if not isinstance(shard, int):
+            return False
+        row = int(np.searchsorted(self.bounds[:, 1], shard, side="right"))
+        return row < len(self.bounds) and bool(self.bounds[row, 0] <= shard)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, ShardRanges):
+            return np.array_equal(self.bounds, other.bounds)
+        return (
+            isinstance(other, Sequence)
+            and len(self) == len(other)
+            and all(a == b for a, b in zip(self, other, strict=True))
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.bounds.tobytes())
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{first}-{past - 1}" for first, past in self.bounds[:10])
+        return f"ShardRanges({shown}{', ...' if len(self.bounds) > 10 else ''})"
