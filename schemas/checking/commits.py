@@ -1,0 +1,144 @@
+"""The records of a committed shard: its commit, the copy beside its files, its account in the ledger."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from schemas.checking.finding import Finding, Restore, curable
+from schemas.checking.records import Read, compare, read
+from schemas.ledger import end_key, start_key
+from schemas.record_files import encode_record
+from schemas.run import Run, commit_copy_key, commit_key
+from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry
+from schemas.storage import StoredFile
+
+_ROUNDING = 1e-6
+_ROUNDING_S = 1e-3  # of clocks
+
+
+@dataclass(frozen=True, eq=False)
+class CommittedShard:
+    """A shard that is or was committed: its commit, where one of its two files is sound."""
+
+    shard: int
+    commit: Commit | None
+    findings: tuple[Finding, ...]
+
+
+def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> CommittedShard:
+    """The shard's commit and its copy, among the files listed below the shard's folder.
+
+    Without a commit's file, a sound copy counts only where the caller knows that there was one.
+    """
+    ours = read(run.storage, commit_key(shard), Commit, lambda c: foreign_to(run, shard, c))
+    if ours.record is not None:
+        copy_key = commit_copy_key(shard, ours.record.attempt)
+        copy = read(run.storage, copy_key, Commit)
+        return CommittedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
+    copies = sound_copies(run, shard, listed)
+    if len(copies) > 1:  # losers that were killed left theirs too
+        copies = [c for c in copies if c.record is not None and _says_committed(run, c.record.attempt)]
+    if len(copies) == 1:
+        return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
+    mend = "Restore the file from a backup; or remove it, and submit again: the shard is made anew"
+    if ours.data is None and ours.problem == "missing":
+        mend = "Submit the run again: the shard is open, and is made anew"
+    problem = f"{ours.problem}, and {'no copy of it' if not copies else 'several attempts left copies'}"
+    return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, mend, shard),))
+
+
+def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Read[Commit]]:
+    """The sound copies of commits in the folders of a shard's attempts."""
+    found: list[Read[Commit]] = []
+    for key in sorted(listed):
+        names = key.split("/")
+        if len(names) == 4 and names[3] == "commit.json":
+            copy = read(run.storage, key, Commit, lambda c: foreign_to(run, shard, c))
+            if copy.record is not None and copy.record.attempt == names[2]:
+                found.append(copy)
+    return found
+
+
+def foreign_to(run: Run, shard: int, commit: Commit) -> str:
+    """Why a commit cannot be this shard's, or ""."""
+    expected = {
+        "shard": shard,
+        "spec_hash": run.manifest.spec_hash,
+        "scenes": run.layout.scenes_per_shard,
+        "samples": run.layout.samples_per_shard,
+    }
+    for field, value in expected.items():
+        if (given := getattr(commit, field)) != value:
+            return f"{field}: {given}, where this run has {value}"
+    return ""
+
+
+def check_account(run: Run, commit: Commit) -> list[Finding]:
+    """The start and the end of a committed attempt: both there, the end at the commit's cost."""
+    shard = commit.shard
+    start = read(run.storage, start_key(commit.attempt), AttemptStart)
+    end = read(run.storage, end_key(commit.attempt), LedgerEntry)
+    findings: list[Finding] = []
+    problem = end.problem
+    if end.record is not None:
+        noted = end.record
+        for field, ours, wanted in (
+            ("attempt", noted.attempt, commit.attempt),
+            ("shard", noted.shard, shard),
+            ("outcome", noted.outcome, "committed"),
+            ("cost", noted.cost, commit.cost),
+        ):
+            if ours != wanted:
+                problem = f"{field}: is not that of the attempt's commit"
+    if problem:
+        entry = LedgerEntry(
+            attempt=commit.attempt,
+            shard=shard,
+            outcome="committed",
+            started=start.record.started if start.record else "",
+            ended=commit.created,
+            cost=commit.cost,
+            host=commit.host,
+        )
+        cure = Restore(encode_record(entry))
+        findings.append(curable(end.key, "account", f"{problem}; it is known from the commit", cure, shard))
+    problem = start.problem
+    if start.record is not None and (start.record.attempt, start.record.shard) != (commit.attempt, shard):
+        problem = "is not that of this attempt"
+    if problem:
+        started = end.record.started if end.record else ""
+        cure = Restore(encode_record(_start(commit.attempt, shard, started, commit.host.name)))
+        findings.append(curable(start.key, "account", problem, cure, shard))
+    if odd := odd_cost(commit.cost):
+        mend = "Look at what wrote it: the record is as it was written"
+        findings.append(Finding(commit_key(shard), "account", odd, mend, shard))
+    return findings
+
+
+def start_from(end: LedgerEntry) -> Restore:
+    """The start record of an attempt as far as its end tells it."""
+    host = end.host.name if end.host else ""
+    return Restore(encode_record(_start(end.attempt, end.shard, end.started, host)))
+
+
+def odd_cost(cost: Cost | None) -> str:
+    """Why a cost does not add up, or ""."""
+    if cost is None:
+        return ""
+    for name, stages, whole in (
+        ("wall", cost.stage_wall_s, cost.wall_s),
+        ("cpu", cost.stage_cpu_s, cost.cpu_s),
+    ):
+        total = sum(stages.values())
+        if total > whole * (1 + _ROUNDING) + _ROUNDING_S:
+            return f"cost.stage_{name}_s: the stages have {total:g} s, and the whole attempt {whole:g} s"
+    return ""
+
+
+def _start(attempt: str, shard: int, started: str, host: str) -> AttemptStart:
+    return AttemptStart(attempt=attempt, shard=shard, started=started, host=host)
+
+
+def _says_committed(run: Run, attempt: str) -> bool:
+    end = read(run.storage, end_key(attempt), LedgerEntry).record
+    return end is not None and end.outcome == "committed"

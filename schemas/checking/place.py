@@ -1,0 +1,170 @@
+"""A whole place checked: a run, or several that were merged, a shard at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from schemas.checking.accounts import Books, check_quarantine, check_rest
+from schemas.checking.commits import check_account, check_commit
+from schemas.checking.finding import Finding
+from schemas.checking.roots import below, check_notes, check_plans, open_roots
+from schemas.checking.sealed import (
+    SealedSlice,
+    SealedTally,
+    check_chunks,
+    check_store,
+    read_root,
+    slices_of,
+)
+from schemas.checking.shards import ShardForm, check_shard, form_of
+from schemas.run import Run
+from schemas.run_records import Commit
+from schemas.storage import Storage
+
+_THREADS = 4  # hashing and unpacking leave Python's lock
+_REMOTE_THREADS = 16  # requests wait for each other's answers
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass
+class Checked:
+    """What was looked at, for the report; grows while the findings are taken."""
+
+    shards: int = 0
+    files: int = 0
+    bytes: int = 0
+    samples: int = 0
+    is_sealed: bool = False
+    books: Books = field(default_factory=Books)
+    runs: list[Run] = field(default_factory=list[Run])
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """One run of the place, and what all checks of its shards share."""
+
+    place: Storage
+    run: Run
+    prefix: str
+    form: ShardForm
+    slice_: SealedSlice | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """What came of one shard."""
+
+    shard: int
+    commit: Commit | None
+    findings: list[Finding]
+
+
+def check_place(
+    place: Storage, checked: Checked, seen: Callable[[int, int], None] = lambda done, total: None
+) -> Iterator[Finding]:
+    """Everything that is wrong at `place`, as it is found.
+
+    `checked` is filled on the way; `seen` hears how many of how many shards are done. Every file is read
+    once. InputError where there is no run, or it is of another format or schema.
+    """
+    roots = open_roots(place)
+    yield from roots.findings
+    checked.runs = roots.runs
+    wanted: dict[str, int] = {}
+    for run in roots.runs:
+        wanted[run.manifest.spec_hash], found = check_plans(run)
+        yield from (below(roots.folder_of(run), finding) for finding in found)
+    yield from check_notes(place)
+    root, found = read_root(place, wanted)
+    yield from found
+    slices = slices_of(root, roots.runs) if root else {}
+    tally = SealedTally()
+    checked.is_sealed = root is not None
+    work = [(run, _shards_of(run, slices.get(run.manifest.spec_hash))) for run in roots.runs]
+    total, done = sum(len(shards) for _, shards in work), 0
+    threads = _REMOTE_THREADS if place.folder is None else _THREADS
+    with ThreadPoolExecutor(threads) as pool:
+        for run, shards in work:
+            prefix = roots.folder_of(run)
+            slice_ = slices.get(run.manifest.spec_hash)
+            subject = _Subject(place, run, prefix, form_of(run), slice_)
+            committed: dict[int, str] = {}
+            for looked in _in_order(pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards):
+                yield from looked.findings
+                if slice_ is not None and looked.shard in slice_.positions:
+                    tally.add(run, slice_, looked.shard, looked.commit)
+                if looked.commit is not None:
+                    committed[looked.shard] = looked.commit.attempt
+                    _count(checked, looked.commit)
+                done += 1
+                seen(done, total)
+            yield from _rest(subject, committed, checked)
+    if root is not None:
+        yield from check_store(place, roots.runs, wanted, slices, tally)
+
+
+def _shards_of(run: Run, slice_: SealedSlice | None) -> list[int]:
+    """Shards that are committed, or that the sealed store has."""
+    return sorted(run.committed() | (slice_.positions.keys() if slice_ else set()))
+
+
+def _look_at(subject: _Subject, shard: int) -> _Looked:
+    """One shard: its commit, its account, its files and rows, its chunks in the sealed store."""
+    run, prefix = subject.run, subject.prefix
+    listed = {file.key: file for file in run.storage.list(f"shards/{shard:06d}")}
+    found = check_commit(run, shard, listed)
+    findings, commit = list(found.findings), found.commit
+    if commit is not None:
+        findings += check_account(run, commit)
+        folder = f"shards/{shard:06d}/{commit.attempt}/"
+        own = {key: file for key, file in listed.items() if key.startswith(folder)}
+        findings += check_shard(run, subject.form, commit, own)
+    findings = [below(prefix, finding) for finding in findings]
+    if commit is not None and subject.slice_ is not None and shard in subject.slice_.positions:
+        findings += check_chunks(subject.place, prefix, run, subject.form, subject.slice_, commit)
+    return _Looked(shard, commit, findings)
+
+
+def _rest(subject: _Subject, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:
+    """What is left of a run after its shards: the waste in the ledger, lost commits, the quarantine."""
+    run, prefix, books = subject.run, subject.prefix, checked.books
+    books.lost_shards = {}
+    yield from (below(prefix, finding) for finding in check_rest(run, committed, books))
+    for shard in sorted(books.lost_shards.keys() - set(_shards_of(run, subject.slice_))):
+        looked = _look_at(subject, shard)
+        yield from looked.findings
+        if looked.commit is not None:
+            _count(checked, looked.commit)
+    yield from (below(prefix, finding) for finding in check_quarantine(run))
+
+
+def _count(checked: Checked, commit: Commit) -> None:
+    checked.shards += 1
+    checked.files += len(commit.files)
+    checked.bytes += sum(entry.size for entry in commit.files)
+    checked.samples += commit.samples
+    checked.books.attempts += 1
+    checked.books.committed_wall_s += commit.cost.wall_s
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, most: int, function: Callable[[T], R], items: Iterable[T]
+) -> Iterator[R]:
+    """The function's results in the order of the items, with so many at most that are not yet taken."""
+    waiting: deque[Future[R]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= most:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()

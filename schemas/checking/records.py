@@ -1,0 +1,71 @@
+"""Records read with suspicion: signed, valid, written as this program writes, equal to their copies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from pydantic import BaseModel
+
+from schemas.checking.finding import Finding, Restore, curable
+from schemas.errors import InputError
+from schemas.record_files import MAX_RECORD_BYTES, decode_record, signed_json
+from schemas.storage import Storage
+
+Record = TypeVar("Record", bound=BaseModel)
+
+_BACKUP = "Restore the file from a backup"
+
+
+@dataclass(frozen=True, eq=False)
+class Read(Generic[Record]):
+    """One record's file: its bytes where there are any, and the record or what is wrong with it."""
+
+    key: str
+    data: bytes | None
+    record: Record | None
+    problem: str
+
+
+def read(
+    storage: Storage, key: str, model: type[Record], refuse: Callable[[Record], str] = lambda record: ""
+) -> Read[Record]:
+    """Read a record; never raises for what the file holds.
+
+    `refuse` says what is wrong with a record that is valid in itself, or "".
+    """
+    try:
+        data = storage.get(key, MAX_RECORD_BYTES)
+    except InputError as error:
+        return Read(key, None, None, error.problem)
+    if data is None:
+        return Read(key, None, None, "missing")
+    try:
+        record = decode_record(key, data, model)
+    except InputError as error:
+        return Read(key, data, None, f"{error.field}: {error.problem}" if error.field else error.problem)
+    # Fields that later versions add are not in it, and are not expected.
+    if signed_json(record.model_dump(mode="json", exclude_unset=True)) != data:
+        return Read(key, data, None, "signed, but not written as this program writes it")
+    problem = refuse(record)
+    return Read(key, data, None if problem else record, problem)
+
+
+def compare(ours: Read[Record], copy: Read[Record], shard: int | None = None) -> list[Finding]:
+    """What is wrong with a record and its second copy; each restores the other."""
+    if ours.record is not None and copy.record is not None:
+        if ours.data == copy.data:
+            return []
+        return [Finding(ours.key, "record", f"is not what its copy {copy.key} holds", _BACKUP, shard)]
+    if ours.record is not None and ours.data is not None:
+        return [curable(copy.key, "record", copy.problem, Restore(ours.data), shard)]
+    if copy.record is not None and copy.data is not None:
+        return [curable(ours.key, "record", ours.problem, Restore(copy.data), shard)]
+    bad = [one for one in (ours, copy) if one.problem != "missing"]
+    return [Finding(one.key, "record", f"{one.problem}; so is its copy", _BACKUP, shard) for one in bad]
+
+
+def sound(ours: Read[Record], copy: Read[Record]) -> Record | None:
+    """The record, from whichever of the two files is sound."""
+    return ours.record if ours.record is not None else copy.record

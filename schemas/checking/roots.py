@@ -1,0 +1,161 @@
+"""The records at a run's root, and those at the root of a merged place, with their second copies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from pydantic import BaseModel, ConfigDict
+
+from schemas.checking.finding import Finding, Restore, curable
+from schemas.checking.records import compare, read, sound
+from schemas.errors import InputError
+from schemas.merged import MERGED, part_folder
+from schemas.record_files import encode_record
+from schemas.run import Run, copy_key
+from schemas.run_records import FORMAT_VERSION, Manifest, Merged, Plan
+from schemas.storage import Storage
+
+_MANIFEST = "manifest.json"
+
+
+class AnyRecord(BaseModel):
+    """A record of which only the signature is checked: nothing about data rests on it."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+@dataclass
+class Roots:
+    """The runs at a place as far as they can be opened, and what is wrong with the records at its root."""
+
+    runs: list[Run] = field(default_factory=list[Run])
+    is_merged: bool = False
+    findings: list[Finding] = field(default_factory=list[Finding])
+
+    def folder_of(self, run: Run) -> str:
+        """The run's folder below the place, with its closing slash."""
+        return f"{part_folder(run.manifest.spec_hash)}/" if self.is_merged else ""
+
+
+def open_roots(place: Storage) -> Roots:
+    """The run, or the parts, at `place`, opened from whichever of two copies is sound.
+
+    InputError where there is none, or it is of another format.
+    """
+    parts, findings = _merged_parts(place)
+    if parts is None:
+        run, found = _open_run(place)
+        if run is None and not found:
+            raise InputError(place.url, _MANIFEST, "not a run: no such file", "Name a run's folder")
+        return Roots([run] if run else [], False, found)
+    roots = Roots([], True, findings)
+    for spec_hash in parts:
+        folder = part_folder(spec_hash)
+        run, found = None, list[Finding]()
+        if next(iter(place.list(folder)), None) is not None:
+            run, found = _open_run(place.below(folder))
+        if run is None and not found:
+            found = [Finding(_MANIFEST, "record", "missing, and so is its copy", "Merge the runs again")]
+        elif run is not None and run.manifest.spec_hash != spec_hash:
+            found.append(Finding(_MANIFEST, "record", "is that of another run", "Merge the runs again"))
+            run = None
+        roots.findings += [below(folder + "/", finding) for finding in found]
+        if run is not None:
+            roots.runs.append(run)
+    return roots
+
+
+def below(prefix: str, finding: Finding) -> Finding:
+    """The finding as one of the place that has the run in the folder `prefix`."""
+    if not prefix:
+        return finding
+    return Finding(
+        prefix + finding.key, finding.kind, finding.problem, finding.mend, finding.shard, finding.cure
+    )
+
+
+def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
+    """Specification hashes of the parts, or None where this is no merged place."""
+    ours, copy = read(place, MERGED, Merged), read(place, copy_key(MERGED), Merged)
+    merged = sound(ours, copy)
+    if merged is not None:
+        _refuse_other_format(place, MERGED, merged.format_version)
+        # One that was merged before copies were kept has none.
+        gone = copy.data is None and copy.problem == "missing"
+        return merged.parts, [] if gone and ours.record is not None else compare(ours, copy)
+    hashes: set[str] = set()
+    for folder in sorted({"/".join(f.key.split("/")[:2]) for f in place.list("parts")}):
+        run, _ = _open_run(place.below(folder)) if folder.count("/") == 1 else (None, [])
+        if run is not None and part_folder(run.manifest.spec_hash) == folder:
+            hashes.add(run.manifest.spec_hash)
+    if ours.data is None and ours.problem == "missing" and len(hashes) < 2:
+        return None, []
+    if len(hashes) < 2:
+        problem = f"{ours.problem}, and its parts do not tell what it held"
+        return (), [Finding(MERGED, "record", problem, "Merge the runs again")]
+    parts = tuple(sorted(hashes))
+    data = encode_record(Merged(parts=parts))
+    return parts, [curable(MERGED, "record", f"{ours.problem}; its parts tell what it held", Restore(data))]
+
+
+def _open_run(storage: Storage) -> tuple[Run | None, list[Finding]]:
+    ours = read(storage, _MANIFEST, Manifest, _bad_hash)
+    copy = read(storage, copy_key(_MANIFEST), Manifest, _bad_hash)
+    manifest = sound(ours, copy)
+    if manifest is None:
+        return None, compare(ours, copy)
+    _refuse_other_format(storage, _MANIFEST, manifest.format_version)
+    return Run(storage, manifest), compare(ours, copy)
+
+
+def _bad_hash(manifest: Manifest) -> str:
+    if manifest.format_version == FORMAT_VERSION and manifest.spec.hash() != manifest.spec_hash:
+        return "spec_hash: not the hash of the specification beside it"
+    return ""
+
+
+def _refuse_other_format(storage: Storage, key: str, version: int) -> None:
+    if version != FORMAT_VERSION:
+        problem = f"{version}, and this program reads {FORMAT_VERSION}"
+        mend = "Use the version of the program that made the run"
+        raise InputError(f"{storage.url}/{key}", "format_version", problem, mend)
+
+
+def check_plans(run: Run) -> tuple[int, list[Finding]]:
+    """The samples wanted, and what is wrong with plans: each has its copy, and wants more than the last."""
+    findings: list[Finding] = []
+    numbers = {0}
+    for folder in ("plans", copy_key("plans")):
+        for file in run.storage.list(folder):
+            name = file.key.removeprefix(f"{folder}/").removesuffix(".json")
+            if name.isascii() and name.isdigit() and len(name) < 10 and f"{folder}/{name}.json" == file.key:
+                numbers.add(int(name))
+    n = 0
+    mend = "Restore the file from a backup, or submit again with the n that was wanted"
+    if max(numbers) > 10 * len(numbers) + 1000:
+        problem = f"plan {max(numbers)} among {len(numbers)} files"
+        return 0, [Finding("plans", "record", problem, "Move it away")]
+    for number in range(1, max(numbers) + 1):
+        key = f"plans/{number}.json"
+        ours, copy = read(run.storage, key, Plan), read(run.storage, copy_key(key), Plan)
+        found, plan = compare(ours, copy), sound(ours, copy)
+        if plan is None and not found:
+            found = [Finding(key, "record", "missing, and so is its copy", mend)]
+        elif plan is not None and plan.n <= n:
+            problem = f"n: {plan.n}, no more than the plan before"
+            found.append(Finding(key, "record", problem, "Remove the plan"))
+        findings += found
+        n = max(n, plan.n if plan else 0)
+    if not n:
+        findings.append(Finding("plans", "record", "no plan says how many samples are wanted", mend))
+    return n, findings
+
+
+def check_notes(place: Storage) -> Iterator[Finding]:
+    """Records about a place on which no row rests: of jobs, and of where merged shards came from."""
+    for folder in ("jobs", "lineage"):
+        for file in place.list(folder):
+            if file.key.endswith(".json") and (problem := read(place, file.key, AnyRecord).problem):
+                mend = "Restore the file from a backup, or remove it: no sample rests on it"
+                yield Finding(file.key, "record", problem, mend)

@@ -1,0 +1,208 @@
+"""The sealed store against the shards that it was laid over."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from hashlib import sha256
+
+from schemas.checking.finding import Finding, Reseal, curable
+from schemas.checking.shards import ShardForm, same_json
+from schemas.errors import InputError
+from schemas.record_files import MAX_RECORD_BYTES
+from schemas.run import Run, shard_folder
+from schemas.run_records import Commit
+from schemas.seal_contents import Contents, SealedRun, SealedShard
+from schemas.seal_metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
+from schemas.shard_files import TABLES, chunk_key, rows_per_shard
+from schemas.storage import Storage
+
+
+@dataclass(frozen=True)
+class SealedSlice:
+    """The shards of one run in the store by its own word: where each stands, and what the last is cut to."""
+
+    n: int
+    missing: tuple[int, ...]
+    positions: Mapping[int, int]  # shard -> its place among all shards of the store
+    cut: Mapping[int, tuple[int, int]]  # shard -> (scenes, samples) where it is not there whole
+
+    def wanted(self, shard: int, run: Run) -> tuple[int, int]:
+        """(scenes, samples) that the store has of a shard."""
+        return self.cut.get(shard, (run.layout.scenes_per_shard, run.layout.samples_per_shard))
+
+
+@dataclass
+class SealedTally:
+    """What the store must say of itself, gathered shard by shard in their order."""
+
+    digest: object = field(default_factory=sha256)
+    shards: list[SealedShard] = field(default_factory=list[SealedShard])
+    unknown: int = 0  # shards without a commit
+
+    def add(self, run: Run, slice_: SealedSlice, shard: int, commit: Commit | None) -> None:
+        """Count one shard of the store."""
+        if commit is None:
+            self.unknown += 1
+            return
+        scenes, samples = slice_.wanted(shard, run)
+        self.shards.append(SealedShard(shard_folder(shard, commit.attempt), scenes, samples))
+        update = self.digest.update  # type: ignore[attr-defined]
+        update(f"{run.manifest.spec_hash} {shard}\n".encode())
+        for entry in sorted(commit.files, key=lambda e: e.path):
+            update(f"{entry.path} {entry.sha256}\n".encode())
+
+
+def read_root(place: Storage, wanted: Mapping[str, int]) -> tuple[SealedRoot | None, list[Finding]]:
+    """What data.zarr says of itself; a finding where it is there and that cannot be so.
+
+    `wanted` are the samples that the newest plans want, by specification hash.
+    """
+    key = f"{SEALED}/{ROOT}"
+    try:
+        root = sealed_root(place)
+        there = root is not None or next(iter(place.list(SEALED)), None) is not None
+    except InputError as error:
+        return None, [curable(key, "sealed", error.problem, Reseal())]
+    if root is None:
+        # Where nothing can be renamed, a store without its root is one that was not finished.
+        if there and (place.folder is not None or place.exists(key)):
+            return None, [curable(key, "sealed", "missing, or does not say what was sealed", Reseal())]
+        return None, []
+    told = {part.spec_hash: part.n for part in root.parts}
+    if told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
+        problem = "says that it holds other rows than any plan wants"
+        return None, [curable(key, "sealed", problem, Reseal())]
+    return root, []
+
+
+def slices_of(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedSlice]:
+    """What the store holds of each run, by specification hash."""
+    found: dict[str, SealedSlice] = {}
+    before = 0
+    last: tuple[str, int] | None = None
+    held: dict[str, tuple[Run, int, tuple[int, ...], dict[int, int]]] = {}
+    for run in runs:
+        part = root.part(run.manifest.spec_hash)
+        if part is None:
+            continue
+        missing = set(part.missing_shards)
+        shards = [k for k in range(run.layout.shards_for(part.n)) if k not in missing]
+        positions = {shard: before + i for i, shard in enumerate(shards)}
+        before += len(shards)
+        held[run.manifest.spec_hash] = (run, part.n, tuple(sorted(missing)), positions)
+        if shards:
+            last = run.manifest.spec_hash, shards[-1]
+    for spec_hash, (run, n, missing, positions) in held.items():
+        cut: dict[int, tuple[int, int]] = {}
+        if last is not None and last[0] == spec_hash:
+            cut[last[1]] = run.layout.rows_wanted(last[1], n)
+        found[spec_hash] = SealedSlice(n, missing, positions, cut)
+    return found
+
+
+def check_chunks(
+    place: Storage, prefix: str, run: Run, form: ShardForm, slice_: SealedSlice, commit: Commit
+) -> Iterator[Finding]:
+    """The store's chunks of one shard: links to its files, or equal bytes."""
+    folder = f"{prefix}{shard_folder(commit.shard, commit.attempt)}"
+    entries = {entry.path: entry for entry in commit.files}
+    wanted = dict(zip(TABLES, slice_.wanted(commit.shard, run), strict=True))
+    for table in TABLES:
+        rows = rows_per_shard(run.layout, table)
+        for array in form.schema.table(table):
+            paths = form.chunks[array.name]
+            step = rows // len(paths)
+            for i in range(-(-wanted[table] // step)):
+                number = slice_.positions[commit.shard] * len(paths) + i
+                key = f"{SEALED}/{array.name}/{chunk_key(array, number)}"
+                entry = entries.get(paths[i])
+                if entry is None or _is_link(place, key, f"{folder}/{entry.path}"):
+                    continue
+                most = min(entry.size, form.most_bytes(paths[i]))
+                if problem := _other_bytes(place, key, most, entry.sha256):
+                    cure = Reseal(source=f"{folder}/{entry.path}")
+                    yield curable(key, "sealed", problem, cure, commit.shard)
+
+
+def _is_link(place: Storage, key: str, source: str) -> bool:
+    if place.folder is None:
+        return False
+    try:
+        one, other = (place.folder / key).lstat(), (place.folder / source).lstat()
+    except OSError:
+        return False
+    return stat.S_ISREG(one.st_mode) and (one.st_dev, one.st_ino) == (other.st_dev, other.st_ino)
+
+
+def _other_bytes(place: Storage, key: str, size: int, digest: str) -> str:
+    try:
+        data = place.get(key, size)
+    except InputError as error:
+        return error.problem
+    if data is None:
+        return "missing"
+    return "" if sha256(data).hexdigest() == digest else "other bytes than its shard has"
+
+
+def check_store(
+    place: Storage,
+    runs: list[Run],
+    wanted: Mapping[str, int],
+    slices: Mapping[str, SealedSlice],
+    tally: SealedTally,
+) -> Iterator[Finding]:
+    """The store's metadata, files that are too many, and whether it is behind its runs."""
+    if tally.unknown:
+        problem = f"holds {tally.unknown} shards of which there is no commit"
+        yield curable(SEALED, "sealed", problem, Reseal())
+        return
+    sealed = tuple(
+        SealedRun(run, part.n, tuple(part.positions), part.missing)
+        for run in runs
+        if (part := slices.get(run.manifest.spec_hash)) is not None
+    )
+    first = sealed[0].run
+    digest = tally.digest.hexdigest()  # type: ignore[attr-defined]
+    contents = Contents(place, sealed, tuple(tally.shards), (digest,), first.schema, first.layout)
+    for path, data in sealed_metadata(contents).items():
+        key = f"{SEALED}/{path}"
+        try:
+            there = place.get(key, MAX_RECORD_BYTES)
+            problem = "missing" if there is None else ""
+            if there is not None and not same_json(there, data):
+                problem = "is not what sealing writes for these shards"
+        except InputError as error:
+            problem = error.problem
+        if problem:
+            yield curable(key, "sealed", problem, Reseal(data=data))
+    yield from _foreign_files(contents)
+    if any(_is_behind(run, wanted[run.manifest.spec_hash], slices) for run in runs):
+        mend = "Run datagen seal to bring it up to date; nothing is damaged"
+        yield Finding(SEALED, "stale", "is older than what is committed now", mend)
+
+
+def _is_behind(run: Run, n: int, slices: Mapping[str, SealedSlice]) -> bool:
+    part = slices.get(run.manifest.spec_hash)
+    return part is None or part.n != n or bool(run.committed() & set(part.missing))
+
+
+def _foreign_files(contents: Contents) -> Iterator[Finding]:
+    known = {f"{SEALED}/{ROOT}"}
+    counts: dict[str, int] = {}
+    fields = {f.name: f for table in TABLES for f in contents.schema.table(table)}
+    for table in TABLES:
+        for array in contents.schema.table(table):
+            known.add(f"{SEALED}/{array.name}/zarr.json")
+            # Only the last shard is cut, so that chunks are numbered without gaps.
+            counts[array.name] = sum(1 for _ in contents.chunks(array))
+    for file in contents.place.list(SEALED):
+        if file.key in known:
+            continue
+        names = file.key.split("/")
+        number = names[2].split(".")[1] if len(names) == 3 and names[2].startswith("c.") else ""
+        array = fields.get(names[1]) if number.isascii() and number.isdigit() and len(number) < 16 else None
+        if array is None or names[2] != chunk_key(array, int(number)) or int(number) >= counts[array.name]:
+            problem = "is no file of the sealed store"
+            yield curable(file.key, "sealed", problem, Reseal())

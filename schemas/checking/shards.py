@@ -1,0 +1,212 @@
+"""The files of a committed shard: their bytes, and the rows in them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+from schemas.checking.finding import Finding, Remake, curable
+from schemas.errors import InputError
+from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
+from schemas.identity import sample_ids
+from schemas.run import Run, shard_folder
+from schemas.run_records import Commit, FileEntry
+from schemas.shard_files import (
+    MAX_TEXT_BYTES,
+    TABLES,
+    chunk_key,
+    chunk_rows,
+    group_metadata,
+    rows_per_shard,
+)
+from schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
+from schemas.storage import StoredFile
+
+_WRITTEN_SO = "It was written so: remove the commit and its copy, and submit again"
+# What the checks of a shard's rows need together; every other array is looked at by itself.
+_KEYS = ("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
+
+
+@dataclass(frozen=True, eq=False)
+class ShardForm:
+    """What every shard of a run must look like."""
+
+    schema: RecordSchema
+    metadata: Mapping[str, bytes]
+    chunks: Mapping[str, tuple[str, ...]]  # of each array, by its name: paths in the order of rows
+    arrays: Mapping[str, StoredArray]
+
+    def most_bytes(self, path: str) -> int:
+        """More than a file of a shard can have."""
+        array = self.arrays.get(path.split("/")[0])
+        if array is None or path in self.metadata:
+            return MAX_META_BYTES
+        count = array.chunk_rows * math.prod(array.shape[1:])
+        item = 4 + MAX_TEXT_BYTES if array.is_text else np.dtype(array.dtype).itemsize
+        return 2**10 + count * item * 17 // 16  # zstd adds less than a hundredth to what it cannot pack
+
+    @property
+    def paths(self) -> frozenset[str]:
+        """Every file of a shard."""
+        return frozenset((*self.metadata, *(path for paths in self.chunks.values() for path in paths)))
+
+
+def form_of(run: Run) -> ShardForm:
+    """The form of this run's shards."""
+    schema, layout = run.schema, run.layout
+    metadata = group_metadata(schema, layout, run.manifest.spec_hash)
+    chunks: dict[str, tuple[str, ...]] = {}
+    arrays: dict[str, StoredArray] = {}
+    for table in TABLES:
+        rows = rows_per_shard(layout, table)
+        for field in schema.table(table):
+            count = rows // chunk_rows(schema, field, rows)
+            chunks[field.name] = tuple(f"{field.name}/{chunk_key(field, i)}" for i in range(count))
+            path = f"{field.name}/zarr.json"
+            arrays[field.name] = parse_metadata(path, field.name, metadata[path])
+    return ShardForm(schema, metadata, chunks, arrays)
+
+
+def check_shard(
+    run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, StoredFile]
+) -> Iterator[Finding]:
+    """Every file of a committed shard against its entry, and the rows against the schema.
+
+    `listed` are the files below the shard's folder. Holds one shard's arrays at most.
+    """
+    folder = shard_folder(commit.shard, commit.attempt)
+    entries = {entry.path: entry for entry in commit.files}
+    if odd := sorted(form.paths ^ entries.keys()):
+        problem = f"files: lacks or adds {len(odd)} files, first {odd[0]}"
+        yield Finding(f"commits/{commit.shard:06d}.json", "rows", problem, _WRITTEN_SO, commit.shard)
+    for key in listed:
+        path = key.removeprefix(f"{folder}/")
+        if path != key and path not in entries and path != "commit.json":
+            problem = "no record knows this file in a committed attempt's folder"
+            yield Finding(key, "foreign", problem, "Move it away: nothing reads it", commit.shard)
+    kept: dict[str, Array] = {}
+    whole = True
+    if "zarr.json" in entries:
+        data, findings = _bytes_of(run, form, commit, entries["zarr.json"], listed)
+        yield from findings
+        yield from _check_metadata(form, folder, "zarr.json", data, commit.shard)
+    for table in TABLES:
+        for field in form.schema.table(table):
+            names = (f"{field.name}/zarr.json", *form.chunks[field.name])
+            read: dict[str, bytes] = {}
+            for path in names:
+                if path in entries:
+                    data, findings = _bytes_of(run, form, commit, entries[path], listed)
+                    yield from findings
+                    if data is not None:
+                        read[path] = data
+            yield from _check_metadata(form, folder, names[0], read.pop(names[0], None), commit.shard)
+            if len(read) != len(names) - 1:
+                whole = False
+                continue
+            values, problem = _decode(run, form, table, field, list(read.values()))
+            if problem:
+                whole = False
+                yield Finding(f"{folder}/{field.name}", "rows", problem, _WRITTEN_SO, commit.shard)
+            elif values is not None and field.name in _KEYS:
+                kept[field.name] = values
+    if whole:
+        for name, problem in _row_problems(run, commit, kept):
+            yield Finding(f"{folder}/{name}", "rows", problem, _WRITTEN_SO, commit.shard)
+
+
+def _bytes_of(
+    run: Run, form: ShardForm, commit: Commit, entry: FileEntry, listed: Mapping[str, StoredFile]
+) -> tuple[bytes | None, list[Finding]]:
+    """A file's bytes where they are those that were committed, or what is wrong."""
+    key = f"{shard_folder(commit.shard, commit.attempt)}/{entry.path}"
+    there = listed.get(key)
+    data, problem = None, ""
+    if entry.size > form.most_bytes(entry.path):
+        problem = f"{entry.size} bytes by its commit, more than such a file can have"
+        return None, [Finding(key, "rows", problem, _WRITTEN_SO, commit.shard)]
+    if there is None:
+        problem = "missing"
+    elif there.size != entry.size:
+        problem = f"{there.size} bytes, where the commit has {entry.size}"
+    else:
+        try:
+            data = run.storage.get(key, entry.size)
+        except InputError as error:
+            problem = error.problem
+        else:
+            if data is None:
+                problem = "missing"
+            elif sha256(data).hexdigest() != entry.sha256:
+                data, problem = None, "sha256: other bytes than were committed"
+    if not problem:
+        return data, []
+    return None, [curable(key, "file", problem, Remake(run, commit.shard, entry), commit.shard)]
+
+
+def _check_metadata(
+    form: ShardForm, folder: str, path: str, data: bytes | None, shard: int
+) -> Iterator[Finding]:
+    if data is None or same_json(data, form.metadata.get(path, b"")):
+        return
+    problem = "not the metadata that the schema asks for"
+    yield Finding(f"{folder}/{path}", "rows", problem, _WRITTEN_SO, shard)
+
+
+def same_json(data: bytes, wanted: bytes) -> bool:
+    """Whether two files are equal, or are so but for how a library lays out its JSON."""
+    if data == wanted:
+        return True
+    try:
+        return bool(json.loads(data) == json.loads(wanted))
+    except (ValueError, RecursionError):
+        return False
+
+
+def _decode(
+    run: Run, form: ShardForm, table: Table, field: Field, chunks: list[bytes]
+) -> tuple[Array | None, str]:
+    """An array of the shard, checked by its field's dtype, shape and range; or what is wrong."""
+    rows = rows_per_shard(run.layout, table)
+    alone = RecordSchema(form.schema.name, form.schema.version, (field,), (field,), form.schema.sizes)
+    try:
+        parts = [decode_chunk(field.name, form.arrays[field.name], data) for data in chunks]
+        values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        alone.check(table, rows, {field.name: values})
+    except InputError as error:
+        return None, error.problem
+    return values, ""
+
+
+def _row_problems(run: Run, commit: Commit, kept: Mapping[str, Array]) -> Iterator[tuple[str, str]]:
+    """(array, problem) where rows are not those that this shard must have, or unlike its commit."""
+    layout = run.layout
+    first, scenes, each = commit.shard * layout.scenes_per_shard, commit.scenes, layout.candidates_per_scene
+    indices = np.arange(first, first + scenes)
+    candidates = np.arange(each)
+    ids = np.concatenate([sample_ids(run.manifest.spec_hash, int(i), candidates) for i in indices])
+    wanted: dict[str, np.ndarray[Any, Any]] = {
+        "scene_index": indices,
+        "sample_scene_index": np.repeat(indices, each),
+        "candidate_index": np.tile(candidates, scenes),
+        "sample_id": ids,
+    }
+    for name, values in wanted.items():
+        if not np.array_equal(kept[name], values):
+            row = int(np.flatnonzero((kept[name] != values).reshape(len(values), -1).any(axis=1))[0])
+            yield name, f"row {row} is not that of its place in the run"
+    positives = int(np.count_nonzero(kept["label"]))
+    if positives != commit.positives:
+        yield "label", f"{positives} positives, where the commit has {commit.positives}"
+    sums = dict(zip(REDRAW_CAUSES, kept["redraws"].sum(axis=0).tolist(), strict=False))
+    redraws = {cause: count for cause, count in sums.items() if count}
+    # Scenes that are labelled again keep the counts of those that drew them, at no cost to this run.
+    known = [redraws] if run.manifest.spec.scenes_from is None else [redraws, {}]
+    if {cause: count for cause, count in commit.redraws.items() if count} not in known:
+        yield "redraws", f"add up to {redraws}, where the commit has {commit.redraws}"

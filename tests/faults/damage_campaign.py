@@ -1,0 +1,182 @@
+"""A run damaged on purpose, one file at a time: what checks find, and what mending brings back."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from schemas.checking.finding import Finding
+from schemas.checking.mending import Mended, mend_place
+from schemas.checking.place import Checked, check_place
+from schemas.run import Run
+from schemas.run_records import LedgerEntry
+from schemas.seal import seal
+from schemas.shard_files import encode_shard
+from schemas.storage import open_storage
+from tests.made_runs import make_run, now, rows_of
+
+# What has no second source: its loss is found, and cannot be undone bit for bit.
+_ALONE = ("ledger/", "quarantine/")
+
+
+@dataclass(frozen=True)
+class Damage:
+    """One file, and what is done to its bytes; None removes it."""
+
+    kind: str
+    key: str
+    change: Callable[[bytes], bytes | None]
+
+
+@dataclass
+class Campaign:
+    """How many damages of each kind there were, and those that went wrong."""
+
+    tried: Counter[str] = field(default_factory=Counter[str])
+    missed: list[str] = field(default_factory=list[str])
+    not_restored: list[str] = field(default_factory=list[str])
+    not_clean: list[str] = field(default_factory=list[str])
+
+    def rows(self) -> Iterator[tuple[str, int, int, int, int]]:
+        """(kind, tried, missed, not restored, not clean after), by kind."""
+        for kind in sorted(self.tried):
+            counts = [
+                sum(one.startswith(f"{kind} ") for one in bad)
+                for bad in (self.missed, self.not_restored, self.not_clean)
+            ]
+            yield kind, self.tried[kind], counts[0], counts[1], counts[2]
+
+
+def make_place(folder: Path, n: int = 19, scenes_per_shard: int = 2, candidates_per_scene: int = 5) -> Run:
+    """A sealed run of few files, whose ledger has waste too."""
+    run = make_run(folder, n, scenes_per_shard, candidates_per_scene)
+    run.ledger.start("b-0", 0)
+    run.ledger.end(LedgerEntry(attempt="b-0", shard=0, outcome="failed", cause="ValueError", ended=now()))
+    seal(run.storage)
+    return run
+
+
+def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+    """The files of a shard of random rows, computed again."""
+    scenes, samples = rows_of(run, shard)
+    return encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+
+
+def kind_of(key: str) -> str:
+    """What sort of file a key names."""
+    first, last = key.split("/")[0], key.rsplit("/", 1)[-1]
+    if first in ("shards", "data.zarr"):
+        sort = "commit copy" if last == "commit.json" else "zarr.json" if last == "zarr.json" else "chunk"
+        return f"sealed {sort}" if first == "data.zarr" else sort
+    return {"copies": "root copy"}.get(first, first.removesuffix(".json").rstrip("s"))
+
+
+def flips(folder: Path, count: int, rng: np.random.Generator) -> Iterator[Damage]:
+    """Random single bit flips: every sort of file has its share, every byte of a sort the same chance."""
+    by_kind: dict[str, list[str]] = {}
+    for key in keys_of(folder):
+        by_kind.setdefault(kind_of(key), []).append(key)
+    kinds = sorted(by_kind)
+    for i in range(count):
+        keys = by_kind[kinds[i % len(kinds)]]
+        sizes = np.array([(folder / key).stat().st_size for key in keys])
+        key = keys[int(rng.choice(len(keys), p=sizes / sizes.sum()))]
+        bit = int(rng.integers(8 * (folder / key).stat().st_size))
+        yield Damage(f"flip {kind_of(key)}", key, lambda data, bit=bit: _flipped(data, bit))
+
+
+def cuts(folder: Path) -> Iterator[Damage]:
+    """Each file in turn removed, cut to nothing, to half, by one byte, and with a byte more."""
+    for key in keys_of(folder):
+        sort = kind_of(key)
+        yield Damage(f"delete {sort}", key, lambda data: None)
+        yield Damage(f"empty {sort}", key, lambda data: b"")
+        yield Damage(f"halve {sort}", key, lambda data: data[: len(data) // 2])
+        yield Damage(f"shorten {sort}", key, lambda data: data[:-1])
+        yield Damage(f"append {sort}", key, lambda data: data + b"\0")
+
+
+def keys_of(folder: Path) -> list[str]:
+    """Every file below a folder."""
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def try_all(clean: Path, scratch: Path, damages: Iterator[Damage], campaign: Campaign) -> None:
+    """Do each damage to a run equal to `clean`, check it, mend it, and check it again."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    copy_run(clean, scratch)
+    whole = {key: (clean / key).read_bytes() for key in keys_of(clean)}
+    for damage in damages:
+        campaign.tried[damage.kind] += 1
+        name = f"{damage.kind} {damage.key}"
+        apply(scratch, damage)
+        if not [f for f in findings_at(scratch) if f.is_damage]:
+            campaign.missed.append(name)
+        mended = mend_at(scratch)
+        if mended.changed:
+            campaign.not_restored.append(f"{name}: also touched {mended.changed[:3]}")
+        there = {key: (scratch / key).read_bytes() for key in keys_of(scratch)}
+        # What has no second source may be left as it is, or be written anew from what is known.
+        apart = {key for key in whole.keys() | there.keys() if whole.get(key) != there.get(key)}
+        alone = damage.key.startswith(_ALONE)
+        if apart - ({damage.key} if alone else set()):
+            campaign.not_restored.append(f"{name}: {sorted(apart)[:3]}")
+        if not alone and ((left := findings_at(scratch)) or mended.left):
+            campaign.not_clean.append(f"{name}: {left[:2]}")
+        if apart:
+            shutil.rmtree(scratch)
+            copy_run(clean, scratch)
+
+
+def copy_run(source: Path, target: Path) -> None:
+    """Copy a run with its hard links between data.zarr and the shards."""
+    linked: dict[int, Path] = {}
+    for path in sorted(source.rglob("*")):
+        to = target / path.relative_to(source)
+        if path.is_dir():
+            to.mkdir(parents=True, exist_ok=True)
+            continue
+        to.parent.mkdir(parents=True, exist_ok=True)
+        inode = path.stat().st_ino
+        if inode in linked:
+            os.link(linked[inode], to)
+        else:
+            shutil.copy2(path, to)
+            linked[inode] = to
+
+
+def apply(folder: Path, damage: Damage) -> None:
+    """Change the file in place, so that its hard links change with it; or remove its name."""
+    path = folder / damage.key
+    data = damage.change(path.read_bytes())
+    if data is None:
+        path.unlink()
+        return
+    mode = path.stat().st_mode
+    path.chmod(0o644)
+    with path.open("r+b") as f:
+        f.truncate(0)
+        f.write(data)
+    path.chmod(mode)
+
+
+def findings_at(folder: Path) -> list[Finding]:
+    """What checks find at a place."""
+    return list(check_place(open_storage(folder, probe=False, create=False), Checked()))
+
+
+def mend_at(folder: Path) -> Mended:
+    """Mend a place of random rows."""
+    return mend_place(open_storage(folder, probe=False, create=False), remake)
+
+
+def _flipped(data: bytes, bit: int) -> bytes:
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
