@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from math import fsum
 
+from schemas.index import Heads
 from schemas.run import Run
 from schemas.run_records import Cost
 
@@ -41,7 +43,7 @@ class Account:
     @property
     def unnamed_wall_s(self) -> float:
         """Wall seconds that no stage claimed."""
-        return max(0.0, self.wall_s - sum(self.stage_wall_s.values()))
+        return max(0.0, self.wall_s - fsum(self.stage_wall_s.values()))
 
 
 @dataclass
@@ -71,10 +73,8 @@ def account_for(runs: Iterable[Run]) -> Books:
     """
     books = Books()
     for run in runs:
-        # The ledger first: whatever it calls committed then has its commit, also while a job goes on.
-        ledger, unfinished = list(run.ledger.ends()), run.ledger.unfinished()
-        committed: set[str] = set()
-        for commit in run.commits():
+        heads, committed = Heads(run), set[str]()
+        for commit in heads.commits():
             committed.add(commit.attempt)
             books.labels += commit.samples
             books.positives += commit.positives
@@ -82,8 +82,8 @@ def account_for(runs: Iterable[Run]) -> Books:
             books.redraws.update(commit.redraws)
             books.useful.add(commit.cost)
             books.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-        for entry in ledger:
+        for entry in heads.ends():
             if entry.attempt not in committed:
                 books.waste.setdefault(entry.outcome, Account()).add(entry.cost)
-        books.running += sum(start.attempt not in committed for start in unfinished)
+        books.running += sum(start.attempt not in committed for start in heads.unfinished())
     return books

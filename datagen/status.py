@@ -8,8 +8,10 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.console import print_json, print_rows
+from schemas.index import Heads
 from schemas.run import Run
 from schemas.seal import sealed_root
+from schemas.shard_ranges import ShardRanges
 
 
 def status(
@@ -28,17 +30,24 @@ def status(
 
 def status_report(run: Run) -> dict[str, Any]:
     """The state of a run as plain values."""
-    planned, committed, quarantined = run.planned(), run.committed(), run.quarantined()
-    commits = list(run.commits())
+    heads, n = Heads(run), run.n
+    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(heads.shards)
+    quarantined = run.quarantined()
+    labels = labels_made = positives = 0
+    winners: set[str] = set()
+    for commit in heads.commits():
+        labels += run.layout.rows_wanted(commit.shard, n)[1]
+        labels_made += commit.samples
+        positives += commit.positives
+        winners.add(commit.attempt)
     outcomes: Counter[str] = Counter()
     causes: Counter[str] = Counter()
-    for entry in run.ledger.ends():
+    for entry in heads.ends():
         outcomes[entry.outcome] += 1
         if entry.cause:
             causes[f"{entry.outcome}: {entry.cause}"] += 1
-    unfinished = {start.attempt for start in run.ledger.unfinished()} - {c.attempt for c in commits}
-    done = [c for c in commits if c.shard in planned]
-    root, absent = sealed_root(run.storage), sorted(set(planned) - committed)
+    unfinished = {start.attempt for start in heads.unfinished()} - winners
+    root, absent = sealed_root(run.storage), planned.without(committed)
     part = root.part(run.manifest.spec_hash) if root else None
     return {
         "run": run.storage.url,
@@ -46,24 +55,24 @@ def status_report(run: Run) -> dict[str, Any]:
         "spec_hash": run.manifest.spec_hash,
         "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
-        "n": run.n,
-        "labels": sum(run.layout.rows_wanted(c.shard, run.n)[1] for c in done),
+        "n": n,
+        "labels": labels,
         # Commits count whole shards, and so more than n where the last one is cut.
-        "labels_made": sum(c.samples for c in commits),
-        "positives": sum(c.positives for c in commits),
+        "labels_made": labels_made,
+        "positives": positives,
         "shards": {
             "planned": len(planned),
-            "committed": len(committed & set(planned)),
+            "committed": len(planned) - len(absent),
             "quarantined": sorted(quarantined),
-            "missing": len(planned) - len(committed & set(planned)) - len(quarantined & set(planned)),
+            "missing": len(absent.without(ShardRanges.of(quarantined))),
         },
         "attempts": dict(sorted(outcomes.items())),
         "attempts_without_end": len(unfinished),
         "causes": dict(causes.most_common(20)),
         # An older seal, of a shorter run or with fewer shards, does not count.
-        "sealed": part is not None and (part.n, part.missing_shards) == (run.n, absent),
+        "sealed": part is not None and part.n == n and absent == part.missing_shards,
         "sealed_labels": part.n if part else None,
-        "complete": len(committed & set(planned)) == len(planned),
+        "complete": not absent,
     }
 
 

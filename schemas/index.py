@@ -102,7 +102,7 @@ class Heads:
 
 
 def refresh(run: Run) -> int:
-    """Bring the index up to date with the run's records; return how many it had not held.
+    """Bring the index up to date with the run's records; return how many were added.
 
     Records that cannot be read are left out. Small files, and those most of whose rows went stale, are
     joined to full ones, so that the index has few files and no more rows than the run has records.
@@ -136,12 +136,14 @@ def refresh(run: Run) -> int:
         for name, head in _read(run, kind, missing):
             if head is None or isinstance(head, InputError):
                 continue
-            new += 1
             read.append((name, stamps[kind][name], head))
             if len(read) == ROWS_PER_FILE // 4:
-                pending[kind] = _flushed(run, joined(pending[kind], table_of(kind, read)))
-                read = []
-        pending[kind] = joined(pending[kind], table_of(kind, read))
+                table = table_of(kind, read)
+                new, read = new + len(table), []
+                pending[kind] = _flushed(run, joined(pending[kind], table))
+        table = table_of(kind, read)
+        new += len(table)
+        pending[kind] = _flushed(run, joined(pending[kind], table))
     if not new and len(spent) <= sum(len(table) > 0 for table in pending.values()):
         return 0  # what is there would only be written again
     for table in pending.values():

@@ -1,0 +1,203 @@
+"""The index answers as the records do, whatever happened to either behind its back."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import random
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import schemas.index
+from datagen.accounts import Books, account_for
+from schemas.errors import InputError
+from schemas.heads import CommitHead, EndHead, head_of_commit, head_of_end
+from schemas.index import closed_ends, committed_heads, index_files, refresh
+from schemas.record_files import encode_record
+from schemas.run import Run, commit_key
+from schemas.run_records import Commit, Cost, Host, LedgerEntry
+from tests.made_runs import commit_of, make_run
+
+SHARDS = 12
+OUTCOMES = ("failed", "crashed", "hung", "lost", "superseded", "out_of_memory", "cancelled")
+
+
+def bare_run(folder: Path) -> Run:
+    """A run whose commits name no files: what counts here are records."""
+    return make_run(folder, n=10 * SHARDS, shards=())
+
+
+def cost(rng: random.Random) -> Cost:
+    stages = {stage: rng.uniform(0, 9) for stage in rng.sample(["draw", "settle", "observe", "write"], 3)}
+    return Cost(
+        wall_s=rng.uniform(30, 99), cpu_s=rng.uniform(0, 99), stage_wall_s=stages,
+        stage_gpu_s={"observe": 0.1} if rng.random() < 0.3 else {}, peak_rss_bytes=rng.randrange(2**40),
+        written_bytes=rng.randrange(2**40),
+    )  # fmt: skip
+
+
+def commit(run: Run, rng: random.Random, shard: int) -> Commit:
+    redraws = {cause: rng.randrange(9) for cause in ("no_base", "bad_house") if rng.random() < 0.5}
+    made = commit_of(run, shard, f"a{rng.randrange(10**9)}", (), rng.randrange(10), redraws)
+    host = Host(name="h", cpu="c", cores=1, memory_bytes=1, pid=rng.randrange(3))
+    return made.model_copy(update={"cost": cost(rng), "host": host})
+
+
+def end(rng: random.Random, attempt: str, shard: int) -> LedgerEntry:
+    return LedgerEntry(
+        attempt=attempt, shard=shard, outcome=rng.choice(OUTCOMES), cause="x" * rng.choice([0, 9, 2000]),
+        stack="a stack", cost=cost(rng) if rng.random() < 0.8 else None,
+    )  # fmt: skip
+
+
+def from_records(run: Run) -> tuple[list[CommitHead], list[EndHead], Books]:
+    """What the records alone say, each read by itself."""
+    commits = [head_of_commit(Run.open(run.storage).commit_of(shard)) for shard in sorted(run.committed())]
+    ends = [head_of_end(entry) for entry in run.ledger.ends()]
+    files = {key: run.storage.get(key, 2**30) for key in index_files(run)}
+    run.storage.delete(files)
+    books = account_for([run])
+    for key, data in files.items():
+        run.storage.put(key, data or b"")
+    return commits, ends, books
+
+
+def assert_equal(run: Run) -> None:
+    commits, ends, books = from_records(run)
+    assert list(committed_heads(run)) == commits and list(closed_ends(run)) == ends
+    said = account_for([run])
+    assert said == books and said.useful.unnamed_wall_s == books.useful.unnamed_wall_s
+
+
+class History:
+    """Things that happen to a run, by name."""
+
+    def __init__(self, run: Run, seed: int) -> None:
+        self.run, self.rng, self.edits = run, random.Random(seed), 0
+
+    def rewrite(self, key: str, data: bytes) -> None:
+        """Change a file behind the program's back, in place, as an editor may."""
+        path = Path(self.run.storage.url, key)
+        path.write_bytes(data)
+        self.edits += 1
+        at = 1_900_000_000 + self.edits  # as if at another time: the clock of a file system has coarse ticks
+        os.utime(path, (at, at))
+
+    def commits(self) -> None:
+        for shard in self.rng.sample(range(SHARDS), 3):
+            made = commit(self.run, self.rng, shard)
+            won = self.run.commit(made)
+            entry = end(self.rng, made.attempt, shard)
+            self.run.ledger.end(entry.model_copy(update={"outcome": "committed"}) if won else entry)
+
+    def fails(self) -> None:
+        for _ in range(3):
+            name = f"a{self.rng.randrange(10**9)}"
+            self.run.ledger.start(name, 1)
+            if self.rng.random() < 0.8:
+                self.run.ledger.end(end(self.rng, name, 1))
+
+    def refreshes(self) -> None:
+        refresh(self.run)
+
+    def changes_a_commit(self) -> None:
+        for shard in sorted(self.run.committed())[:2]:
+            changed = commit(self.run, self.rng, shard)
+            self.rewrite(commit_key(shard), encode_record(changed))
+
+    def changes_an_end(self) -> None:
+        for entry in list(self.run.ledger.ends())[:2]:
+            changed = end(self.rng, entry.attempt, entry.shard)
+            self.rewrite(f"ledger/{entry.attempt}.json", encode_record(changed))
+
+    def loses_records(self) -> None:
+        keys = [f.key for folder in ("commits", "ledger") for f in self.run.storage.list(folder)]
+        self.run.storage.delete(self.rng.sample(sorted(keys), min(2, len(keys))))
+
+    def damages_the_index(self) -> None:
+        for key in index_files(self.run)[:1]:
+            data = bytearray(self.run.storage.get(key, 2**30) or b"")
+            data[self.rng.randrange(len(data))] ^= 1 << self.rng.randrange(8)
+            self.rewrite(key, bytes(data[: self.rng.choice([None, len(data) // 2])]))
+
+    def loses_the_index(self) -> None:
+        self.run.storage.delete(index_files(self.run)[: self.rng.choice([1, 9])])
+
+
+HAPPENS = sorted(name for name, member in vars(History).items() if name[0] != "_" and name != "rewrite")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(HAPPENS), max_size=8), st.integers(0, 2**32), st.sampled_from([4, 16_384]))
+def test_answers_are_those_of_the_records(words: list[str], seed: int, rows: int) -> None:
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schemas.index, "ROWS_PER_FILE", rows)
+        run = bare_run(Path(folder))
+        history = History(run, seed)
+        history.commits()
+        history.refreshes()
+        for word in words:
+            getattr(history, word)()
+            assert_equal(run)
+        refresh(run)
+        assert_equal(run)
+        records = len(run.committed()) + sum(1 for _ in run.ledger.ends())
+        assert len(index_files(run)) <= 2 + 2 * records // rows + 2  # halves at most, and a rest of each kind
+        assert refresh(run) == 0
+
+
+def indexed(folder: Path) -> Run:
+    run = bare_run(folder)
+    History(run, 1).commits()
+    History(run, 2).fails()
+    refresh(run)
+    return run
+
+
+def test_what_the_index_holds_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = indexed(tmp_path)
+    read: list[str] = []
+    many: Callable[..., object] = run.storage.get_many
+    monkeypatch.setattr(run.storage, "get_many", lambda keys, n: many(read.extend(k := list(keys)) or k, n))
+    assert len(list(committed_heads(run))) == 3
+    list(closed_ends(run))
+    long = [e.attempt for e in run.ledger.ends() if len(e.cause) > 1000]
+    assert [key for key in read if "commits/" in key] == []
+    assert {key for key in read if "ledger/" in key} >= {f"ledger/{name}.json" for name in long}
+
+
+def test_a_damaged_record_is_refused_as_without_an_index(tmp_path: Path) -> None:
+    run = indexed(tmp_path)
+    shard = min(run.committed())
+    path = tmp_path / commit_key(shard)
+    path.write_bytes(path.read_bytes().replace(b'"samples": 10', b'"samples": 11'))
+    with pytest.raises(InputError, match="damaged or was edited"):
+        list(committed_heads(run))
+    refresh(run)  # leaves it out
+    with pytest.raises(InputError, match="damaged or was edited"):
+        list(committed_heads(run))
+
+
+def test_an_index_of_another_run_does_not_count(tmp_path: Path) -> None:
+    ours, theirs = indexed(tmp_path / "a"), indexed(tmp_path / "b")
+    other = theirs.manifest.model_copy(update={"spec_hash": "7" * 64})
+    Run(theirs.storage, other)
+    for key in index_files(ours):
+        forged = gzip.decompress(ours.storage.get(key, 2**30) or b"").replace(b'"shard"', b'"snark"')
+        theirs.storage.put(key, gzip.compress(forged))
+    assert_equal(theirs)
+    refresh(theirs)
+    assert_equal(theirs)
+
+
+def test_an_index_that_unpacks_to_terabytes_is_not_unpacked(tmp_path: Path) -> None:
+    run = indexed(tmp_path)
+    bomb = gzip.compress(bytes(2**27 + 1), 1)
+    run.storage.put("index/7.json.gz", bomb)
+    assert_equal(run)
+    assert refresh(run) >= 0 and "index/7.json.gz" not in index_files(run)
