@@ -14,7 +14,8 @@ from pathlib import Path
 from cluster.driver import Order, drive
 from cluster.guard import Meter, utc_now
 from cluster.policy import Policy
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest
 from cluster.task import Product
 from schemas.run_records import Cost, LedgerEntry

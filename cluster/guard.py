@@ -1,7 +1,9 @@
 """The worker's side of an attempt: deadline with stack, process notes, account of the cost.
 
 A worker that is killed cannot answer. So it first writes who it is into a small note, and points
-`faulthandler` at a file beside it: whatever ends the process, the driver finds what is known.
+`faulthandler` at a file beside it: whatever ends the process, the driver finds what is known. Notes
+are kept in a folder of the worker's own machine, under a name that is the job's alone: a job on many
+machines writes no small files over a network, and needs no folder that all of them share.
 """
 
 from __future__ import annotations
@@ -11,8 +13,11 @@ import json
 import os
 import platform
 import resource
+import secrets
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -111,8 +116,9 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
         yield
         return
     note, stack = _note_path(task.notes, task.attempt), _stack_path(task.notes, task.attempt)
+    note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     draft = note.with_suffix(".part")
-    draft.write_text(json.dumps({"host": platform.node(), "pid": os.getpid(), "started": started}))
+    draft.write_text(json.dumps({"host": this_host().model_dump(), "started": started}))
     draft.rename(note)
     if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
         try:
@@ -138,49 +144,71 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
 
 @dataclass(frozen=True)
 class Note:
-    """What a worker left behind about an attempt."""
+    """What a worker wrote about itself when it began an attempt."""
 
-    host: str
-    pid: int
+    host: Host
     started: str
 
 
+@dataclass(frozen=True)
+class Remains:
+    """What a dead worker left of an attempt: its note, and the stack that it died with ("" for none)."""
+
+    note: Note | None = None
+    stack: str = ""
+
+
+@contextmanager
+def notes_of_a_job() -> Generator[str]:
+    """The name under which machines keep their notes of one job; this one's are removed at the end."""
+    name = f"datagen-notes-{secrets.token_hex(8)}"
+    try:
+        yield name
+    finally:
+        clear_notes(name)
+
+
+def clear_notes(notes: str) -> None:
+    """Remove this machine's notes of a job."""
+    shutil.rmtree(_folder(notes), ignore_errors=True)
+
+
 def read_note(notes: str, attempt: str) -> Note | None:
-    """The note of an attempt that has begun and not ended by itself; None when there is none."""
+    """This machine's note of an attempt that has begun and not ended by itself; None when there is none."""
     if not notes:
         return None
     try:
-        text = _note_path(notes, attempt).read_text()
+        found = json.loads(_note_path(notes, attempt).read_text())
     except FileNotFoundError:
         return None
-    return Note(**json.loads(text))
+    return Note(Host(**found["host"]), found["started"])
 
 
-def collect_stack(notes: str, attempt: str) -> str:
-    """The stack that a dead worker left, "" when there is none; note and stack file are removed."""
+def collect_remains(notes: str, attempt: str) -> Remains:
+    """What a dead worker left of an attempt on this machine; note and stack file are removed."""
     if not notes:
-        return ""
-    path = _stack_path(notes, attempt)
+        return Remains()
+    note, path = read_note(notes, attempt), _stack_path(notes, attempt)
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - STACK_LIMIT))
-            text = file.read(STACK_LIMIT).decode(errors="replace")
+            stack = file.read(STACK_LIMIT).decode(errors="replace")
     except FileNotFoundError:
-        text = ""
+        stack = ""
     path.unlink(missing_ok=True)
     _note_path(notes, attempt).unlink(missing_ok=True)
-    return text
+    return Remains(note, stack)
 
 
-def obituary(task: Task, outcome: Outcome, cause: str) -> AttemptReport:
-    """The report of an attempt whose worker is gone, from what it left behind.
+def obituary(task: Task, outcome: Outcome, cause: str, remains: Remains | None = None) -> AttemptReport:
+    """The report of an attempt whose worker is gone, from what it left behind: here, or `remains`.
 
     A cause of many lines is cut to one; where the worker left no stack, its whole text stands there.
     A stack that begins with faulthandler's timeout line tells a hang from a crash. The wall time is
     counted from the note; CPU time went with the process and is 0.
     """
-    note, ended = read_note(task.notes, task.attempt), utc_now()
-    stack = collect_stack(task.notes, task.attempt)
+    left, ended = remains or collect_remains(task.notes, task.attempt), utc_now()
+    note, stack = left.note, left.stack
     line = short_line(cause)
     if line != cause:
         stack, cause = stack or cause[-STACK_LIMIT:], line
@@ -200,15 +228,20 @@ def obituary(task: Task, outcome: Outcome, cause: str) -> AttemptReport:
         started=note.started if note else "",
         ended=ended,
         cost=Cost(wall_s=max(0.0, wall_s), cpu_s=0.0) if note else None,
+        host=note.host if note else None,
     )
 
 
+def _folder(notes: str) -> Path:
+    return Path(tempfile.gettempdir(), notes)  # which an absolute path replaces
+
+
 def _note_path(notes: str, attempt: str) -> Path:
-    return Path(notes, f"{attempt}.json")
+    return _folder(notes) / f"{attempt}.json"
 
 
 def _stack_path(notes: str, attempt: str) -> Path:
-    return Path(notes, f"{attempt}.stack")
+    return _folder(notes) / f"{attempt}.stack"
 
 
 @cache

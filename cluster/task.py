@@ -30,7 +30,9 @@ class Task(Protocol):
 
     @property
     def notes(self) -> str:
-        """Folder in which the worker leaves its process id and its stack; "" for none."""
+        """Name of the folder, in its machine's folder for temporary files, in which the worker leaves
+        its process id and its stack; "" for none. Unique to the job; an absolute path stands as it is.
+        """
         ...
 
 

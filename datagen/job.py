@@ -17,7 +17,8 @@ from cluster.executor import Executor
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy, too_many_quarantined
 from cluster.progress import progress
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask

@@ -10,7 +10,7 @@ import pytest
 
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
-from cluster.guard import Meter, guarded, obituary, read_note
+from cluster.guard import Meter, Note, guarded, obituary, read_note
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy
 from cluster.stop import StopRequest, stop_on_signals
@@ -145,7 +145,7 @@ def test_the_guard_reports_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
     report = guarded(look, ScriptedTask(7, "a", 60, str(notes)), deadline=False)
     assert report.ends_job and report.outcome == "failed" and report.cause == "RUN: the disk is full"
-    assert getattr(seen[0], "pid", 0) == os.getpid() and list(notes.iterdir()) == []
+    assert isinstance(seen[0], Note) and seen[0].host.pid == os.getpid() and list(notes.iterdir()) == []
     gone = obituary(ScriptedTask(7, "b", 60, str(notes)), "lost", "node gone")
     assert (gone.outcome, gone.cause, gone.cost, gone.started) == ("lost", "node gone", None, "")
     text = "ImportError: no module\n" + "a long story\n" * 100

@@ -16,7 +16,8 @@ from cluster.driver import Order, drive
 from cluster.guard import Meter
 from cluster.policy import Policy
 from cluster.progress import progress
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.task import Product
 from schemas.run import Run

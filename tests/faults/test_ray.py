@@ -12,7 +12,8 @@ import pytest
 
 from cluster.driver import Order, drive
 from cluster.policy import Policy
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest
 from cluster.tally import JobSummary, Tally
 from tests.cluster.simulated import Heard, PaperBooks

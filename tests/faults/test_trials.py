@@ -11,7 +11,8 @@ import pytest
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
 from cluster.policy import Policy
-from cluster.ray_executor import RayExecutor, RaySettings, ray_cluster
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest
 from datagen import cli
 from schemas.run import Run
