@@ -33,8 +33,15 @@ class Ledger:
     def end(self, entry: LedgerEntry) -> bool:
         """Note how an attempt ended; False when its end was noted before. Long stacks are cut.
 
-        An attempt that another job took for lost may still answer: its account replaces the guess.
+        An attempt that another job took for lost may still answer: its account replaces the guess. One
+        that ended before it could note that it began gets its start here, so that every end has one.
         """
+        if entry.outcome not in ("committed", "superseded") and not self._storage.exists(
+            start_key(entry.attempt)
+        ):
+            host = entry.host.name if entry.host else ""
+            start = AttemptStart(attempt=entry.attempt, shard=entry.shard, started=entry.started, host=host)
+            self._storage.put_new(start_key(entry.attempt), encode_record(start))
         kept = entry.model_copy(
             update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
         )

@@ -62,7 +62,7 @@ class Run:
         naming every field that differs, or when the place holds files of something else.
         """
         if not storage.exists("manifest.json"):
-            _refuse_foreign(storage)
+            refuse_foreign(storage)
             publish(storage, "manifest.json", encode_record(manifest))
         run = cls.open(storage)
         run._refuse_other(manifest)
@@ -117,16 +117,22 @@ class Run:
         """Samples wanted by the newest plan."""
         return self._newest_plan()[1]
 
-    def grow(self, n: int) -> None:
-        """Want at least n samples. A run never shrinks."""
+    def grow(self, n: int, created: str | None = None) -> None:
+        """Want at least n samples; a run never shrinks. `created` is when that was said, now by default."""
         if not 1 <= n <= 10**12:
             raise InputError("--n", "", f"{n} samples", "Ask for 1 to 10^12 samples")
         while True:
             number, wanted = self._newest_plan()
             if wanted >= n:
                 return
+            plan = Plan(n=n, created=created or now())
             # Losing this race means that another plan appeared: look again.
-            publish(self.storage, f"plans/{number + 1}.json", encode_record(Plan(n=n, created=now())))
+            publish(self.storage, f"plans/{number + 1}.json", encode_record(plan))
+
+    def plan(self) -> Plan | None:
+        """The newest plan; None where a run was made and its first plan not yet."""
+        number, _ = self._newest_plan()
+        return read_record(self.storage, f"plans/{number}.json", Plan) if number else None
 
     def _newest_plan(self) -> tuple[int, int]:
         numbers = self._numbers("plans", width=1)
@@ -334,10 +340,11 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
     storage.put_new(key, record if kept is None else kept)
 
 
-def _refuse_foreign(storage: Storage) -> None:
-    ours = re.compile(r"^(manifest\.json|plans/|copies/|shards/|commits/|ledger/|\.probe-)")
+def refuse_foreign(storage: Storage, *also: str) -> None:
+    """Refuse a place without a run that holds files of something else; `also` begin further names of ours."""
+    ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
     for file in storage.list(""):
-        if not ours.match(file.key):
+        if not file.key.startswith(ours):
             raise InputError(
                 storage.url, file.key, "the folder holds files of something else", "Choose a new --out"
             )

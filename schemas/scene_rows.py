@@ -41,7 +41,7 @@ def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
     for scene in scenes:
         shard, row = divmod(scene, per_shard)
         if shard != loaded:
-            loaded, arrays = shard, _read_shard(run, shard)
+            loaded, arrays = shard, read_shard(run, shard)
         rows = np.s_[row * per_scene : (row + 1) * per_scene]
         yield SceneRows(
             record={f.name: arrays[f.name][row] for f in run.schema.scene_fields},
@@ -56,7 +56,8 @@ def committed_scenes(run: Run) -> int:
     return shards * run.layout.scenes_per_shard
 
 
-def _read_shard(run: Run, shard: int) -> dict[str, Array]:
+def read_shard(run: Run, shard: int) -> dict[str, Array]:
+    """Every array of a committed shard, all of its rows. InputError for a missing or damaged file."""
     commit = run.commit_of(shard)
     folder = shard_folder(shard, commit.attempt)
     place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)

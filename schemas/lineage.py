@@ -1,0 +1,111 @@
+"""Where the shards of a merged run come from: `lineage.json`, which names the runs that made them.
+
+Sources are named transitively: a run that was itself merged is passed through to those that it names.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
+from itertools import groupby
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.record_files import encode_record, read_record
+from schemas.run import Run
+from schemas.run_records import FORMAT_VERSION
+
+LINEAGE = "lineage.json"
+_Shard = Annotated[int, Field(ge=0, le=10**18)]
+
+
+class Origin(NamedTuple):
+    """A run that made shards: where it lay when it was merged, and what made it. Sorted in this order."""
+
+    address: str
+    created: str
+    platform: str
+    code_version: str
+
+
+class LineageSource(BaseModel):
+    """One origin and the shards that come from it, as ranges of first and last."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    address: str
+    created: str
+    platform: str
+    code_version: str
+    shards: tuple[tuple[_Shard, _Shard], ...]
+
+
+class Lineage(BaseModel):
+    """lineage.json: the origins of a run that was merged, in order of their addresses."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format_version: int = FORMAT_VERSION
+    sources: tuple[LineageSource, ...]
+
+
+class Origins:
+    """What is known of the origins of one run's shards."""
+
+    def __init__(self, run: Run) -> None:
+        manifest = run.manifest
+        self.own = Origin(
+            address=run.storage.url,
+            platform=manifest.platform,
+            code_version=manifest.code_version,
+            created=manifest.created,
+        )
+        lineage = read_record(run.storage, LINEAGE, Lineage)
+        sources = lineage.sources if lineage else ()
+        self.named = tuple(Origin(**source.model_dump(exclude={"shards"})) for source in sources)
+        ranges = [
+            (first, last, origin)
+            for source, origin in zip(sources, self.named, strict=True)
+            for first, last in source.shards
+        ]
+        self._ranges = sorted(ranges, key=lambda r: r[:2])
+        self._firsts = [first for first, _, _ in self._ranges]
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether the run has a lineage."""
+        return bool(self.named)
+
+    def of(self, shard: int) -> Origin:
+        """Where a shard comes from; the run itself where no lineage says otherwise."""
+        k = bisect_right(self._firsts, shard) - 1
+        if k >= 0 and shard <= self._ranges[k][1]:
+            return self._ranges[k][2]
+        return self.own
+
+
+def encode_lineage(shards: Mapping[Origin, Iterable[int]]) -> bytes:
+    """The record's bytes from the shards of each origin."""
+    sources = [LineageSource(**origin._asdict(), shards=_ranges(shards[origin])) for origin in sorted(shards)]
+    return encode_record(Lineage(sources=tuple(sources)))
+
+
+def lineage_summary(run: Run) -> list[dict[str, Any]]:
+    """The origins of a run's committed shards, their number and ranges; empty where it was not merged."""
+    origins = Origins(run)
+    if not origins.is_merged:
+        return []
+    found: dict[Origin, list[int]] = {origin: [] for origin in origins.named}
+    for shard in sorted(run.committed()):
+        found.setdefault(origins.of(shard), []).append(shard)
+    return [
+        {**origin._asdict(), "shards": len(shards), "ranges": [list(r) for r in _ranges(shards)]}
+        for origin, shards in sorted(found.items())
+    ]
+
+
+def _ranges(shards: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    runs = groupby(enumerate(sorted(shards)), key=lambda pair: pair[1] - pair[0])
+    grouped = ([shard for _, shard in group] for _, group in runs)
+    return tuple((group[0], group[-1]) for group in grouped)

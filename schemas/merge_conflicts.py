@@ -1,0 +1,78 @@
+"""Two runs that hold the same scenes: their rows must be equal, whatever bytes their files have.
+
+Files may differ where rows do not: another version of the compressor, another cut into shards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from schemas.fields import RecordSchema, SceneRows
+from schemas.run import Run, shard_folder
+from schemas.scene_rows import read_scenes
+
+
+def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int) -> None:
+    """Raise InputError where two committed shards have other rows of a scene that both hold.
+
+    It names both runs, the shard, the first file that differs and the first sample. InputError also for a
+    file that is damaged.
+    """
+    first = max(
+        run.layout.scenes_per_shard * shard for run, shard in ((one, shard_one), (other, shard_other))
+    )
+    end = min(
+        run.layout.scenes_per_shard * (shard + 1) for run, shard in ((one, shard_one), (other, shard_other))
+    )
+    # Opened anew, so that their commits are not kept.
+    one, other = (Run(run.storage, run.manifest) for run in (one, other))
+    scenes = range(first, end)
+    for ours, theirs in zip(read_scenes(one, scenes), read_scenes(other, scenes), strict=True):
+        found = _first_difference(one.schema, ours, theirs)
+        if found is None:
+            continue
+        field, row = found
+        sample = bytes(ours.samples["sample_id"][row]).hex()
+        file = _first_file(one, shard_one, other, shard_other, field)
+        raise InputError(
+            one.storage.url,
+            f"shard {shard_one}",
+            f"{other.storage.url} has other rows of it: {file} differs, first in sample {sample}, in {field}",
+            "Run `datagen verify` on both, and merge without the one that is wrong",
+        )
+
+
+def _first_difference(schema: RecordSchema, ours: SceneRows, theirs: SceneRows) -> tuple[str, int] | None:
+    """The first field and sample row in which one scene differs; row 0 where the scene itself does."""
+    for field in schema.scene_fields:
+        if not _equal(np.asarray(ours.record[field.name]), np.asarray(theirs.record[field.name])):
+            return field.name, 0
+    found: list[tuple[int, int, str]] = []
+    for place, field in enumerate(schema.sample_fields):
+        a, b = ours.samples[field.name], theirs.samples[field.name]
+        if not _equal(a, b):
+            row = next(k for k in range(len(a)) if not _equal(a[k : k + 1], b[k : k + 1]))
+            found.append((row, place, field.name))
+    return (min(found)[2], min(found)[0]) if found else None
+
+
+def _equal(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> bool:
+    """Bit for bit."""
+    if a.dtype.kind == "O":
+        return bool(np.array_equal(a, b))
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def _first_file(one: Run, shard_one: int, other: Run, shard_other: int, field: str) -> str:
+    """The first committed file that differs; the array's folder where the shards are cut otherwise."""
+    commit, theirs = one.commit_of(shard_one), other.commit_of(shard_other)
+    folder = shard_folder(shard_one, commit.attempt)
+    if one.layout != other.layout:
+        return f"{folder}/{field}"
+    digests = {entry.path: entry.sha256 for entry in theirs.files}
+    paths = sorted(e.path for e in commit.files if digests.get(e.path) != e.sha256)
+    return f"{folder}/{paths[0] if paths else field}"

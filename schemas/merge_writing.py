@@ -1,0 +1,200 @@
+"""A planned union written down: shards first, then the ledger, quarantine and lineage.
+
+Every step skips what is there, so that a merge that was killed is finished by doing it again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+from schemas.errors import InputError
+from schemas.fields import REDRAW_CAUSES
+from schemas.ledger import end_key, start_key
+from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
+from schemas.merge_ledger import united_attempts
+from schemas.merge_plan import Holding, Union
+from schemas.record_files import MAX_RECORD_BYTES, encode_record
+from schemas.run import Run, copy_key, publish, shard_folder
+from schemas.run_records import Commit, QuarantineRecord
+from schemas.scene_rows import read_shard
+from schemas.shard_files import encode_shard
+from schemas.storage import Storage
+
+Tick = Callable[[], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """What became of a union. `there` are shards that its place had before."""
+
+    run: Run
+    there: int
+    linked: int
+    cut: int
+    spare: int  # shards that more than one source holds
+    attempts: int
+
+
+def begin_union(union: Union, storage: Storage) -> Run:
+    """The union's run with its manifest and plan, made where it does not exist yet.
+
+    InputError when another run stands there.
+    """
+    if not storage.exists("manifest.json"):
+        publish(storage, "manifest.json", encode_record(union.manifest))
+    run = Run.open(storage)
+    for field, found, asked in (
+        ("spec_hash", run.manifest.spec_hash, union.manifest.spec_hash),
+        ("layout", run.layout, union.layout),
+    ):
+        if found != asked:
+            problem = f"{found}, where the merged run has {asked}"
+            raise InputError(f"{storage.url}/manifest.json", field, problem, "Choose a new --out")
+    run.grow(union.plan.n, union.plan.created)
+    return run
+
+
+def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
+    """Write the union into its run; `tick` is called for every shard and every attempt.
+
+    InputError where a source lacks a committed file, or one that must be cut is damaged.
+    """
+    before = run.committed()
+    wanted = [union.kept[shard] for shard in sorted(union.kept)]
+    new = [holding for holding in wanted if holding.shard not in before]
+    lost = [h for h in wanted if h.shard in before and h.source != union.out and _is_lost(run, h)]
+    linked = cut = 0
+    for (source, _), group in groupby(new, key=lambda holding: (holding.source, holding.of)):
+        holdings = list(group)
+        is_cut = union.cut(source).pieces > 1
+        won = _cut(union, run, holdings) if is_cut else [_link(union, run, holdings[0])]
+        lost += [h for h, is_won in zip(holdings, won, strict=True) if not is_won]
+        linked, cut = linked + (not is_cut), cut + is_cut * len(holdings)
+        for _ in holdings:
+            tick()
+    union = _without(union, lost)
+    attempts = _write_ledger(union, run, tick)
+    _write_quarantine(union, run)
+    replace_record(run.storage, LINEAGE, encode_lineage(_lineage(union)))
+    return Written(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
+
+
+def replace_record(storage: Storage, key: str, record: bytes) -> None:
+    """Write a record that may change, its copy first; nothing is touched where both are so already."""
+    for name in (copy_key(key), key):
+        if storage.get(name, MAX_RECORD_BYTES) != record:
+            storage.put(name, record)
+            storage.sync([name])
+
+
+def _link(union: Union, run: Run, holding: Holding) -> bool:
+    """Take a source's shard over as it is; whether it became the union's."""
+    source, commit = union.runs[holding.source], union.commit_of(holding)
+    source.check_files(commit)
+    folder = shard_folder(holding.shard, holding.attempt)
+    for entry in commit.files:
+        key = f"{folder}/{entry.path}"
+        run.storage.adopt(source.storage, key, key, limit_bytes=entry.size)
+    run.storage.sync(f"{folder}/{entry.path}" for entry in commit.files)
+    return run.commit(commit)
+
+
+def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
+    """Write pieces of one shard of a source as shards of their own; whether each became the union's."""
+    source = union.runs[holdings[0].source]
+    whole = union.commit_of(holdings[0])
+    arrays = read_shard(Run(source.storage, source.manifest), holdings[0].of)
+    schema, layout = source.schema, union.layout
+    won: list[bool] = []
+    for holding in holdings:
+        place = holding.shard - union.cut(holding.source).first(holding.of)
+        scenes = slice(place * layout.scenes_per_shard, (place + 1) * layout.scenes_per_shard)
+        samples = slice(place * layout.samples_per_shard, (place + 1) * layout.samples_per_shard)
+        scene_arrays = {f.name: arrays[f.name][scenes] for f in schema.scene_fields}
+        sample_arrays = {f.name: arrays[f.name][samples] for f in schema.sample_fields}
+        files = encode_shard(schema, layout, run.manifest.spec_hash, scene_arrays, sample_arrays)
+        redraws = dict(zip(REDRAW_CAUSES, scene_arrays["redraws"].sum(axis=0).tolist(), strict=True))
+        commit = Commit(
+            shard=holding.shard,
+            attempt=holding.name,
+            spec_hash=whole.spec_hash,
+            scenes=layout.scenes_per_shard,
+            samples=layout.samples_per_shard,
+            positives=int(sample_arrays["label"].sum()),
+            redraws={cause: count for cause, count in redraws.items() if count},
+            files=run.write_shard(holding.shard, holding.name, files),
+            cost=union.cost_of(holding, whole),
+            host=whole.host,
+            created=whole.created,
+        )
+        won.append(run.commit(commit))
+    return won
+
+
+def _is_lost(run: Run, holding: Holding) -> bool:
+    """Whether the place has this shard from another attempt than was planned."""
+    return Run(run.storage, run.manifest).commit_of(holding.shard).attempt != holding.name
+
+
+def _without(union: Union, lost: Iterable[Holding]) -> Union:
+    """The union after others were faster in committing some of its shards."""
+    kept, spare = dict(union.kept), dict(union.spare)
+    for holding in lost:
+        spare[holding.shard] = (*spare.get(holding.shard, ()), kept.pop(holding.shard))
+    return replace(union, kept=kept, spare=spare)
+
+
+def _write_ledger(union: Union, run: Run, tick: Tick) -> int:
+    there = {file.key for file in run.storage.list("ledger")}
+    count = 0
+    for attempt in united_attempts(union):
+        for key, record in ((start_key(attempt.name), attempt.start), (end_key(attempt.name), attempt.end)):
+            if record is not None:
+                _put(run.storage, key, encode_record(record), key in there)
+        count += 1
+        tick()
+    return count
+
+
+def _put(storage: Storage, key: str, record: bytes, is_there: bool) -> None:
+    if not is_there:
+        storage.put_new(key, record)
+    elif storage.get(key, MAX_RECORD_BYTES) != record:  # what was known of an attempt was less
+        storage.put(key, record)
+        storage.sync([key])
+
+
+def _write_quarantine(union: Union, run: Run) -> None:
+    found: dict[int, QuarantineRecord] = {}
+    scenes = union.layout.scenes_per_shard
+    for source, given_up in enumerate(union.runs):
+        for record in given_up.quarantine_records():
+            for shard in union.cut(source).shards(record.shard):
+                piece = record.model_copy(
+                    update={"shard": shard, "first_scene": shard * scenes, "scenes": scenes}
+                )
+                found[shard] = min(found.get(shard, piece), piece, key=encode_record)
+    there = run.quarantined() | run.committed()
+    for shard in sorted(found.keys() - there):
+        run.quarantine(found[shard])
+
+
+def _lineage(union: Union) -> dict[Origin, list[int]]:
+    """The shards of each origin. Where several sources have a shard from one attempt, the first by order."""
+    origins = [Origins(run) for run in union.runs]
+    shards: dict[Origin, list[int]] = {}
+    for source, known in enumerate(origins):
+        if known.is_merged:
+            shards |= {origin: [] for origin in known.named}
+        elif source != union.out:
+            shards[known.own] = []
+    own = None if union.out is None else origins[union.out].own
+    for shard, holding in union.kept.items():
+        same = [h for h in (holding, *union.spare.get(shard, ())) if h.name == holding.name]
+        claims = {origins[h.source].of(h.of) for h in same}
+        # A merge that was killed had no time to say where the shards at its place come from.
+        others = claims - {own} if len(claims) > 1 else claims
+        shards.setdefault(min(others), []).append(shard)
+    return shards

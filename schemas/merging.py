@@ -1,0 +1,159 @@
+"""Merging: runs made apart become one run, or one place of several, by links wherever layouts allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.errors import InputError
+from schemas.merge_plan import Union, plan_union, refuse_incompatible
+from schemas.merge_writing import Written, begin_union, replace_record, write_union
+from schemas.merged import MERGED, open_runs, part_folder
+from schemas.record_files import MAX_RECORD_BYTES, encode_record
+from schemas.resharding import common_layout
+from schemas.run import Run, refuse_foreign
+from schemas.run_records import Layout, Merged
+from schemas.seal import SEALED, seal, sealed_metadata
+from schemas.seal_contents import read_contents
+from schemas.storage import Storage, open_storage
+
+_ELSEWHERE = "Choose a new --out, and name this one among the runs that are merged"
+
+
+@dataclass(frozen=True, eq=False)
+class Merge:
+    """Runs that can be merged, and what they give: one union a specification, by ascending hash."""
+
+    out: str
+    existing: tuple[Run, ...]  # what stands at the place already
+    unions: tuple[Union, ...]
+    hashes: tuple[str, ...]  # of all specifications of the place
+
+    @property
+    def is_ordinary(self) -> bool:
+        """Whether the result is one run; else it is a place of several."""
+        return len(self.hashes) == 1
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A merge that was done; `sealed` is the store's address, "" where nothing is committed."""
+
+    place: Storage
+    written: tuple[Written, ...]
+    sealed: str
+
+
+def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> Merge:
+    """Look at everything and write nothing; `tick` is called for every commit that was read.
+
+    A run that stands at `out` counts as one of the sources. InputError when there is nothing to merge, when
+    runs are not of one kind, hold other rows of one scene, or cannot be added to what is at `out`.
+    """
+    if not places:
+        raise InputError("datagen merge", "RUN", "no run is named", "Name the runs to merge")
+    existing = _existing(out)
+    sources = _distinct([run for place in places for run in open_runs(place)])
+    refuse_incompatible(sources)
+    if existing:
+        refuse_incompatible([existing[0], *sources])
+    _refuse_nested(places, out, existing, sources)
+    named = {_identity(run.storage) for run in existing}
+    groups: dict[str, list[Run]] = {run.manifest.spec_hash: [run] for run in existing}
+    for run in sources:
+        if _identity(run.storage) not in named:
+            groups.setdefault(run.manifest.spec_hash, []).append(run)
+    layout = common_layout(run.layout for group in groups.values() for run in group)
+    hashes = tuple(sorted(groups))
+    _refuse_other_place(existing, hashes, layout)
+    here = {run.manifest.spec_hash for run in existing}
+    unions = tuple(
+        plan_union(groups[spec_hash], 0 if spec_hash in here else None, layout, tick)
+        for spec_hash in hashes
+        if spec_hash not in here or len(groups[spec_hash]) > 1
+    )
+    return Merge(out, tuple(existing), unions, hashes)
+
+
+def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
+    """Write a planned merge and seal it; `tick` is called for every shard and every attempt.
+
+    Doing it again finishes what was cut short, and changes nothing where it is done.
+    """
+    place = open_storage(merge.out)
+    if not merge.existing:
+        refuse_foreign(place, *(() if merge.is_ordinary else ("parts/",)))
+    runs: list[Run] = []
+    for union in merge.unions:
+        spec_hash = union.manifest.spec_hash
+        runs.append(begin_union(union, place if merge.is_ordinary else place.below(part_folder(spec_hash))))
+    # From here on the place counts as what it will be; what is not there yet is missing, as in any run.
+    if not merge.is_ordinary:
+        replace_record(place, MERGED, encode_record(Merged(parts=merge.hashes)))
+    written = [write_union(union, run, tick) for union, run in zip(merge.unions, runs, strict=True)]
+    return Result(place, tuple(written), _seal(place))
+
+
+def _seal(place: Storage) -> str:
+    """Seal the place unless it is sealed as it stands."""
+    if not any(run.committed() for run in open_runs(place)):
+        return ""
+    root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
+    if place.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:
+        return f"{place.url}/{SEALED}"
+    return seal(place)
+
+
+def _existing(out: str) -> list[Run]:
+    """What stands at the place of the result; nothing where it is new."""
+    try:
+        storage = open_storage(out, probe=False, create=False)
+    except InputError as e:
+        if e.problem == "no such folder":
+            return []
+        raise
+    if not storage.exists("manifest.json") and not storage.exists(MERGED):
+        return []
+    return open_runs(storage)
+
+
+def _distinct(runs: Sequence[Run]) -> list[Run]:
+    return list({_identity(run.storage): run for run in runs}.values())
+
+
+def _identity(storage: Storage) -> str:
+    return storage.url if storage.folder is None else str(storage.folder.resolve())
+
+
+def _refuse_nested(places: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
+    """Sources are never written to: the result cannot lie in one, nor one in the result."""
+    here = out.rstrip("/") if "://" in out else str(Path(out).expanduser().resolve())
+    roots = {_identity(open_storage(place, probe=False, create=False)) for place in places}
+    known = {here, *(_identity(run.storage) for run in existing)}
+    for other in sorted({*roots, *(_identity(run.storage) for run in sources)} - known):
+        if here.startswith(f"{other}/") or other.startswith(f"{here}/"):
+            problem = f"lies in {other}" if here.startswith(other) else f"{other} lies in it"
+            raise InputError(out, "--out", problem, "Choose a place of its own for the result")
+
+
+def _refuse_other_place(existing: Sequence[Run], hashes: Sequence[str], layout: Layout) -> None:
+    """Refuse what cannot be added to what stands at the place: its shards and its kind of place stay."""
+    if not existing:
+        return
+    first = existing[0]
+    if first.layout != layout:
+        raise InputError(
+            first.storage.url,
+            "layout.scenes_per_shard",
+            f"{first.layout.scenes_per_shard}, where these runs together need {layout.scenes_per_shard}",
+            _ELSEWHERE,
+        )
+    if len(existing) == 1 and len(hashes) > 1:
+        other = next(h for h in hashes if h != first.manifest.spec_hash)
+        raise InputError(
+            first.storage.url,
+            "spec_hash",
+            f"one run stands there, and runs of another specification ({other[:16]}) are to join it",
+            _ELSEWHERE,
+        )

@@ -1,0 +1,99 @@
+"""Shards cut smaller: their common layout, and the names, costs and shard numbers of the pieces.
+
+Cutting in two steps gives what cutting at once gives, to the last byte: every rule below looks at scenes
+alone, never at how often something was cut before.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+
+from schemas.run_records import Cost, Layout
+
+_PIECE = re.compile(r"(.*)\.cut([0-9]+)")
+_MAX_NAME = 100
+_NS = 10**9
+
+
+def common_layout(layouts: Iterable[Layout]) -> Layout:
+    """The largest shards that divide those of every layout; candidates per scene must agree."""
+    found = list(layouts)
+    scenes = math.gcd(*(layout.scenes_per_shard for layout in found))
+    return Layout(scenes_per_shard=scenes, candidates_per_scene=found[0].candidates_per_scene)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How shards of `scenes` scenes fall into shards of `into` scenes, which divide them."""
+
+    scenes: int
+    into: int
+
+    @property
+    def pieces(self) -> int:
+        """Pieces of one shard; 1 where nothing is cut."""
+        return self.scenes // self.into
+
+    def first(self, shard: int) -> int:
+        """The first piece of a shard, as a shard of the smaller layout."""
+        return shard * self.pieces
+
+    def shards(self, shard: int) -> range:
+        """The pieces of a shard, as shards of the smaller layout."""
+        return range(self.first(shard), self.first(shard + 1))
+
+    def name(self, attempt: str, piece: int) -> str:
+        """Name of the attempt that made this piece: it says the piece's first scene."""
+        return attempt if self.pieces == 1 else f"{_fitting(base_name(attempt))}.cut{piece * self.into}"
+
+    def cost(self, cost: Cost, piece: int) -> Cost:
+        """What a piece cost: each scene the same, to the nanosecond and byte; the pieces add up to the whole.
+
+        Where seconds or bytes do not divide, the first scenes carry one more. Peak memory is that of the
+        attempt.
+        """
+        if self.pieces == 1:
+            return cost
+        offset = piece % self.pieces * self.into
+
+        def seconds(value: float) -> float:
+            return _share(round(value * _NS), self.scenes, offset, self.into) / _NS
+
+        def by_stage(values: Mapping[str, float]) -> dict[str, float]:
+            return {stage: seconds(value) for stage, value in values.items()}
+
+        return Cost(
+            wall_s=seconds(cost.wall_s),
+            cpu_s=seconds(cost.cpu_s),
+            stage_wall_s=by_stage(cost.stage_wall_s),
+            stage_cpu_s=by_stage(cost.stage_cpu_s),
+            stage_gpu_s=by_stage(cost.stage_gpu_s),
+            peak_rss_bytes=cost.peak_rss_bytes,
+            written_bytes=_share(cost.written_bytes, self.scenes, offset, self.into),
+        )
+
+
+def base_name(attempt: str) -> str:
+    """Name of the attempt of which this one is a piece; its own where it is whole."""
+    found = _PIECE.fullmatch(attempt)
+    return found[1] if found else attempt
+
+
+def rank(attempt: str) -> tuple[str, str]:
+    """Of equal attempts the first by this is kept: the order of the whole attempts' names."""
+    return _fitting(base_name(attempt)), attempt
+
+
+def _share(total: int, scenes: int, first: int, count: int) -> int:
+    """What `count` scenes from `first` on carry of a total over all scenes."""
+    each, rest = divmod(total, scenes)
+    return each * count + min(max(rest - first, 0), count)
+
+
+def _fitting(name: str) -> str:
+    # Attempts are named in at most 100 characters, and a piece's name is longer.
+    return name if len(name) <= _MAX_NAME - 20 else sha256(name.encode()).hexdigest()[:32]
