@@ -1,19 +1,20 @@
-"""A run's missing shards made, here or on a cluster, and what the user is told at the end."""
+"""A job: missing shards made, here or on a cluster, watched in the run, and told of at the end."""
 
 from __future__ import annotations
 
 import os
-import shlex
+import platform
 import sys
-import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cluster.attempt import run_attempt
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
 from cluster.executor import Executor
+from cluster.guard import notes_of_a_job
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy, too_many_quarantined
 from cluster.progress import progress
@@ -22,78 +23,186 @@ from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask
+from cluster.watch import Together, Watch
 from datagen.console import print_rows, seconds
+from datagen.job_board import JobBoard
+from datagen.job_options import Placing, command_line
 from schemas.errors import InputError
+from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
+from schemas.record_files import now
 from schemas.run import Run
 from schemas.seal import seal
+from schemas.storage import Storage
+
+# Set for the driver of a detached job: its name at the Jobs API, and where that listens.
+SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 
 
-@dataclass(frozen=True)
-class JobSettings:
-    """Where a job runs and finds its sources; nothing of this changes a sample."""
+@dataclass(frozen=True, eq=False)
+class Work:
+    """One run of a job, and where its sources lie."""
 
-    houses: str
+    run: Run
+    houses: str  # source references, absolute
     objects: str
-    workers: int | None
-    address: str
-    json: bool
     scenes_from: str = ""  # the run whose scenes are labelled again; "" draws new ones
 
 
-def run_job(run: Run, settings: JobSettings) -> JobSummary:
-    """Make every missing shard of the run, here or on a Ray cluster."""
-    missing = run.missing()
-    layout, spec = run.layout, run.manifest.spec
-    done = len(run.planned()) - len(missing)
-    if not missing:
-        close_lost_attempts(run)
-        given_up, shards = run.quarantined() & set(run.planned()), len(run.planned())
-        failed = too_many_quarantined(Policy(), len(given_up), shards)
-        return JobSummary("failed" if failed else "complete", "", Tally(0), 0.0)
-    stop = StopRequest()
+@dataclass(frozen=True, eq=False)
+class JobPlan:
+    """What a job does: the missing shards of one run, or of the parts of a merged place."""
+
+    place: Storage  # where the job's records and the sealed store go
+    name: str  # the place as the user wrote it
+    works: Sequence[Work]
+    placing: Placing
+    resume: Sequence[str]  # the words of the command that goes on with it
+
+
+def carry_out(plan: JobPlan) -> int:
+    """Make every missing shard, seal, and say how it went; the exit code.
+
+    While it works, the job is known in the place, and heeds requests to stop that are left there.
+    """
+    runs = [work.run for work in plan.works]
+    missing = [run.missing() for run in runs]
+    if not any(missing):
+        for run in runs:
+            close_lost_attempts(run)
+        return _finish(plan, _judged(plan, JobSummary("complete", "", Tally(0), 0.0)))
+    board = JobBoard(Jobs(plan.place), _record_of(plan), sum(map(len, missing)))
+    board.begin()
+    try:
+        summary = _judged(plan, _make(plan, missing, board))
+        board.seal()
+        code = _finish(plan, summary)
+    except BaseException as error:
+        end, code = _end_of(error)
+        board.end(end, code, " ".join(str(error).split())[:1000])
+        raise
+    board.end(summary.end, code, summary.cause, summary)
+    return code
+
+
+def _end_of(error: BaseException) -> tuple[JobEnd, int]:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", 130
+    if isinstance(error, _CannotGoOn):
+        return "aborted", 2
+    return "broken", 2 if isinstance(error, InputError) else 1
+
+
+def _record_of(plan: JobPlan) -> JobRecord:
+    return JobRecord(
+        id=new_job_id(),
+        command=("datagen", *sys.argv[1:]),
+        host=platform.node(),
+        pid=os.getpid(),
+        started=now(),
+        address=plan.placing.address,
+        submission=os.environ.get(SUBMISSION, ""),
+        jobs_api=os.environ.get(JOBS_API, ""),
+    )
+
+
+def _make(plan: JobPlan, missing: Sequence[Sequence[int]], board: JobBoard) -> JobSummary:
+    """Drive one run after the other on one set of workers."""
+    placing, stop = plan.placing, StopRequest()
+    policy = Policy(max_quarantined_share=placing.max_quarantined)
+    whole = JobSummary("complete", "", Tally(0), 0.0)
     with ExitStack() as stack:
-        # Local paths travel to workers of this machine; on a cluster they are shared by all nodes.
-        notes = stack.enter_context(tempfile.TemporaryDirectory(prefix="datagen-notes-"))
+        notes = stack.enter_context(notes_of_a_job())
+        executor = _executor(placing, sum(map(len, missing)), stack)
+        stack.enter_context(stop_on_signals(stop, interrupt=placing.workers == 0))
+        for work, shards in zip(plan.works, missing, strict=True):
+            if whole.end in ("interrupted", "aborted"):
+                whole = replace(whole, tally=whole.tally.plus(Tally(len(shards))))
+            elif shards:
+                whole = _together(whole, _drive(work, shards, executor, policy, board, stop, placing, notes))
+                board.add(whole.tally)
+    for work in plan.works:
+        # What a killed driver left open is closed last: its workers may outlive it and still commit.
+        close_lost_attempts(work.run)
+    return whole
 
-        def make_task(order: Order) -> ShardTask:
-            return ShardTask(
-                run=run.storage.url,
-                spec=spec,
-                layout=layout,
-                shard=order.shard,
-                attempt=order.attempt,
-                houses=settings.houses,
-                objects=settings.objects,
-                deadline_s=order.deadline_s,
-                memory_factor=order.memory_factor,
-                notes=notes,
-                scenes_from=settings.scenes_from,
-            )
 
-        executor = _executor(settings, len(missing), stack)
-        stack.enter_context(stop_on_signals(stop, interrupt=settings.workers == 0))
-        display = stack.enter_context(
-            progress(layout.samples_per_shard, len(missing), done, True if settings.json else None)
+def _drive(
+    work: Work,
+    shards: Sequence[int],
+    executor: Executor[ShardTask],
+    policy: Policy,
+    board: JobBoard,
+    stop: StopRequest,
+    placing: Placing,
+    notes: str,
+) -> JobSummary:
+    run = work.run
+    layout, spec = run.layout, run.manifest.spec
+
+    def make_task(order: Order) -> ShardTask:
+        return ShardTask(
+            run=run.storage.url,
+            spec=spec,
+            layout=layout,
+            shard=order.shard,
+            attempt=order.attempt,
+            houses=work.houses,
+            objects=work.objects,
+            deadline_s=order.deadline_s,
+            memory_factor=order.memory_factor,
+            notes=notes,
+            scenes_from=work.scenes_from,
         )
-        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
-    # What a killed driver left open is closed last: its workers may outlive it and still commit.
-    close_lost_attempts(run)
-    return summary
+
+    done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
+    with progress(per_shard, len(shards), done, True if placing.json else None) as display:
+        events = Together([display, Watch(board, stop, per_shard)])
+        return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
 
 
-def _executor(settings: JobSettings, shards: int, stack: ExitStack) -> Executor[ShardTask]:
-    if settings.workers == 0:
+def _together(before: JobSummary, summary: JobSummary) -> JobSummary:
+    """The summary of both, in the end that is worse."""
+    worst = max(before, summary, key=lambda s: ("complete", "failed", "interrupted", "aborted").index(s.end))
+    tally = before.tally.plus(summary.tally)
+    return JobSummary(worst.end, worst.cause, tally, before.elapsed_s + summary.elapsed_s)
+
+
+def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
+    """Judge a job that left nothing to do by the share of the whole run that is given up.
+
+    The driver knows its own shards alone, which may be the last two of a thousand.
+    """
+    if summary.end not in ("complete", "failed") or summary.remaining:
+        return summary
+    given_up = planned = 0
+    for work in plan.works:
+        shards = set(work.run.planned())
+        given_up, planned = given_up + len(work.run.quarantined() & shards), planned + len(shards)
+    policy = Policy(max_quarantined_share=plan.placing.max_quarantined)
+    failed = too_many_quarantined(policy, given_up, planned)
+    return replace(summary, end="failed" if failed else "complete")
+
+
+def _executor(placing: Placing, shards: int, stack: ExitStack) -> Executor[ShardTask]:
+    if placing.workers == 0:
         return InProcessExecutor(run_attempt)
     cores = len(os.sched_getaffinity(0))
-    workers = min(settings.workers or cores, shards)  # Ray starts them all at once
-    ray_settings = RaySettings(address=settings.address, workers=workers)
-    return RayExecutor(run_attempt, ray_settings, stack.enter_context(ray_cluster(ray_settings)))
+    workers = min(placing.workers or cores, shards)  # Ray starts them all at once
+    ray_settings = RaySettings(address=placing.address, workers=workers)
+    executor = RayExecutor(run_attempt, ray_settings, stack.enter_context(ray_cluster(ray_settings)))
+    stack.callback(executor.close)
+    return executor
 
 
-def finish(run: Run, summary: JobSummary, out: str) -> int:
+class _CannotGoOn(InputError):
+    """The job met what no retry cures."""
+
+
+def _finish(plan: JobPlan, summary: JobSummary) -> int:
     """Seal what there is, say how it went and how to go on; return the exit code."""
-    tally = summary.tally
-    n, given_up = run.n, sorted(run.quarantined())
+    tally, runs, name = summary.tally, [work.run for work in plan.works], plan.name
+    n, resume = sum(run.n for run in runs), command_line(plan.resume)
+    given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
     if tally.shards:
         labels = f"{tally.labels:,} new, {n:,} wanted"
     elif given_up:
@@ -107,34 +216,23 @@ def finish(run: Run, summary: JobSummary, out: str) -> int:
         ("retries", str(tally.retries)),
     ]
     if given_up:
-        shown = (
-            f"{len(given_up)} shards, {given_up[:10]}: remove {shlex.quote(f'{out}/quarantine')} to try again"
-        )
+        again = command_line(["resume", name, "--quarantined"])
+        shown = f"{len(given_up)} shards, {[shard for _, shard in given_up[:10]]}: {again} tries them again"
         rows.append(("quarantined", shown))
-    if summary.end in ("complete", "failed") and run.committed():
-        sealed = seal(run.storage)
+    if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
+        sealed = seal(plan.place)
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
-    print_rows(f"{summary.end}: {out}", rows)
+    print_rows(f"{summary.end}: {name}", rows)
     if summary.end == "aborted":
-        raise InputError(
-            out, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume_command()}"
-        )
+        raise _CannotGoOn(name, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
     if summary.end == "failed":
-        causes = Counter(record.causes[-1] for record in run.quarantine_records() if record.causes)
+        causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
         most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
-        sys.stderr.write(
-            f"error: {out}: too many shards failed{most}. See: datagen status {shlex.quote(out)}\n"
-        )
+        see = command_line(["status", name])
+        sys.stderr.write(f"error: {name}: too many shards failed{most}. See: {see}\n")
     if summary.end == "interrupted":
-        sys.stderr.write(
-            f"interrupted with {summary.remaining} shards to go. Resume with:\n  {resume_command()}\n"
-        )
+        sys.stderr.write(f"interrupted with {summary.remaining} shards to go. Resume with:\n  {resume}\n")
     return summary.exit_code
-
-
-def resume_command() -> str:
-    """The command line that goes on with this run: the one that began it."""
-    return shlex.join(["datagen", *sys.argv[1:]])
 
 
 def _rate(summary: JobSummary) -> str:

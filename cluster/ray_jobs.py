@@ -1,0 +1,143 @@
+"""Ray's Jobs API: commands that a cluster runs for whoever may ask, with their output and their end."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import time
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
+from schemas.errors import InputError
+
+_MEND = (
+    "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it asks for one"
+)
+# A head that has just started has no agent yet.
+_AGENT_WITHIN_S = 60.0
+_ANSWER_WITHIN_S = 5.0
+_WORK = ("PENDING", "RUNNING")
+# Ray takes these over the address that it is given.
+_OVERRIDES = ("RAY_ADDRESS", "RAY_API_SERVER_ADDRESS")
+
+
+class RayJobs:
+    """The jobs of one cluster. Make it with `open_ray_jobs`."""
+
+    def __init__(self, url: str, client: Any) -> None:
+        self.url = url
+        self._client = client
+
+    def submit(self, entrypoint: str, submission: str, environment: Mapping[str, str]) -> None:
+        """Let the cluster's head run a shell command under a name of our own."""
+        until_s = time.monotonic() + _AGENT_WITHIN_S
+        while True:
+            try:
+                self._client.submit_job(
+                    entrypoint=entrypoint,
+                    submission_id=submission,
+                    runtime_env={"env_vars": dict(environment)},
+                )
+                return
+            except RuntimeError as error:
+                if "No available agent" not in str(error) or time.monotonic() >= until_s:
+                    raise InputError(
+                        self.url, "", first_line(error), "See the cluster's dashboard"
+                    ) from error
+                time.sleep(0.5)
+
+    def state(self, submission: str) -> str:
+        """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED; "" where the cluster does not know it."""
+        try:
+            return str(self._client.get_job_status(submission).value)
+        except RuntimeError as error:
+            if "does not exist" in str(error):
+                return ""
+            raise InputError(self.url, submission, first_line(error), _MEND) from error
+
+    def message(self, submission: str) -> str:
+        """What Ray says of the job."""
+        return " ".join(str(self._client.get_job_info(submission).message).split())
+
+    def output(self, submission: str) -> str:
+        """All that the command has written so far."""
+        try:
+            return str(self._client.get_job_logs(submission))
+        except RuntimeError as error:
+            raise InputError(
+                self.url, submission, first_line(error), "The cluster has forgotten it"
+            ) from error
+
+    def stop(self, submission: str) -> None:
+        """End the command: politely, and by force some seconds later."""
+        try:
+            self._client.stop_job(submission)
+        except RuntimeError as error:
+            raise InputError(
+                self.url, submission, first_line(error), "See the cluster's dashboard"
+            ) from error
+
+    def at_work(self) -> list[str]:
+        """Commands of jobs that have not ended."""
+        return [str(job.entrypoint) for job in self._client.list_jobs() if job.status.value in _WORK]
+
+
+def open_ray_jobs(address: str, token: str = "") -> RayJobs:
+    """The Jobs API at a dashboard (`http://HOST:PORT`) or of a cluster (`HOST:PORT`, `ray://...`, `auto`).
+
+    Without `token` the one is given that Ray would find, to a cluster that asks for it. InputError where
+    nothing answers there, or not to us.
+    """
+    changed = dict.fromkeys(_OVERRIDES)
+    if address.startswith(("http://", "https://")):
+        url = address
+    else:
+        url = f"http://{address}" if _speaks_http(address) else ""
+        if not url:
+            refuse_unreachable(address)
+            # Asked for its dashboard, a cluster wants the token where it wants one at all.
+            changed |= {} if address == "auto" else token_for(address)
+    if not token and (found := known_token()) and (not url or _turns_away(url)):
+        token = found[0]
+    before = {name: os.environ.pop(name, None) for name in changed}
+    os.environ.update({name: value for name, value in changed.items() if value is not None})
+    try:
+        from ray.exceptions import RayError
+        from ray.job_submission import JobSubmissionClient
+
+        headers = {"Authorization": f"Bearer {token}"} if token else None
+        try:
+            client = JobSubmissionClient(url or address, headers=headers)
+        except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
+            raise InputError("--address", address, first_line(error), _MEND) from error
+        return RayJobs(str(client.get_address()), client)
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _speaks_http(address: str) -> bool:
+    """Whether HOST:PORT is a dashboard: the other ports of a cluster do not answer such a request."""
+    return "://" not in address and address != "auto" and _status(f"http://{address}") is not None
+
+
+def _turns_away(url: str) -> bool:
+    return _status(url) in (401, 403)
+
+
+def _status(url: str) -> int | None:
+    """What a dashboard answers to one who says nothing of himself; None where it does not."""
+    parts = urlsplit(url)
+    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+    connection = kind(parts.netloc, timeout=_ANSWER_WITHIN_S)
+    try:
+        connection.request("GET", "/api/version")
+        return connection.getresponse().status
+    except (OSError, ValueError, http.client.HTTPException):
+        return None
+    finally:
+        connection.close()

@@ -1,0 +1,77 @@
+"""A command handed over to Ray: it goes on there when the shell that gave it has ended."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+
+from cluster.ray_head import ensure_head, head_token
+from cluster.ray_jobs import RayJobs, open_ray_jobs
+from datagen.console import print_rows
+from datagen.job import JOBS_API, SUBMISSION
+from datagen.job_options import Placing, command_line
+from schemas.errors import InputError
+from schemas.jobs import new_job_id
+
+_BEGUN_WITHIN_S = 60.0
+_LOOK_S = 0.3
+_OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
+
+
+def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
+    """Let the command of these words run as a Ray job, and say how to follow it.
+
+    With the address `local`, on a head of this machine that is started where none runs. Comes back once
+    the command has begun, or waits for room on its cluster. InputError where the cluster cannot be
+    reached or refuses it.
+    """
+    if placing.address == "local":
+        head = ensure_head(placing.workers or len(os.sched_getaffinity(0)))
+        jobs = open_ray_jobs(head.jobs_api, head.token)
+        # The very program that was called: the head runs on its machine, for its user.
+        program = [sys.executable, "-m", "datagen.cli"]
+    else:
+        jobs = open_ray_jobs(placing.address)
+        program = ["datagen"]  # as the cluster's image has it
+    submission = f"datagen-{new_job_id()}"
+    address = [] if placing.workers == 0 else ["--address", "auto"]
+    entrypoint = shlex.join([*program, *words, *address])
+    environment = {SUBMISSION: submission, JOBS_API: jobs.url}
+    if placing.address == "local":
+        # The head may be older than what this shell says of stores and caches.
+        environment |= {name: value for name, value in os.environ.items() if name.startswith(_OF_THE_SHELL)}
+    jobs.submit(entrypoint, submission, environment)
+    state = _await_begin(jobs, submission)
+    rows = [
+        ("submission", submission),
+        ("state", state.lower()),
+        ("cluster", jobs.url),
+        ("follow", command_line(["status", place])),
+        ("", command_line(["logs", place, "--follow"])),
+        ("stop", command_line(["cancel", place])),
+    ]
+    if placing.address == "local":
+        rows.append(("Ray stays", f"for later jobs; {command_line(['cancel', '--head'])} ends it"))
+    print_rows(f"detached: {command_line(words)}", rows)
+    return 0
+
+
+def _await_begin(jobs: RayJobs, submission: str) -> str:
+    until_s = time.monotonic() + _BEGUN_WITHIN_S
+    while True:
+        state = jobs.state(submission)
+        if state in ("FAILED", "STOPPED"):
+            said = jobs.output(submission).strip().splitlines()
+            why = said[-1].removeprefix("error: ") if said else jobs.message(submission)
+            raise InputError(submission, "", f"it ended at once: {why}", "Correct it and submit again")
+        if state != "PENDING" or time.monotonic() >= until_s:
+            return state
+        time.sleep(_LOOK_S)
+
+
+def jobs_api_of(url: str) -> RayJobs:
+    """The Jobs API where a detached job was handed over. InputError where it does not answer."""
+    return open_ray_jobs(url, head_token(url))

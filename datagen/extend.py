@@ -1,0 +1,106 @@
+"""`datagen extend`: want more labels of a run, or of merged runs, and make them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from heapq import heapify, heapreplace
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from datagen.detach import detach_job
+from datagen.going_on import Sources, go_on, open_work
+from datagen.job_options import (
+    DEFAULT_SHARE,
+    Address,
+    Detach,
+    HousesAgain,
+    JsonLines,
+    MaxQuarantined,
+    ObjectsAgain,
+    Placing,
+    ScenesFromAgain,
+    Workers,
+    absolute_place,
+    resumable,
+    words_of,
+)
+from datagen.stored_scenes import StoredScenes, refuse_too_few
+from datagen.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+from schemas.merged import open_runs
+from schemas.run import Run
+from schemas.storage import open_storage
+
+
+def extend(
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    *,
+    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
+    houses: HousesAgain = None,
+    objects: ObjectsAgain = None,
+    scenes_from: ScenesFromAgain = None,
+    workers: Workers = None,
+    address: Address = "local",
+    max_quarantined: MaxQuarantined = DEFAULT_SHARE,
+    detach: Detach = False,
+    json: JsonLines = False,
+) -> int:
+    """Want n labels of a run and make those that are missing; shards that exist keep their bytes.
+
+    Merged runs share the further labels evenly, in whole shards.
+    """
+    placing, given = (
+        Placing(workers, address, json, max_quarantined, detach),
+        Sources(houses, objects, scenes_from),
+    )
+    placing.refuse_bad()
+    if not 1 <= n <= 10**12:
+        raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+    words = ["extend", absolute_place(run), "--n", str(n), *given.words(), *placing.words()]
+    if detach and address != "local":
+        return detach_job(words, run, placing)
+    with resumable([*words, *words_of({"--address": None if address == "local" else address})]):
+        place = open_storage(run, create=False)
+        runs = open_runs(place)
+        works = [open_work(part, given, address) for part in runs]
+        wanted = longer(runs, n, run)
+        for part, work, more in zip(runs, works, wanted, strict=True):
+            if work.scenes_from:
+                stored = StoredScenes(Run.open(work.scenes_from), work.houses, work.objects)
+                refuse_too_few(stored, part.layout, more)
+        for part, more in zip(runs, wanted, strict=True):
+            part.grow(more)
+    if detach:
+        return detach_job(words, run, placing)
+    return go_on(place, run, works, placing, given)
+
+
+def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:
+    """How many labels each run shall have so that together they have n. InputError where that is fewer."""
+    have = [run.n for run in runs]
+    if n < sum(have):
+        problem = f"{place} already wants {sum(have):,}, and a run never shrinks"
+        raise InputError("--n", str(n), problem, f"Give {sum(have)} or more")
+    return shares(have, [run.layout.samples_per_shard for run in runs], n)
+
+
+def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
+    """`have` labels grown by whole shards until they are n together: evenly, and the last one cut.
+
+    `per_shard` are the labels of one shard of each. Each further shard goes to whoever was given the
+    fewest labels so far, the first of equals.
+    """
+    # What everybody gets in any case is given at once: n may be a million shards away.
+    missing = n - sum(have)
+    step = missing // len(have) - max(per_shard)
+    given = [max(0, step // size) * size for size in per_shard]
+    missing -= sum(given)
+    line = [(labels, k) for k, labels in enumerate(given)]
+    heapify(line)
+    while missing > 0:
+        labels, k = line[0]
+        more = min(per_shard[k], missing)
+        missing, given[k] = missing - more, labels + more
+        heapreplace(line, (given[k], k))
+    return [a + b for a, b in zip(have, given, strict=True)]

@@ -1,0 +1,100 @@
+"""What `submit`, `resume` and `extend` share: an existing run's sources opened, and its job begun."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+
+from datagen.arms import refuse_missing_packages
+from datagen.doctor.engines import probe_render_device
+from datagen.job import JobPlan, Work, carry_out
+from datagen.job_options import Placing, absolute_place, absolute_source, resumable, words_of
+from datagen.remaking import open_origin
+from datagen.specify import label_engines, scene_engines
+from schemas.errors import InputError
+from schemas.record_files import different_fields
+from schemas.run import Run
+from schemas.specification import Specification
+from schemas.storage import Storage
+from workers.labels import load_label_source
+from workers.robots import gripper_of
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where the user says that a run's sources lie now; None is where the run found them."""
+
+    houses: str | None = None
+    objects: str | None = None
+    scenes_from: str | None = None
+
+    def words(self) -> list[str]:
+        """The options that say the same again."""
+        return words_of(
+            {
+                "--houses": self.houses and absolute_source(self.houses),
+                "--objects": self.objects and absolute_source(self.objects),
+                "--scenes-from": self.scenes_from and absolute_place(self.scenes_from),
+            }
+        )
+
+
+def open_work(run: Run, given: Sources, address: str) -> Work:
+    """An existing run with its sources, checked to be those that it was made from.
+
+    InputError where they are not there, or where another engine is installed than the run was made with:
+    its shards would then be of another kind than those that are there.
+    """
+    spec, known = run.manifest.spec, run.manifest.sources
+    refuse_missing_packages(spec.label_source)
+    load_label_source(spec.label_source)
+    _ = run.schema  # refuses a run of another schema version
+    _refuse_other_engines(run)
+    open_origin(run, given.houses, given.objects, given.scenes_from)
+    refuse_unusable_engines(spec, address)
+    return Work(
+        run,
+        absolute_source(given.houses or known.get("houses", "builtin")),
+        absolute_source(given.objects or known.get("objects", "builtin")),
+        "" if spec.scenes_from is None else absolute_place(given.scenes_from or known["scenes_from"]),
+    )
+
+
+def go_on(
+    place: Storage, name: str, works: Sequence[Work], placing: Placing, given: Sources | None = None
+) -> int:
+    """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
+    words = ["resume", absolute_place(name), *(given or Sources()).words(), *placing.words()]
+    if placing.address != "local":
+        words += ["--address", placing.address]
+    with resumable(words):
+        return carry_out(JobPlan(place, name, works, placing, words))
+
+
+def refuse_unusable_engines(spec: Specification, address: str) -> None:
+    """Raise InputError for a robot or a renderer with which every shard would fail."""
+    if spec.arm is not None:
+        gripper_of(spec.arm.robot)
+    if address == "local" and spec.scenes_from is None and spec.observation.renderer == "sapien":
+        device = probe_render_device()
+        if not device.succeeded:
+            problem, mend = f"no render device here ({device.text})", "Take embree, or see `datagen doctor`"
+            raise InputError("--renderer", "sapien", problem, mend)
+
+
+def _refuse_other_engines(run: Run) -> None:
+    spec = run.manifest.spec
+    try:
+        here = label_engines(spec.label_source)
+        if spec.scenes_from is None:  # stored scenes are what they are, whatever drew them
+            here |= scene_engines(spec)
+    except PackageNotFoundError as error:
+        raise InputError(
+            run.storage.url, "engines", f"{error.name} is not installed here", "Install it"
+        ) from None
+    made = {name: version for name, version in spec.engines.items() if name in here}
+    rows = [f"{name}: it has {a}, here is {b}" for name, a, b in different_fields(made, here)]
+    if rows:
+        place, mend = f"{run.storage.url}/manifest.json", "Install what it has, or start a new run"
+        raise InputError(place, "engines", "; ".join(rows), mend)

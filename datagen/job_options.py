@@ -1,0 +1,126 @@
+"""Options of the verbs that run jobs, and the command line that they make together."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from cluster.ray_cluster import refuse_unusable
+from datagen.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+Workers = Annotated[
+    int | None,
+    WHOLE_NUMBER,
+    Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
+]
+Address = Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")]
+JsonLines = Annotated[bool, Parameter(negative=(), help="Report progress as JSON lines, also on a terminal.")]
+MaxQuarantined = Annotated[
+    float, Parameter(help="Share of the run's shards that may be given up before the job has failed.")
+]
+Detach = Annotated[
+    bool,
+    Parameter(
+        negative=(),
+        help="Hand the job to Ray and come back: it goes on when this shell ends. With --address, to that "
+        "cluster (its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine.",
+    ),
+]
+HousesAgain = Annotated[
+    str | None, Parameter(help="Where the houses lie now [where the run found them].", name="--houses")
+]
+ObjectsAgain = Annotated[
+    str | None, Parameter(help="Where the objects lie now [where the run found them].", name="--objects")
+]
+ScenesFromAgain = Annotated[
+    str | None,
+    Parameter(
+        help="Where the run lies whose scenes are labelled again [where it was found].", name="--scenes-from"
+    ),
+]
+Quarantined = Annotated[
+    bool, Parameter(negative=(), help="Try the shards in quarantine again; their records stay as history.")
+]
+
+DEFAULT_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where and how a job runs; nothing of this changes a sample."""
+
+    workers: int | None = None
+    address: str = "local"
+    json: bool = False
+    max_quarantined: float = DEFAULT_SHARE
+    detach: bool = False
+
+    def refuse_bad(self) -> None:
+        """Raise InputError for values out of range and, unless detached, for a cluster that is not there."""
+        if self.workers is not None and not 0 <= self.workers <= 4096:
+            mend = "Leave it out for one a core"
+            raise InputError("--workers", str(self.workers), "is not between 0 and 4096", mend)
+        if not 0 <= self.max_quarantined <= 1:
+            given = str(self.max_quarantined)
+            raise InputError("--max-quarantined", given, "is not a share", "Give 0.01 for one in a hundred")
+        if self.workers != 0 and not self.detach:
+            refuse_unusable(self.address)
+
+    def words(self) -> list[str]:
+        """The options that say the same again, without --detach and --address."""
+        share = None if self.max_quarantined == DEFAULT_SHARE else self.max_quarantined
+        return words_of({"--workers": self.workers, "--max-quarantined": share, "--json": self.json})
+
+
+def words_of(options: Mapping[str, object]) -> list[str]:
+    """Options as words of a command line; None and False say nothing."""
+    words: list[str] = []
+    for name, value in options.items():
+        if value is True:
+            words.append(name)
+        elif value is not None and value is not False:
+            words += [name, str(value)]
+    return words
+
+
+def command_line(words: Sequence[str]) -> str:
+    """The command that a user can paste."""
+    return shlex.join(["datagen", *words])
+
+
+@contextmanager
+def resumable(words: Sequence[str]) -> Generator[None]:
+    """Tell whoever interrupts the block how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            f"interrupted early; what is committed stays. Go on with:\n  {command_line(words)}\n"
+        )
+        raise
+
+
+def absolute_source(ref: str) -> str:
+    """A source reference with its file or folder made absolute: workers run elsewhere."""
+    kind, _, text = ref.partition(":")
+    # What names no file is a parameter of the source, as in builtin:400.
+    is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
+    return f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref
+
+
+def absolute_place(place: str) -> str:
+    """A run's address as every folder and machine understands it."""
+    if "://" in place and not place.startswith("file://"):
+        return place
+    return str(Path(place.removeprefix("file://")).expanduser().absolute())
