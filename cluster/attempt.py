@@ -32,9 +32,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     else goes wrong is raised as it is, and concerns this attempt alone.
     """
     spec_hash = task.spec.hash()
-    with _ends_job(every_input_error=True):
-        run, world = _open(task.run, spec_hash, task.houses, task.objects)
-        source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
+    run, world, source = open_task(task)
     with _ends_job():
         run.ledger.start(task.attempt, task.shard)
     stored = None if source is None else read_scenes(source, task.scene_indices)
@@ -62,6 +60,17 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     with _ends_job():
         won = run.commit(commit)
     return Product(won, len(labels), positives, cost)
+
+
+def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
+    """The run, the world of its sources, and the run whose scenes are labelled again, if there is one.
+
+    They are opened once a process. Raises JobCannotGoOn where that cannot be done here.
+    """
+    with _ends_job(every_input_error=True):
+        run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
+        source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
+    return run, world, source
 
 
 @contextmanager
