@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 
@@ -201,15 +202,23 @@ class Run:
                 yield self.decode_commit(shard, data)
 
     def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; its entries for the commit. Nothing counts before it."""
+        """Write an attempt's files durably; its entries for the commit. Nothing counts before it.
+
+        Where the disk refuses one, none is left behind: a full disk gets its room back.
+        """
         folder = shard_folder(shard, attempt)
         entries = tuple(
             FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())
             for path, data in files.items()
         )
-        for path, data in files.items():
-            self.storage.put(f"{folder}/{path}", data)
-        self.storage.sync(f"{folder}/{path}" for path in files)
+        try:
+            for path, data in files.items():
+                self.storage.put(f"{folder}/{path}", data)
+            self.storage.sync(f"{folder}/{path}" for path in files)
+        except InputError:
+            with suppress(InputError):
+                self.storage.delete(f"{folder}/{path}" for path in files)
+            raise
         return entries
 
     def commit(self, commit: Commit) -> bool:
