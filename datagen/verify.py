@@ -1,0 +1,185 @@
+"""`datagen verify`: whether a run is what it says, to the last byte."""
+
+from __future__ import annotations
+
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from datagen.console import print_json, print_rows, seconds, size
+from datagen.counting import counting
+from datagen.whole_number import WHOLE_NUMBER
+from schemas.checking.finding import Finding
+from schemas.checking.place import Checked, check_place
+from schemas.errors import InputError
+from schemas.run import Run
+from schemas.storage import Storage, open_storage
+
+_KEPT = 10_000  # findings that are told one by one; all are counted
+_SHOWN = 50  # of them on a terminal
+
+
+def verify(
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    *,
+    deep: Annotated[
+        int,
+        WHOLE_NUMBER,
+        Parameter(help="Recompute so many random samples, and draw so many random scenes again."),
+    ] = 0,
+    seed: Annotated[
+        int | None, WHOLE_NUMBER, Parameter(help="Which samples and scenes --deep takes [others each time].")
+    ] = None,
+    houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
+    objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
+    scenes_from: Annotated[
+        str | None, Parameter(help="The run whose scenes this one labelled, where it has moved since.")
+    ] = None,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+) -> int:
+    """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
+
+    Nothing is written. Each finding names the file, what is wrong and how to mend it. Exit code 0 when
+    there is none, 1 when there are some. With --deep, labels are computed again too.
+    """
+    if not 0 <= deep <= 1_000_000:
+        raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
+    place = open_storage(run, probe=False, create=False)
+    checked, found = Checked(), Found()
+    with counting("checked", as_json=True if json else None) as seen:
+        found.take(check_place(place, checked, seen))
+    chosen = secrets.randbits(32) if seed is None else seed
+    recomputed = deep > 0 and not found.damage
+    if recomputed:
+        sources = (houses, objects, scenes_from)
+        found.take(_deep(place, checked.runs, deep, chosen, sources))
+    report = _report(run, checked, found)
+    report["deep"] = {"asked": deep, "done": recomputed, "seed": chosen} if deep else None
+    if json:
+        print_json(report)
+    else:
+        _print(report, checked, found)
+    return 1 if found.damage else 0
+
+
+class Found:
+    """Findings as they come: all are counted, the first are kept."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.kept: list[Finding] = []
+
+    def take(self, findings: Iterable[Finding]) -> None:
+        """Take all of them."""
+        for finding in findings:
+            self.counts[finding.kind] += 1
+            if len(self.kept) < _KEPT:
+                self.kept.append(finding)
+
+    @property
+    def damage(self) -> int:
+        """How many findings are damage, and not only age."""
+        return self.counts.total() - self.counts["stale"]
+
+
+def _deep(
+    place: Storage,
+    runs: list[Run],
+    count: int,
+    seed: int,
+    sources: tuple[str | None, str | None, str | None],
+) -> Iterator[Finding]:
+    """Samples recomputed and scenes redrawn, shared out among the runs."""
+    # Simulators are imported only where they are needed.
+    from datagen.deep import deep_findings
+    from datagen.remaking import open_origin
+
+    rng = np.random.default_rng(seed)
+    shares = np.full(len(runs), count // len(runs))
+    shares[: count % len(runs)] += 1
+    mend = "Trust neither it nor its neighbours: find out what made it"
+    for run, share in zip(runs, shares.tolist(), strict=True):
+        origin = open_origin(run, *sources)
+        folder = run.storage.url.removeprefix(place.url).strip("/")
+        for where, shard, problem in deep_findings(run, share, origin, rng):
+            key = where.removeprefix(f"{run.storage.url}/")
+            yield Finding(f"{folder}/{key}".strip("/"), "deep", problem, mend, shard)
+
+
+def finding_row(finding: Finding) -> dict[str, Any]:
+    """A finding as plain values."""
+    return {
+        "file": finding.key,
+        "kind": finding.kind,
+        "problem": finding.problem,
+        "mend": finding.mend,
+        "shard": finding.shard,
+        "repairable": finding.cure is not None,
+    }
+
+
+def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
+    books = checked.books
+    return {
+        "run": run,
+        "clean": not found.damage,
+        "shards": checked.shards,
+        "files": checked.files,
+        "bytes": checked.bytes,
+        "samples": checked.samples,
+        "sealed": checked.is_sealed,
+        "seal_is_stale": found.counts["stale"] > 0,
+        "ledger": {
+            "attempts": books.attempts,
+            "running": books.unfinished,
+            "without_account": books.without_account,
+            "wall_s": books.committed_wall_s + books.wasted_wall_s,
+            "commits_wall_s": books.committed_wall_s,
+            "waste_wall_s": books.wasted_wall_s,
+        },
+        "counts": dict(sorted(found.counts.items())),
+        "findings": [finding_row(finding) for finding in found.kept],
+    }
+
+
+def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
+    books = checked.books
+    wall_s = books.committed_wall_s + books.wasted_wall_s
+    rows = [
+        ("shards", f"{checked.shards:,}, {checked.files:,} files of {size(checked.bytes)}, every byte"),
+        ("samples", f"{checked.samples:,}; each id is that of its specification, scene and candidate"),
+        (
+            "ledger",
+            f"{books.attempts:,} attempts: {seconds(wall_s)} = {seconds(books.committed_wall_s)} in commits"
+            f" + {seconds(books.wasted_wall_s)} waste",
+        ),
+        ("sealed", "yes" if checked.is_sealed else "no"),
+    ]
+    deep = report["deep"]
+    if deep:
+        done = f"{deep['asked']:,} samples recomputed, {deep['asked']:,} scenes drawn again"
+        rows.append(
+            ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: mend it first")
+        )
+    state = "clean" if not found.damage else f"{found.damage:,} findings"
+    print_rows(f"{state}: {report['run']}", rows)
+    print_findings("findings", found.kept, sum(found.counts.values()))
+
+
+def print_findings(title: str, findings: list[Finding], total: int) -> None:
+    """A table of findings, or nothing where there is none."""
+    if not findings:
+        return
+    rows = [(_plain(f.key), _plain(f.problem), f.mend) for f in findings[:_SHOWN]]
+    print_rows(title, rows, ("file", "what is wrong", "how to mend it"))
+    if total > len(rows):
+        print_rows(f"and {total - len(rows):,} more: --json tells them", [])
+
+
+def _plain(text: str) -> str:
+    """The text without what would move a terminal's cursor."""
+    return "".join(c if c.isprintable() else "?" for c in text)
