@@ -1,0 +1,350 @@
+"""Kill or fail an operation at each of its calls, and see that every unit is absent or there, whole.
+
+This process has the shim loaded and everything imported, and starts no thread: it forks a child for each
+point, and another that looks with fresh eyes. Run as a program it prints its findings as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from schemas.errors import InputError
+from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, units, use_small_schema
+from tests.faults.crash_points_shim import Call, Mode, Shim, read_log
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+_REFUSED, _DEFECT = 3, 4
+Files = Mapping[str, bytes]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One call at which something happens: its number from 1, and the error or 0 for a kill."""
+
+    mode: Mode
+    at: int
+    error: int = 0
+
+
+@dataclass
+class Finding:
+    """What an operation showed. `absent` and `there` count points; `between`, those with some units of
+    several there; `violations` say what was neither."""
+
+    operation: str
+    calls: int
+    points: int = 0
+    absent: int = 0
+    there: int = 0
+    between: int = 0
+    refused: int = 0
+    violations: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """An operation that nothing disturbed: what was before and after it, and its calls."""
+
+    before_files: Files
+    after_files: Files
+    before: Units
+    after: Units
+    calls: list[Call]
+
+
+def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: int | None) -> list[Finding]:
+    """Try the operations at all their points, or at so many of each kind of end."""
+    findings: list[Finding] = []
+    for operation in operations:
+        known = _reference(shim, work, operation)
+        finding = Finding(operation.name, len(known.calls))
+        for point in points(known.calls, sample):
+            _try(shim, work, operation, known, point, finding)
+        shutil.rmtree(work / operation.name)
+        findings.append(finding)
+    return findings
+
+
+def points(calls: list[Call], sample: int | None) -> list[Point]:
+    """Every end at every call, or of each kind of end a sample with the last calls in it."""
+    numbers = range(1, len(calls) + 1)
+    kinds = [
+        [Point(Mode.KILL, k) for k in numbers],
+        [Point(Mode.KILL_HALF_WRITTEN, k) for k in numbers if calls[k - 1].kind == "write"],
+        [Point(Mode.FAIL_ONCE, k, errno.EIO) for k in numbers],
+        [Point(Mode.FAIL_FROM_HERE, k, errno.ENOSPC) for k in numbers],
+    ]
+    if sample is not None:
+        draw = random.Random(len(calls))
+        kinds = [[*draw.sample(kind[:-3], min(sample, len(kind[:-3]))), *kind[-3:]] for kind in kinds]
+    return [point for kind in kinds for point in kind]
+
+
+def trace(shim: Shim, work: Path, operations: Iterable[Operation], log: Path) -> None:
+    """Run the operations once each, and log their calls. Who traces finds them by the names looked for."""
+    with log.open("wb") as f:
+        for operation in operations:
+            _trace_one(shim, work / operation.name.replace(" ", "_"), operation, f)
+
+
+def _trace_one(shim: Shim, folder: Path, operation: Operation, log: BinaryIO) -> None:
+    def act() -> None:
+        log.write(f"begin {folder}\n".encode())
+        log.flush()
+        Path(f"{folder}.begin").exists()
+        shim.arm(folder, Mode.COUNT, log=log.fileno())
+        operation.act(folder)
+        shim.disarm()
+        Path(f"{folder}.end").exists()
+
+    _must(lambda: operation.prepare(folder))
+    _must(act)
+
+
+def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
+    home = work / operation.name
+    home.mkdir()
+    template, after = home / "before", home / "after"
+    _must(lambda: operation.prepare(template))
+    _copy(template, after)
+    log = home / "log"
+    with log.open("wb") as f:
+
+        def act() -> None:
+            shim.arm(after, Mode.COUNT, log=f.fileno())
+            operation.act(after)
+            shim.disarm()
+
+        _must(act)
+    return _Reference(
+        _files(template), _files(after), _look(template), _look(after), read_log(log.read_text())
+    )
+
+
+def _try(
+    shim: Shim, work: Path, operation: Operation, known: _Reference, point: Point, finding: Finding
+) -> None:
+    place = work / operation.name / "point"
+    _copy(work / operation.name / "before", place)
+
+    def act() -> None:
+        shim.arm(place, point.mode, point.at, point.error)
+        try:
+            operation.act(place)
+        finally:
+            shim.disarm()
+
+    status, told = _in_child(act)
+    finding.points += 1
+    call = known.calls[point.at - 1]
+    where = f"{point.mode.name} {point.error or ''} at {point.at}: {call.kind} {Path(call.path).name}"
+
+    def violated(what: str) -> None:
+        finding.violations.append(f"{where}: {what}")
+
+    if point.error:
+        if status == _REFUSED:
+            finding.refused += 1
+            if "\n" in told:
+                violated(f"an error of several lines: {told}")
+            if call.kind not in ("unlink", "rmdir"):
+                for name in _drafts(_files(place).keys() - known.before_files.keys(), known):
+                    violated(f"left behind: {name}")
+        elif status != 0:
+            violated(f"ended with {status}: {told}")
+    elif status not in (-9, 0):
+        violated(f"ended with {status}: {told}")
+    ended = status == 0
+    for name, data in known.before_files.items():
+        if known.after_files.get(name) == data and _bytes(place / name) != data:
+            violated(f"changed {name}")
+    # One fresh process looks, goes on as a user would, and looks again.
+    now, resumed = _look_and_resume(place, operation)
+    _judge(now, known, finding, violated, ended)
+    if _lasting(resumed) != _lasting(known.after):
+        violated(f"resumed to something else: {_different(resumed, known.after)}")
+
+
+def _drafts(names: Iterable[str], known: _Reference) -> list[str]:
+    """Those of the new files that belong to nothing: drafts, and an attempt that is not written whole.
+
+    One that is, and lacks only its commit, is left to `gc`: its commit may be on its way.
+    """
+    drafts: list[str] = []
+    by_attempt: dict[str, set[str]] = {}
+    for name in names:
+        if re.search(r"\.(part|partial)\b|#[0-9]+$", name):
+            drafts.append(name)
+        elif found := re.match(r"(.*/)?shards/[0-9]+/[^/]+/", name):
+            by_attempt.setdefault(found[0], set()).add(name)
+    for folder, there in by_attempt.items():
+        whole = {name for name in known.after_files if name.startswith(folder)}
+        if whole - there - {f"{folder}commit.json"}:
+            drafts += sorted(there)
+    return drafts
+
+
+def _judge(
+    now: Units, known: _Reference, finding: Finding, violated: Callable[[str], None], ended: bool
+) -> None:
+    """Every unit is as before or as after, and as after where the operation came to its end."""
+    states: set[str] = set()
+    for name in sorted({*now, *known.before, *known.after}):
+        old, value, new = known.before.get(name), now.get(name), known.after.get(name)
+        if old == new == value or (name.startswith("ledger ") and name not in known.after):
+            continue  # an attempt that has begun is no unit: its end, or the one who resumes, closes it
+        if value == new:
+            states.add("there")
+        elif value == old:
+            states.add("absent")
+        else:
+            violated(f"{name} is {value!r}, was {old!r}, should be {new!r}")
+    if ended and "absent" in states:
+        violated("it said that it had succeeded")
+    state = "between" if len(states) > 1 else next(iter(states), "there")
+    setattr(finding, state, getattr(finding, state) + 1)
+
+
+def _lasting(found: Units) -> Units:
+    """Units without the ledger's: whoever resumes is another attempt."""
+    return {name: value for name, value in found.items() if not name.startswith("ledger ")}
+
+
+def _different(one: Units, other: Units) -> list[str]:
+    return [name for name in sorted({*one, *other}) if one.get(name) != other.get(name)]
+
+
+def _look(folder: Path) -> Units:
+    """The units, seen by a process that has never seen the run."""
+    status, told = _in_child(lambda: json.dumps(units(folder)))
+    return json.loads(told) if status == 0 else {"readers": told}
+
+
+def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units]:
+    def go() -> str:
+        now = units(folder)
+        try:
+            (operation.resume or operation.act)(folder)
+        except InputError as e:
+            return json.dumps([now, {"resuming": str(e)}])
+        return json.dumps([now, units(folder)])
+
+    status, told = _in_child(go)
+    now, resumed = json.loads(told) if status == 0 else ({"readers": told}, {})
+    return now, resumed
+
+
+def _must(do: Callable[[], None]) -> None:
+    status, told = _in_child(do)
+    if status != 0:
+        raise RuntimeError(told)
+
+
+def _in_child(do: Callable[[], str | None]) -> tuple[int, str]:
+    """Do it in a forked child: (exit status, negative for a signal; what it returned or failed with)."""
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        status, told = _DEFECT, ""
+        try:
+            os.close(reading)
+            told, status = do() or "", 0
+        except InputError as e:
+            told, status = str(e), _REFUSED
+        except BaseException:  # noqa: BLE001 - whatever it is must not come back into the parent's code
+            told = traceback.format_exc()
+        finally:
+            with os.fdopen(writing, "w") as f:
+                f.write(told)
+            os._exit(status)
+    os.close(writing)
+    with os.fdopen(reading) as f:
+        told = f.read()
+    _, ended = os.waitpid(pid, 0)
+    return os.waitstatus_to_exitcode(ended), told
+
+
+def _copy(source: Path, target: Path) -> None:
+    """A copy in which names that share a file share one again."""
+    shutil.rmtree(target, ignore_errors=True)
+    if not source.exists():
+        return
+    seen: dict[int, Path] = {}
+    for path in [source, *sorted(source.rglob("*"))]:
+        copy = target / path.relative_to(source)
+        if path.is_dir():
+            copy.mkdir()
+        elif (first := seen.setdefault(path.stat().st_ino, copy)) != copy:
+            os.link(first, copy)
+        else:
+            shutil.copy(path, copy)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+# As a program, and how to start it --------------------------------------------------------------
+
+
+def run_campaign(names: Iterable[str], sample: int | None, library: Path) -> list[Finding]:
+    """The campaign over the named operations, or all, in a process with the shim."""
+    more = [] if sample is None else ["--sample", str(sample)]
+    done = start(library, [*more, *(f"--only={name}" for name in names)], stdout=subprocess.PIPE)
+    return [Finding(**found) for found in json.loads(done.stdout)]
+
+
+def start(
+    library: Path, arguments: list[str], before: Iterable[str] = (), **how: Any
+) -> subprocess.CompletedProcess[str]:
+    """This program with the shim at `library`; `before` are words in front of it."""
+    command = [sys.executable, "-m", "tests.faults.crash_points_campaign", str(library), *arguments]
+    environment = {**os.environ, "LD_PRELOAD": str(library)}
+    # Libraries that start threads when imported would not survive the forks.
+    environment |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    # Not for what stands in front, which starts it in its turn.
+    preload = ["env", f"LD_PRELOAD={environment.pop('LD_PRELOAD')}"] if before else []
+    return subprocess.run(
+        [*before, *preload, *command], cwd=REPOSITORY, env=environment, check=True, text=True, **how
+    )
+
+
+def main() -> None:
+    """Try the named operations, or all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("library", type=Path)
+    parser.add_argument("--sample", type=int, help="points of each kind of end, in place of all")
+    parser.add_argument("--trace", type=Path, help="only run the operations, and log their calls there")
+    parser.add_argument("--only", action="append", default=[], help="an operation")
+    options = parser.parse_args()
+    use_small_schema()
+    chosen = [op for op in OPERATIONS if not options.only or op.name in options.only]
+    memory = Path("/dev/shm")  # copies there are quick; a kill is the same on every file system
+    with tempfile.TemporaryDirectory(prefix="crash-points-", dir=memory if memory.is_dir() else None) as work:
+        if options.trace:
+            trace(Shim(options.library), Path(work), chosen, options.trace)
+            return
+        found = campaign(Shim(options.library), Path(work), chosen, options.sample)
+    json.dump([asdict(finding) for finding in found], sys.stdout)
+
+
+if __name__ == "__main__":
+    main()
