@@ -6,7 +6,7 @@ them, each piece with its share of the cost; those that made nothing stay whole,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 from schemas.merge_plan import Holding, Union
@@ -14,6 +14,7 @@ from schemas.record_files import encode_record
 from schemas.run_records import AttemptStart, LedgerEntry
 
 SPARE_CAUSE = "merged: this shard is held from another attempt"
+LOST_CAUSE = "merged: it left no end, and its shard was decided without it"
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,11 @@ class _Place:
     piece: int | None  # shard of the union; None for the whole attempt
 
 
-def united_attempts(union: Union) -> Iterator[UnitedAttempt]:
-    """Every attempt of the union in order of names; records are read as they are asked for."""
+def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[UnitedAttempt]:
+    """Every attempt of the union in order of names; records are read as they are asked for.
+
+    One that left no end is lost, at a cost that nobody knows, where its shard is kept or `given_up`.
+    """
     held = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
     kept = {holding.name: holding for holding in union.kept.values()}
     places = _places(union)
@@ -48,6 +52,8 @@ def united_attempts(union: Union) -> Iterator[UnitedAttempt]:
         elif name in held:
             yield UnitedAttempt(name, start, _end_of_held(union, held[name], start, ends, is_kept=False))
         else:
+            if start is not None and not ends and (start.shard in union.kept or start.shard in given_up):
+                ends.append(_lost(start))
             yield UnitedAttempt(name, start, min(ends, key=_account_first) if ends else None)
 
 
@@ -115,5 +121,12 @@ def _end_of_held(
     return min([*noted, derived], key=lambda end: (end == derived, encode_record(end)))
 
 
-def _account_first(end: LedgerEntry) -> tuple[bool, bytes]:
-    return end.cost is None, encode_record(end)
+def _lost(start: AttemptStart) -> LedgerEntry:
+    return LedgerEntry(
+        attempt=start.attempt, shard=start.shard, outcome="lost", cause=LOST_CAUSE, started=start.started
+    )
+
+
+def _account_first(end: LedgerEntry) -> tuple[bool, bool, bytes]:
+    """Which of several ends of one attempt says most: one with its cost, and a guess only where all are."""
+    return end.cost is None, end.cause == LOST_CAUSE, encode_record(end)

@@ -113,7 +113,8 @@ def plan_union(
         cut = Cut(run.layout.scenes_per_shard, layout.scenes_per_shard)
         for holding in _holdings(run, source, cut):
             held.setdefault(holding.shard, []).append(holding)
-            tick()
+            if holding.shard == cut.first(holding.of):
+                tick()
     kept: dict[int, Holding] = {}
     spare: dict[int, tuple[Holding, ...]] = {}
     compared: set[tuple[int, int, int, int]] = set()

@@ -5,7 +5,7 @@ Every step skips what is there, so that a merge that was killed is finished by d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -75,8 +75,10 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
         for _ in holdings:
             tick()
     union = _without(union, lost)
-    attempts = _write_ledger(union, run, tick)
-    _write_quarantine(union, run)
+    given_up = _given_up(union)
+    attempts = _write_ledger(union, run, given_up, tick)
+    for shard in sorted(given_up.keys() - run.quarantined()):
+        run.quarantine(given_up[shard])
     replace_record(run.storage, LINEAGE, encode_lineage(_lineage(union)))
     return Written(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
 
@@ -146,10 +148,10 @@ def _without(union: Union, lost: Iterable[Holding]) -> Union:
     return replace(union, kept=kept, spare=spare)
 
 
-def _write_ledger(union: Union, run: Run, tick: Tick) -> int:
+def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) -> int:
     there = {file.key for file in run.storage.list("ledger")}
     count = 0
-    for attempt in united_attempts(union):
+    for attempt in united_attempts(union, given_up):
         for key, record in ((start_key(attempt.name), attempt.start), (end_key(attempt.name), attempt.end)):
             if record is not None:
                 _put(run.storage, key, encode_record(record), key in there)
@@ -166,19 +168,17 @@ def _put(storage: Storage, key: str, record: bytes, is_there: bool) -> None:
         storage.sync([key])
 
 
-def _write_quarantine(union: Union, run: Run) -> None:
+def _given_up(union: Union) -> dict[int, QuarantineRecord]:
+    """Records of the shards that some source gave up and none has, by shard."""
     found: dict[int, QuarantineRecord] = {}
     scenes = union.layout.scenes_per_shard
-    for source, given_up in enumerate(union.runs):
-        for record in given_up.quarantine_records():
+    for source, run in enumerate(union.runs):
+        for record in run.quarantine_records():
             for shard in union.cut(source).shards(record.shard):
-                piece = record.model_copy(
-                    update={"shard": shard, "first_scene": shard * scenes, "scenes": scenes}
-                )
+                place = {"shard": shard, "first_scene": shard * scenes, "scenes": scenes}
+                piece = record.model_copy(update=place)
                 found[shard] = min(found.get(shard, piece), piece, key=encode_record)
-    there = run.quarantined() | run.committed()
-    for shard in sorted(found.keys() - there):
-        run.quarantine(found[shard])
+    return {shard: record for shard, record in found.items() if shard not in union.kept}
 
 
 def _lineage(union: Union) -> dict[Origin, list[int]]:

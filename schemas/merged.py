@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
@@ -35,3 +37,25 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
 def part_folder(spec_hash: str) -> str:
     """Folder of the part with this specification."""
     return f"parts/{spec_hash[:16]}"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What runs together want and have: labels, and planned shards without a commit."""
+
+    n: int
+    labels: int
+    missing: int
+
+
+def wanted(runs: Iterable[Run]) -> Wanted:
+    """Sums over the runs of a place. Shards beyond a run's n do not count, and the last one is cut."""
+    n = labels = missing = 0
+    for run in runs:
+        run_n = run.n
+        shards = run.layout.shards_for(run_n)
+        done = [shard for shard in run.committed() if shard < shards]
+        n += run_n
+        labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
+        missing += shards - len(done)
+    return Wanted(n, labels, missing)

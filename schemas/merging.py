@@ -35,6 +35,11 @@ class Merge:
         """Whether the result is one run; else it is a place of several."""
         return len(self.hashes) == 1
 
+    @property
+    def records(self) -> int:
+        """Shards and attempts to write, at most: what is in several sources is counted in each."""
+        return sum(len(union.kept) + sum(map(len, union.attempts)) for union in self.unions)
+
 
 @dataclass(frozen=True, eq=False)
 class Result:

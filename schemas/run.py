@@ -29,6 +29,7 @@ from schemas.run_records import (
     FileEntry,
     Layout,
     Manifest,
+    Merged,
     Plan,
     QuarantineRecord,
 )
@@ -76,6 +77,12 @@ class Run:
         storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
         manifest = read_record(storage, "manifest.json", Manifest)
         if manifest is None:
+            merged = read_record(storage, "merged.json", Merged)
+            if merged is not None:
+                parts = ", ".join(f"{storage.url}/parts/{part[:16]}" for part in merged.parts[:3])
+                more = f" or another of {len(merged.parts)}" if len(merged.parts) > 3 else ""
+                problem = f"holds {len(merged.parts)} merged runs, and one is needed here"
+                raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
             raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
         where = f"{storage.url}/manifest.json"
         if manifest.format_version != FORMAT_VERSION:
