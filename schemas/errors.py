@@ -25,7 +25,7 @@ class InputError(ValueError):
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
         # Exceptions cross process borders; the default would call __init__ with one argument.
-        return (InputError, (self.place, self.field, self.problem, self.mend))
+        return (type(self), (self.place, self.field, self.problem, self.mend))
 
 
 def choices(valid: object) -> str:

@@ -1,0 +1,315 @@
+"""Files below one folder of this machine, reached without following a symbolic link.
+
+A run may come from elsewhere and hold links to anything. So every verb walks down from the root by open
+folders, refuses what is neither a folder nor a plain file, and is not led out by a link that is put in
+its way meanwhile. Failures are OSErrors; what is refused is an InputError that names it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from schemas.errors import InputError
+from schemas.storage_errors import storage_error, too_large
+from schemas.stored_file import StoredFile
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+# Enough to go through a folder, without permission to read it.
+_STEP = getattr(os, "O_PATH", os.O_RDONLY) | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+# Without O_NONBLOCK the opening of a pipe waits for somebody at its other end.
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_DRAFT = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
+_COPIED_AT_ONCE = 2**20
+_MAX_DEPTH = 32
+_KINDS = {
+    stat.S_IFLNK: "a symbolic link",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+class LocalFiles:
+    """The files below `root`/`prefix`. The root itself may be a link: whoever named it meant it."""
+
+    def __init__(self, root: Path, prefix: tuple[str, ...] = ()) -> None:
+        self.root, self.prefix = root, prefix
+        self.folder = root.joinpath(*prefix)
+
+    def below(self, key: str) -> LocalFiles:
+        """The files of a folder below, which need not exist; reached from the same root."""
+        return LocalFiles(self.root, (*self.prefix, *key.split("/")))
+
+    def put(self, key: str, data: bytes) -> None:
+        """Write a file whole; one of that name is replaced."""
+        folders, name = _split(key)
+        here = self._walk(folders, make=True)
+        try:
+            with _drafted(name, here) as draft:
+                _write(draft, data, here, durably=False)
+                os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
+        finally:
+            os.close(here)
+
+    def create(self, key: str, data: bytes) -> bool:
+        """Write a file durably unless the name is taken; False when it is.
+
+        The bytes are on disk before the name is, or a power cut could leave an empty file that counts.
+        """
+        folders, name = _split(key)
+        here = self._walk(folders, make=True)
+        try:
+            with _drafted(name, here) as draft:
+                _write(draft, data, here, durably=True)
+                try:
+                    os.link(draft, name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=False)
+                except FileExistsError:
+                    return False
+        finally:
+            os.close(here)
+        self._sync_folders(_with_parents(folders))
+        return True
+
+    def get(self, key: str, limit_bytes: int) -> bytes | None:
+        """The file's bytes, or None when there is no such file. InputError for one above the limit."""
+        try:
+            fd = self._open_file(key)
+        except FileNotFoundError:
+            return None
+        try:
+            size = os.fstat(fd).st_size
+            if size > limit_bytes:
+                raise too_large(f"{self.folder}/{key}", size, limit_bytes)
+            return _read(fd, size)
+        finally:
+            os.close(fd)
+
+    def exists(self, key: str) -> bool:
+        """Whether the file exists."""
+        folders, name = _split(key)
+        try:
+            here = self._walk(folders)
+        except FileNotFoundError:
+            return False
+        try:
+            mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
+        except FileNotFoundError:
+            return False
+        finally:
+            os.close(here)
+        self._refuse_odd(mode, key)
+        return stat.S_ISREG(mode)
+
+    def list(self, prefix: str) -> Iterator[StoredFile]:
+        """All files below a folder; none when it does not exist. InputError for links, pipes, devices."""
+        folders = tuple(prefix.split("/")) if prefix else ()
+        try:
+            here = self._walk(folders, flags=_FOLDER)
+        except FileNotFoundError:
+            return
+        try:
+            yield from self._list(here, f"{prefix}/" if prefix else "", 0)
+        finally:
+            os.close(here)
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Remove files; those that do not exist are passed over. A link is removed, not what it names."""
+        for key in keys:
+            folders, name = _split(key)
+            with suppress(FileNotFoundError):
+                here = self._walk(folders)
+                try:
+                    os.unlink(name, dir_fd=here)
+                finally:
+                    os.close(here)
+
+    def take(self, source: LocalFiles, source_key: str, key: str) -> None:
+        """A second name for a file of `source`, or a copy where no link can be; replaces an older file."""
+        from_folders, from_name = _split(source_key)
+        folders, name = _split(key)
+        there = source._walk(from_folders)
+        try:
+            seen = os.stat(from_name, dir_fd=there, follow_symlinks=False)
+            source._refuse_odd(seen.st_mode, source_key)
+            here = self._walk(folders, make=True)
+            try:
+                with suppress(FileNotFoundError):
+                    if os.path.samestat(seen, os.stat(name, dir_fd=here, follow_symlinks=False)):
+                        return
+                with _drafted(name, here) as draft:
+                    try:
+                        os.link(from_name, draft, src_dir_fd=there, dst_dir_fd=here, follow_symlinks=False)
+                    except OSError as e:
+                        if e.errno not in _NOT_LINKED:
+                            raise
+                        source._copy(source_key, draft, here)
+                    os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
+            finally:
+                os.close(here)
+        finally:
+            os.close(there)
+
+    def sync(self, keys: Iterable[str]) -> None:
+        """Call fsync on each file, and on each folder from there up to the root, leaves first.
+
+        InputError names the file or folder for which the disk refuses.
+        """
+        folders: set[tuple[str, ...]] = set()
+        for key in keys:
+            self._sync(key, lambda key=key: self._open_file(key))
+            folders.update(_with_parents(_split(key)[0]))
+        self._sync_folders(folders)
+
+    def _sync_folders(self, folders: Iterable[tuple[str, ...]]) -> None:
+        for folder in sorted(folders, key=len, reverse=True):
+            self._sync("/".join(folder), lambda folder=folder: self._walk(folder, flags=_FOLDER))
+
+    def _sync(self, key: str, open_it: Callable[[], int]) -> None:
+        try:
+            fd = open_it()
+            try:
+                os.fsync(fd)
+            finally:
+                os.close(fd)
+        except OSError as e:
+            raise storage_error(self.folder / key, e) from e
+
+    def _walk(self, folders: Sequence[str], make: bool = False, flags: int = _STEP) -> int:
+        """An open folder, whose descriptor the caller closes; with `make` missing ones are made."""
+        here = os.open(self.root, flags & ~os.O_NOFOLLOW)
+        for name in (*self.prefix, *folders):
+            try:
+                below = _step(name, here, make, flags)
+            except OSError as e:
+                if e.errno in (errno.ENOTDIR, errno.ELOOP):
+                    with suppress(FileNotFoundError):
+                        mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
+                        self._refuse_odd(mode, "/".join(folders), f"{name!r} in this path is ")
+                raise
+            finally:
+                os.close(here)
+            here = below
+        return here
+
+    def _open_file(self, key: str) -> int:
+        folders, name = _split(key)
+        here = self._walk(folders)
+        try:
+            mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
+            if not stat.S_ISREG(mode):
+                self._refuse_odd(mode, key)
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), key)
+            return os.open(name, _FILE, dir_fd=here)
+        finally:
+            os.close(here)
+
+    def _list(self, folder: int, prefix: str, depth: int) -> Iterator[StoredFile]:
+        if depth > _MAX_DEPTH:
+            mend = "It was not written by this program: remove it"
+            raise InputError(f"{self.folder}/{prefix}", "", "folders within folders without end", mend)
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                key = prefix + entry.name
+                try:
+                    seen = entry.stat(follow_symlinks=False)
+                    is_folder = stat.S_ISDIR(seen.st_mode)
+                    below = os.open(entry.name, _FOLDER, dir_fd=folder) if is_folder else -1
+                except FileNotFoundError:
+                    continue  # removed since the folder was read
+                if is_folder:
+                    try:
+                        yield from self._list(below, f"{key}/", depth + 1)
+                    finally:
+                        os.close(below)
+                else:
+                    self._refuse_odd(seen.st_mode, key)
+                    stamp = f"{seen.st_ino:x}-{seen.st_ctime_ns:x}-{seen.st_size:x}"
+                    yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
+
+    def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
+        """Raise InputError for what is neither a file nor a folder."""
+        kind = _KINDS.get(stat.S_IFMT(mode))
+        if kind is not None:
+            place = f"{self.folder}/{key}"
+            mend = "Remove it; where it stands for a file that you trust, put a copy of that file there"
+            raise InputError(place, "", f"{where or 'is '}{kind}, and a run has none", mend)
+
+    def _copy(self, key: str, draft: str, into: int) -> None:
+        fd = self._open_file(key)
+        try:
+            target = os.open(draft, _DRAFT, 0o666, dir_fd=into)
+            try:
+                while data := os.read(fd, _COPIED_AT_ONCE):
+                    _write_all(target, data)
+            finally:
+                os.close(target)
+        finally:
+            os.close(fd)
+
+
+@contextmanager
+def _drafted(name: str, folder: int) -> Generator[str]:
+    """The name of a draft beside a file, which is gone when the block ends."""
+    draft = f"{name}.{secrets.token_hex(8)}.part"
+    try:
+        yield draft
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(draft, dir_fd=folder)
+
+
+def _split(key: str) -> tuple[tuple[str, ...], str]:
+    *folders, name = key.split("/")
+    return tuple(folders), name
+
+
+def _with_parents(folders: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """A folder and all above it, up to the root."""
+    return (folders[:depth] for depth in range(len(folders) + 1))
+
+
+def _step(name: str, here: int, make: bool, flags: int) -> int:
+    while True:
+        try:
+            return os.open(name, flags, dir_fd=here)
+        except FileNotFoundError:
+            if not make:
+                raise
+            with suppress(FileExistsError):
+                os.mkdir(name, dir_fd=here)
+
+
+def _read(fd: int, size: int) -> bytes:
+    """The first `size` bytes, or what there is of them."""
+    data = os.read(fd, size)
+    if len(data) == size:
+        return data
+    parts = [data]  # one call reads at most 2 GiB
+    while data and (size := size - len(data)):
+        data = os.read(fd, size)
+        parts.append(data)
+    return b"".join(parts)
+
+
+def _write(draft: str, data: bytes, folder: int, durably: bool) -> None:
+    fd = os.open(draft, _DRAFT, 0o666, dir_fd=folder)
+    try:
+        _write_all(fd, data)
+        if durably:
+            os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _write_all(fd: int, data: bytes) -> None:
+    left = memoryview(data)
+    while left:
+        left = left[os.write(fd, left) :]

@@ -1,0 +1,209 @@
+"""Objects below a prefix of an S3 bucket, through obstore: repeated while that helps, within a bound.
+
+The client repeats nothing by itself, so that one rule holds for every request: what may pass is tried
+again with growing pauses until `PATIENCE` requests' time is used up, what cannot pass is told at once.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import timedelta
+from functools import cache
+from itertools import islice
+from typing import Any, TypeVar
+
+import obstore
+from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.store import S3Store
+
+from schemas.errors import InputError
+from schemas.remote_settings import bucket_and_prefix, connection_settings, timeout_s
+from schemas.storage_errors import StoreTrouble, store_trouble, too_large
+from schemas.stored_file import StoredFile
+
+AT_ONCE = 16  # requests under way for one call
+PATIENCE = 1.5  # timeouts for which a request is repeated, at least once
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
+_DELETED_AT_ONCE = 1000  # what S3 takes in one request
+_FAILURES = (BaseError, OSError, ValueError)
+
+Result = TypeVar("Result")
+Item = TypeVar("Item")
+
+
+class RemoteObjects:
+    """The objects below `s3://bucket/prefix`. A failure is an `InputError` of the object and the mend."""
+
+    def __init__(self, url: str) -> None:
+        self.bucket, self.prefix = bucket_and_prefix(url)
+        self.url = f"s3://{self.bucket}/{self.prefix}".rstrip("/")
+        self._timeout_s = timeout_s()
+        self._store = self._open(self.prefix)
+
+    def below(self, key: str) -> RemoteObjects:
+        """The objects below a longer prefix."""
+        return RemoteObjects(f"{self.url}/{key}")
+
+    def put(self, key: str, data: bytes) -> None:
+        """Write an object whole; one of that name is replaced."""
+        self._try(key, lambda: obstore.put(self._store, key, data, use_multipart=False))
+
+    def create(self, key: str, data: bytes) -> bool:
+        """Write an object unless the name is taken; False when it is, by whomever.
+
+        A request that was carried out and yet answered with an error finds its own object when it is
+        repeated: False, too.
+        """
+
+        def put() -> bool:
+            try:
+                obstore.put(self._store, key, data, mode="create", use_multipart=False)
+            except AlreadyExistsError as e:
+                # Also said while another request is at this name, which may come to nothing.
+                if "409 Conflict" in str(e) and not self.exists(key):
+                    raise _Passing("the store answers 409") from e
+                return False
+            return True
+
+        return self._try(key, put)
+
+    def get(self, key: str, limit_bytes: int) -> bytes | None:
+        """The object's bytes, or None when there is none. InputError for one above the limit."""
+
+        def get() -> bytes:
+            found = obstore.get(self._store, key)
+            size = int(found.meta["size"])
+            if size > limit_bytes:
+                raise too_large(f"{self.url}/{key}", size, limit_bytes)
+            data = bytes(found.bytes())
+            if len(data) != size:
+                raise _Passing("the store breaks off its answers")
+            return data
+
+        try:
+            return self._try(key, get)
+        except FileNotFoundError:
+            return None
+
+    def exists(self, key: str) -> bool:
+        """Whether the object exists."""
+        try:
+            self._try(key, lambda: obstore.head(self._store, key))
+        except FileNotFoundError:
+            return False
+        return True
+
+    def list(self, prefix: str) -> Iterator[StoredFile]:
+        """All objects below a prefix (without its closing slash), in order of their keys."""
+        last: str | None = None
+        pages: Iterator[Any] | None = None
+
+        def page() -> Any:
+            nonlocal pages
+            try:
+                if pages is None:
+                    pages = iter(obstore.list(self._store, prefix, offset=last))
+                return next(pages, None)
+            except _FAILURES:
+                pages = None  # a stream that failed is over: begin again after what was seen
+                raise
+
+        while (entries := self._try(prefix, page)) is not None:
+            for entry in entries:
+                last = str(entry["path"])
+                stamp = entry["e_tag"] or f"{entry['last_modified'].isoformat()}-{entry['size']}"
+                yield StoredFile(last, int(entry["size"]), str(stamp), entry["last_modified"].timestamp())
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Remove objects; those that do not exist are passed over."""
+        left = iter(keys)
+        while some := list(islice(left, _DELETED_AT_ONCE)):
+            try:
+                self._try(some[0], lambda some=some: obstore.delete(self._store, some))
+            except FileNotFoundError:
+                continue
+
+    def take(self, source: RemoteObjects, source_key: str, key: str, limit_bytes: int) -> None:
+        """Copy an object of `source`: by the server within one bucket. FileNotFoundError if there is none."""
+        if source.bucket == self.bucket:
+            whole = self._open("")
+            from_, to = f"{source.prefix}/{source_key}".lstrip("/"), f"{self.prefix}/{key}".lstrip("/")
+            self._try(key, lambda: obstore.copy(whole, from_, to))
+            return
+        data = source.get(source_key, limit_bytes)
+        if data is None:
+            raise FileNotFoundError(source_key)
+        self.put(key, data)
+
+    def put_many(self, files: Mapping[str, bytes]) -> None:
+        """Write many objects whole, several at once."""
+        for _ in in_order(lambda item: self.put(*item), files.items()):
+            pass
+
+    def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
+        """(key, bytes) of many objects in the order of the keys, read several at once."""
+        return in_order(lambda key: (key, self.get(key, limit_bytes)), keys)
+
+    def _open(self, prefix: str) -> Any:
+        timeout = timedelta(seconds=self._timeout_s)
+        options: Any = {
+            **connection_settings(),
+            "connect_timeout": min(timeout, timedelta(seconds=5)),
+            "read_timeout": timeout,
+            "timeout": 10 * timeout,  # of a whole object, over a slow line
+        }
+        retries: Any = {"max_retries": 0, "retry_timeout": timeout}
+        try:
+            return S3Store(self.bucket, prefix=prefix or None, client_options=options, retry_config=retries)
+        except _FAILURES as e:
+            problem = "the AWS_* environment variables cannot be used"
+            raise InputError(self.url, "", problem, "Check their spelling and values") from e
+
+    def _try(self, key: str, request: Callable[[], Result]) -> Result:
+        """What a request gives, repeated while that helps; FileNotFoundError for an absent object."""
+        end_s = time.monotonic() + PATIENCE * self._timeout_s
+        pause_s, tries = _FIRST_PAUSE_S, 0
+        while True:
+            try:
+                return request()
+            except InputError:
+                raise
+            except _FAILURES as e:
+                trouble = e.trouble if isinstance(e, _Passing) else store_trouble(e)
+                if isinstance(e, FileNotFoundError) and trouble.problem != "no such bucket":
+                    raise
+                tries += 1
+                if not trouble.passing or (tries > 1 and time.monotonic() + pause_s > end_s):
+                    raise trouble.at(f"{self.url}/{key}" if key else self.url) from e
+            time.sleep(pause_s * random.uniform(0.5, 1.0))
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+
+def in_order(do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """What `do` gives for each item, in their order, several at a time; the first failure ends it."""
+    left = iter(items)
+    under_way: list[Future[Result]] = []
+    try:
+        under_way += [_threads().submit(do, item) for item in islice(left, AT_ONCE)]
+        while under_way:
+            yield under_way.pop(0).result()
+            under_way += [_threads().submit(do, item) for item in islice(left, 1)]
+    finally:
+        for future in under_way:
+            future.cancel()
+
+
+class _Passing(OSError):
+    """Trouble that the client does not take for any."""
+
+    def __init__(self, problem: str) -> None:
+        self.trouble = StoreTrouble(problem, "Submit again when the store has recovered", passing=True)
+        super().__init__(problem)
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(AT_ONCE, thread_name_prefix="store")

@@ -1,0 +1,121 @@
+"""What is told when files cannot be read or written: one line that names the place and the mend."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.errors import InputError
+
+_MENDS = {
+    errno.ENOSPC: "Free disk space or write to another disk, then submit again: the run resumes",
+    errno.EDQUOT: "Free disk space or raise the quota, then submit again: the run resumes",
+    errno.EACCES: "Give yourself read and write permission there, or choose another folder",
+    errno.EPERM: "Choose a folder on a file system that allows this (hard links, permissions)",
+    errno.EROFS: "Choose a folder that can be written",
+    errno.ENOTDIR: "A file stands where a folder is needed: remove it or choose another folder",
+    errno.EISDIR: "A folder stands where a file is needed: remove it or choose another folder",
+    errno.ENAMETOOLONG: "Choose a shorter path",
+    errno.EMFILE: "Raise the limit of open files (ulimit -n)",
+    errno.EIO: "Check the disk",
+}
+_OTHER_MEND = "Check that the place exists, is reachable and can be written"
+
+_RESUME = "then submit again: the run resumes"
+_KEYS_MEND = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
+_ENDPOINT_MEND = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
+_TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
+
+
+class StoreFailure(InputError):
+    """An object store that refuses or does not answer, after all that was worth repeating.
+
+    It concerns whoever uses the store, not one shard: a job that meets it cannot go on.
+    """
+
+
+class FileTooLarge(InputError):
+    """A file that is not read because of its size."""
+
+
+@dataclass(frozen=True)
+class StoreTrouble:
+    """What went wrong in one request to an object store. `passing`: another try may succeed."""
+
+    problem: str
+    mend: str
+    passing: bool
+
+    def at(self, place: str) -> StoreFailure:
+        """The error to raise."""
+        return StoreFailure(place, "", self.problem, self.mend)
+
+
+def storage_error(place: str | Path, error: OSError) -> InputError:
+    """The one-line error for a failed file operation, with the mend that its errno asks for."""
+    problem = os.strerror(error.errno) if error.errno is not None else str(error)
+    return InputError(place, "", problem, _MENDS.get(error.errno or 0, _OTHER_MEND))
+
+
+def too_large(place: str, size: int, limit_bytes: int) -> FileTooLarge:
+    """The error for a file above the limit."""
+    return FileTooLarge(
+        place,
+        "",
+        f"{size} bytes, more than the {limit_bytes} that such a file can have",
+        "It was not written by this program: restore the run from a copy, or remove the file",
+    )
+
+
+def store_trouble(error: Exception) -> StoreTrouble:
+    """What an exception of the object store's client means.
+
+    Of its text only the status, the server's error code and the kind of failure are told on: addresses
+    and headers in it may hold credentials.
+    """
+    text = str(error)
+    status = _found(r"non-2xx status code: ([0-9]{3})", text) or _found(r"status: ([0-9]{3})", text)
+    code = _found(rf"<Code>({_TRUSTED})</Code>", text)
+    if "169.254." in text or "latest/api/token" in text:
+        return StoreTrouble("no credentials are set", _KEYS_MEND, passing=False)
+    if code == "NoSuchBucket":
+        mend = "Make the bucket first, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
+        return StoreTrouble("no such bucket", mend, passing=False)
+    if "redirect" in text or status in ("301", "307"):
+        mend = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
+        return StoreTrouble("the bucket is in another region", mend, passing=False)
+    if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
+        return StoreTrouble(f"access denied ({code or status})", _KEYS_MEND, passing=False)
+    if status:
+        shown = f"{status} {code}" if code else status
+        if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
+            mend = f"Wait until the store has recovered, {_RESUME}"
+            return StoreTrouble(f"the store answers {shown}", mend, passing=True)
+        mend = "Check that AWS_ENDPOINT_URL is an S3 store and knows this request"
+        return StoreTrouble(f"the store refuses ({shown})", mend, passing=False)
+    if code:  # a copy that fails late answers 200 with an error in its body
+        mend = f"Wait until the store has recovered, {_RESUME}"
+        return StoreTrouble(f"the store answers {code}", mend, passing=True)
+    return _trouble_on_the_way(text)
+
+
+def _trouble_on_the_way(text: str) -> StoreTrouble:
+    kind = _found(r"HttpError \{\s*kind: ([A-Za-z]+)", text)
+    if kind == "Connect":
+        why = "its name is not known" if "dns error" in text else "the connection fails"
+        return StoreTrouble(f"the store cannot be reached ({why})", _ENDPOINT_MEND, passing=True)
+    if kind == "Timeout":
+        mend = f"Check the network, or allow more with DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
+        return StoreTrouble("the store does not answer in time", mend, passing=True)
+    if kind in ("Request", "Interrupted", "Decode"):
+        return StoreTrouble("the store breaks off its answers", _ENDPOINT_MEND, passing=True)
+    mend = "Check that AWS_ENDPOINT_URL is an S3 store"
+    return StoreTrouble("the store's answer is not that of an S3 store", mend, passing=False)
+
+
+def _found(pattern: str, text: str) -> str:
+    found = re.search(pattern, text)
+    return found[1] if found else ""

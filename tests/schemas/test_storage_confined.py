@@ -1,0 +1,185 @@
+"""A run from elsewhere may hold links, pipes and devices: none is followed, opened or listed through."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas import local_files
+from schemas.errors import InputError
+from schemas.storage import Storage, open_storage
+from tests.made_runs import files_of
+
+VERBS: dict[str, Callable[[Storage, str], object]] = {
+    "get": lambda s, key: s.get(key, 10**6),
+    "get_many": lambda s, key: list(s.get_many([key], 10**6)),
+    "exists": lambda s, key: s.exists(key),
+    "sync": lambda s, key: s.sync([key]),
+    "link": lambda s, key: s.link_or_copy(key, "taken"),
+    "put_new": lambda s, key: s.put_new(key, b"x"),
+    "below": lambda s, key: s.below(key).get("x", 9),
+}
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Storage:
+    """A storage beside a folder of secrets."""
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "key").write_text("secret")
+    return open_storage(tmp_path / "run")
+
+
+def odd(kind: str, path: Path, secrets: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as s:
+            s.bind(str(path))
+    elif kind == "link to a file":
+        path.symlink_to(secrets / "key")
+    elif kind == "link to a folder":
+        path.symlink_to(secrets)
+    elif kind == "link within":
+        (path.parent / "plain").write_text("x")
+        path.symlink_to("plain")
+    else:
+        path.symlink_to("/nowhere/at/all")
+
+
+KINDS = ["pipe", "socket", "link to a file", "link to a folder", "link within", "dangling link"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_plain_file_is_refused_by_name(kind: str, place: Storage):
+    assert place.folder is not None
+    secrets = place.folder.parent / "secrets"
+    odd(kind, place.folder / "a" / "odd", secrets)
+    for name, verb in VERBS.items():
+        with pytest.raises(InputError, match=r"a run has none\. Remove it") as e:
+            verb(place, "a/odd")
+        assert f"{place.url}/a/odd" in str(e.value), name
+        assert "\n" not in str(e.value)
+    for prefix in ("", "a"):
+        with pytest.raises(InputError, match="a/odd: is a"):
+            list(place.list(prefix))
+    place.put("a/odd", b"ours")  # a name is replaced, whatever stood there
+    assert place.get("a/odd", 9) == b"ours"
+    assert files_of(secrets) == {"key": b"secret"}
+
+
+def test_no_verb_goes_through_a_link_in_a_path(place: Storage):
+    assert place.folder is not None
+    secrets = place.folder.parent / "secrets"
+    (place.folder / "shards").symlink_to(secrets)
+    for verb in (
+        *(lambda v=v: v(place, "shards/key") for v in VERBS.values()),
+        lambda: place.put("shards/key", b"overwritten"),
+        lambda: place.put("shards/deep/er", b"new"),
+        lambda: place.delete(["shards/key"]),
+        lambda: list(place.list("shards")),
+        lambda: place.below("shards").put("key", b"overwritten"),
+        lambda: list(place.below("shards").list("")),
+    ):
+        with pytest.raises(InputError, match="'shards' in this path is a symbolic link, and a run has none"):
+            verb()
+    place.delete(["shards"])  # the link itself
+    assert files_of(secrets) == {"key": b"secret"}
+    assert not (place.folder / "shards").exists()
+
+
+def test_a_device_is_refused(place: Storage):
+    if os.geteuid():
+        pytest.skip("only root makes devices")
+    assert place.folder is not None
+    try:
+        os.mknod(place.folder / "zero", 0o600 | 0o020000, os.makedev(1, 5))
+    except PermissionError:
+        pytest.skip("devices cannot be made here")
+    with pytest.raises(InputError, match="is a device, and a run has none"):
+        place.get("zero", 10)
+
+
+def test_the_root_may_be_a_link(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk")
+    s = open_storage(tmp_path / "run")
+    assert s.put_new("a/b", b"x") and s.get("a/b", 9) == b"x"
+    assert files_of(tmp_path / "disk") == {"a/b": b"x"}
+
+
+def test_folders_without_end_are_refused(place: Storage):
+    assert place.folder is not None
+    (place.folder / "/".join(["d"] * 40)).mkdir(parents=True)
+    with pytest.raises(InputError, match="folders within folders without end"):
+        list(place.list(""))
+
+
+def test_a_folder_is_no_file(place: Storage):
+    place.put("a/b", b"x")
+    assert not place.exists("a")
+    for verb in (lambda: place.get("a", 9), lambda: place.put("a", b""), lambda: place.delete(["a"])):
+        with pytest.raises(InputError, match="A folder stands where a file is needed"):
+            verb()
+    with pytest.raises(InputError, match="A file stands where a folder is needed"):
+        place.get("a/b/c", 9)
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["", "/", "/etc/passwd", "..", "../x", "a/../b", "a/..", "./a", "a/./b", "a//b", "a/", "a\0b", "a\nb"],
+)
+def test_keys_that_lead_elsewhere_are_refused(key: str, place: Storage):
+    for verb in (*VERBS.values(), lambda s, k: s.put(k, b""), lambda s, k: s.delete([k])):
+        with pytest.raises(InputError, match="not the name of a file below the root"):
+            verb(place, key)
+    assert files_of(place.folder.parent) == {"secrets/key": b"secret"}  # type: ignore[union-attr]
+
+
+@given(st.text(st.sampled_from("ab.-/é \\"), max_size=12))
+def test_a_key_is_taken_exactly_if_its_parts_are_names(tmp_path_factory: pytest.TempPathFactory, key: str):
+    s = open_storage(tmp_path_factory.mktemp("run"), probe=False)
+    good = "\\" not in key and all(part not in ("", ".", "..") for part in key.split("/"))
+    if good:
+        s.put(key, b"x")
+        assert [f.key for f in s.list("")] == [key]
+    else:
+        with pytest.raises(InputError):
+            s.put(key, b"x")
+
+
+@pytest.mark.parametrize("code", ["EXDEV", "EPERM", "EMLINK", "EOPNOTSUPP"])
+def test_where_no_link_can_be_the_bytes_are_copied(
+    code: str, place: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    import errno
+
+    def refuse(*_: object, **__: object) -> None:
+        number = getattr(errno, code)
+        raise OSError(number, os.strerror(number))
+
+    theirs = open_storage(tmp_path / "theirs")
+    theirs.put("x", b"12" * 10**6)
+    place.put("y", b"before")
+    monkeypatch.setattr(local_files.os, "link", refuse)
+    place.adopt(theirs, "x", "y")
+    monkeypatch.undo()
+    assert place.get("y", 10**7) == b"12" * 10**6
+    assert files_of(place.folder).keys() == {"y"}  # type: ignore[arg-type]
+
+
+def test_a_disk_of_its_own_is_copied_to(place: Storage, tiny_disk: Path):
+    there = open_storage(tiny_disk)
+    place.put("small", b"x" * 1000)
+    there.adopt(place, "small", "a/small")
+    assert there.get("a/small", 1000) == b"x" * 1000
+    place.put("large", b"x" * 2_000_000)
+    with pytest.raises(InputError, match="No space left on device"):
+        there.adopt(place, "large", "a/large")
+    assert files_of(tiny_disk).keys() == {"a/small"}
