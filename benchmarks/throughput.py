@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.job import JobSettings, run_job
+from datagen.job import JobPlan, Work, make_missing, open_board
+from datagen.job_options import Placing
 from datagen.specify import layout_of, specify
 from datagen.submit import manifest_of
 from schemas.errors import InputError
@@ -83,9 +84,10 @@ def run(
             spec, layout_of(spec, n), {"houses": options.houses, "objects": options.objects}
         )
         made = Run.create_or_open(open_storage(out), manifest, n)
-        settings = JobSettings(absolute(options.houses), absolute(options.objects), workers, "local", False)
+        work = Work(made, absolute(options.houses), absolute(options.objects))
+        plan = JobPlan(made.storage, out, [work], Placing(workers=workers), ())
         started_s = time.perf_counter()
-        summary = run_job(made, settings)
+        summary = make_missing(plan, open_board(plan))
         ended_s = time.perf_counter()
         if summary.end != "complete":
             raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Mend that first")

@@ -14,6 +14,7 @@ from cluster.attempt import run_attempt
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
 from cluster.executor import Executor
+from cluster.fitness import refuse_unfit_machines
 from cluster.guard import notes_of_a_job
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy, too_many_quarantined
@@ -64,16 +65,13 @@ def carry_out(plan: JobPlan) -> int:
 
     While it works, the job is known in the place, and heeds requests to stop that are left there.
     """
-    runs = [work.run for work in plan.works]
-    missing = [run.missing() for run in runs]
-    if not any(missing):
-        for run in runs:
-            close_lost_attempts(run)
+    if not _count_missing(plan):
+        for work in plan.works:
+            close_lost_attempts(work.run)
         return _finish(plan, _judged(plan, JobSummary("complete", "", Tally(0), 0.0)))
-    board = JobBoard(Jobs(plan.place), _record_of(plan), sum(map(len, missing)))
-    board.begin()
+    board = open_board(plan)
     try:
-        summary = _judged(plan, _make(plan, missing, board))
+        summary = _judged(plan, make_missing(plan, board))
         board.seal()
         code = _finish(plan, summary)
     except BaseException as error:
@@ -92,8 +90,9 @@ def _end_of(error: BaseException) -> tuple[JobEnd, int]:
     return "broken", 2 if isinstance(error, InputError) else 1
 
 
-def _record_of(plan: JobPlan) -> JobRecord:
-    return JobRecord(
+def open_board(plan: JobPlan) -> JobBoard:
+    """Make the job known in its place."""
+    record = JobRecord(
         id=new_job_id(),
         command=("datagen", *sys.argv[1:]),
         host=platform.node(),
@@ -103,10 +102,18 @@ def _record_of(plan: JobPlan) -> JobRecord:
         submission=os.environ.get(SUBMISSION, ""),
         jobs_api=os.environ.get(JOBS_API, ""),
     )
+    board = JobBoard(Jobs(plan.place), record, _count_missing(plan))
+    board.begin()
+    return board
 
 
-def _make(plan: JobPlan, missing: Sequence[Sequence[int]], board: JobBoard) -> JobSummary:
-    """Drive one run after the other on one set of workers."""
+def _count_missing(plan: JobPlan) -> int:
+    return sum(len(work.run.missing()) for work in plan.works)
+
+
+def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
+    """Drive one run after the other on one set of workers; how that ended."""
+    missing = [work.run.missing() for work in plan.works]
     placing, stop = plan.placing, StopRequest()
     policy = Policy(max_quarantined_share=placing.max_quarantined)
     whole = JobSummary("complete", "", Tally(0), 0.0)
@@ -154,6 +161,9 @@ def _drive(
             scenes_from=work.scenes_from,
         )
 
+    if isinstance(executor, RayExecutor):
+        probe = make_task(Order(shards[0], "probe", deadline_s=0.0, memory_factor=1.0))
+        refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     with progress(per_shard, len(shards), done, True if placing.json else None) as display:
         events = Together([display, Watch(board, stop, per_shard)])
@@ -176,8 +186,9 @@ def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
         return summary
     given_up = planned = 0
     for work in plan.works:
-        shards = set(work.run.planned())
-        given_up, planned = given_up + len(work.run.quarantined() & shards), planned + len(shards)
+        shards = work.run.planned()
+        planned += len(shards)
+        given_up += sum(shard in shards for shard in work.run.quarantined())
     policy = Policy(max_quarantined_share=plan.placing.max_quarantined)
     failed = too_many_quarantined(policy, given_up, planned)
     return replace(summary, end="failed" if failed else "complete")
