@@ -33,12 +33,12 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     """
     spec_hash = task.spec.hash()
     run, world, source = open_task(task)
-    with _ends_job():
+    with ends_job():
         run.ledger.start(task.attempt, task.shard)
     stored = None if source is None else read_scenes(source, task.scene_indices)
-    with _ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
+    with ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
         made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
-    with _ends_job(), made.clock.stage("write"):
+    with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files)
     labels = made.sample["label"]
@@ -57,7 +57,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
         host=this_host(),
         created=utc_now(),
     )
-    with _ends_job():
+    with ends_job():
         won = run.commit(commit)
     return Product(won, len(labels), positives, cost)
 
@@ -67,14 +67,14 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
 
     They are opened once a process. Raises JobCannotGoOn where that cannot be done here.
     """
-    with _ends_job(every_input_error=True):
+    with ends_job(every_input_error=True):
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
         source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
     return run, world, source
 
 
 @contextmanager
-def _ends_job(every_input_error: bool = False, codes: tuple[int, ...] = _FINAL) -> Generator[None]:
+def ends_job(every_input_error: bool = False, codes: tuple[int, ...] = _FINAL) -> Generator[None]:
     """Raise JobCannotGoOn for a full or forbidden disk (`codes`) or, where asked, for any InputError."""
     problems = {os.strerror(code) for code in codes}
     try:

@@ -31,6 +31,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "seal": ("datagen.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
     "unseal": ("datagen.seal:unseal", "Remove that store; the run keeps every shard."),
     "merge": ("datagen.merge:merge", "One run of several that were made apart."),
+    "replay": ("datagen.replay:replay", "One sample's scene made again, beside what is stored."),
+    "relabel": ("datagen.relabel:relabel", "Labels by another rule, from stored distances."),
     "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
     "show": ("datagen.show:show", "A picture of one scene of a run."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),

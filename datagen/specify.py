@@ -56,7 +56,7 @@ def specify(
     fields = read_fields(config)
     for name, value in options.items():
         if value is not None:
-            _put(fields, name, value, config)
+            put_field(fields, name, value, config)
     settle = fields.setdefault("settle", {})
     if isinstance(settle, dict):
         # SAPIEN where its libraries are, else what works here; the choice is recorded.
@@ -174,7 +174,7 @@ def _read_config(path: Path) -> dict[str, Any]:
         raise InputError(path, "", f"is not TOML: {error}", mend) from None
 
 
-def _put(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
+def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
     """Set a dotted name in nested dictionaries."""
     *parents, leaf = name.split(".")
     for parent in parents:

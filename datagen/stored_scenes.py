@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
-from datagen.specify import label_engines, layout_of, read_fields, scene_engine_names, validated
+from datagen.specify import label_engines, layout_of, put_field, read_fields, scene_engine_names, validated
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Layout
@@ -62,12 +62,13 @@ def specify_again(
     config: Path | None,
     robot: str | None = None,
     repeats: int | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Specification:
     """The stored run's specification with other labels.
 
     The configuration may set the sections `arm`, `heuristic` and `visibility`; what it leaves out is as
-    in the stored run. Raises InputError for other sections, and for a robot that the stored candidates
-    do not suit.
+    in the stored run. `options`, by dotted name, win over it. Raises InputError for other sections, and
+    for a robot that the stored candidates do not suit.
     """
     before = stored.run.manifest.spec
     place = str(config) if config else "options"
@@ -76,6 +77,8 @@ def specify_again(
         if section not in _LABEL_SECTIONS:
             problem = "decides scenes and candidates, which are those of --scenes-from"
             raise InputError(place, section, problem, "Take it out")
+    for name, value in (options or {}).items():
+        put_field(chosen, name, value, config)
     fields = before.model_dump(mode="json", exclude_none=True)
     arm = fields.pop("arm", {})
     # Which arm it is and how it plans stays; whether worlds are disturbed is said for each run.

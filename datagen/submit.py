@@ -168,7 +168,7 @@ def submit(
             refuse_unusable_engines(spec, address)
             if _layout_there(out) is None:
                 _refuse_no_scene(world, houses)
-            source_url, layout = "", layout_of(spec, n)
+            source_url, layout, schema_version = "", layout_of(spec, n), None
         else:
             stored = open_stored_scenes(scenes_from, houses, objects, decide_scenes)
             spec = specify_again(label_source, stored, config, robot, perturb)
@@ -176,11 +176,13 @@ def submit(
             open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
             refuse_unusable_engines(spec, address)
             source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
+            schema_version = stored.run.manifest.schema_version
             refuse_too_few(stored, layout, n)
         sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
         if source_url:
             sources["scenes_from"] = source_url
-        run = Run.create_or_open(open_storage(out), manifest_of(spec, layout, sources), n)
+        manifest = manifest_of(spec, layout, sources, schema_version)
+        run = Run.create_or_open(open_storage(out), manifest, n)
     if detach:
         return detach_job(words, out, placing)
     work = Work(run, sources["houses"], sources["objects"], source_url)

@@ -1,0 +1,153 @@
+"""One shard of a run with other labels: its distances and visibilities stay, and so do its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+from cluster.attempt import ends_job
+from cluster.guard import Meter, this_host, utc_now
+from cluster.task import Product
+from schemas.cost import StageClock
+from schemas.identity import sample_ids
+from schemas.run import Run, shard_folder
+from schemas.run_records import Commit, FileEntry
+from schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
+from schemas.shard_reading import committed_place, read_metadata
+from workers.labels import heuristic as formula
+
+Columns = dict[str, np.ndarray[Any, Any]]
+
+_READ = (
+    "distance_m", "mount_distance_m", "arm_reach_m", "visibility", "sample_scene_index", "candidate_index",
+    "label", "label_version",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RelabelTask:
+    """One attempt at relabelling one shard, in this process."""
+
+    shard: int
+    attempt: str
+    deadline_s: float
+    memory_factor: float = 1.0
+    notes: str = ""
+
+
+@dataclass
+class Flips:
+    """Labels that came out otherwise than in the source, counted over shards."""
+
+    to_good: int = 0
+    to_bad: int = 0
+
+
+def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> Product:
+    """Label a committed shard of `source` by the rule of `run`, and commit it there.
+
+    Files whose bytes stay are adopted; written are labels, scores and ids. Raises InputError for a
+    damaged file, JobCannotGoOn for a full or forbidden disk.
+    """
+    clock = StageClock()
+    with ends_job():
+        run.ledger.start(task.attempt, task.shard)
+    with clock.stage("draw"):
+        before = source.commit_of(task.shard)
+        source.check_files(before)
+        stored = _read(source, before)
+    with clock.stage("visibility"):
+        made = _relabelled(run, stored)
+        files = _made_files(run, made)
+    with ends_job(), clock.stage("write"):
+        entries, written_bytes = _write(run, source, before, task.attempt, files)
+    cost = meter.cost(clock, written_bytes)
+    positives = int(made["label"].sum())
+    commit = Commit(
+        shard=task.shard,
+        attempt=task.attempt,
+        spec_hash=run.manifest.spec_hash,
+        scenes=before.scenes,
+        samples=before.samples,
+        positives=positives,
+        redraws={},  # nothing was drawn
+        files=entries,
+        cost=cost,
+        host=this_host(),
+        created=utc_now(),
+    )
+    with ends_job():
+        won = run.commit(commit)
+    flips.to_good += int((made["label"] > stored["label"]).sum())
+    flips.to_bad += int((made["label"] < stored["label"]).sum())
+    return Product(won, before.samples, positives, cost)
+
+
+def _read(source: Run, commit: Commit) -> Columns:
+    folder = shard_folder(commit.shard, commit.attempt)
+    place = committed_place(source.storage, folder, commit, commit.scenes, commit.samples)
+    return place.read(read_metadata(source.storage, folder, _READ).values())
+
+
+def _relabelled(run: Run, stored: Columns) -> Columns:
+    """The columns that another rule changes."""
+    score, label = formula.heuristic(
+        stored["distance_m"],
+        stored["mount_distance_m"],
+        stored["arm_reach_m"],
+        stored["visibility"],
+        run.manifest.spec.heuristic,
+    )
+    scene, candidate = stored["sample_scene_index"], stored["candidate_index"]
+    starts = np.flatnonzero(np.diff(scene, prepend=scene[0] - 1))
+    ids = [
+        sample_ids(run.manifest.spec_hash, int(scene[rows[0]]), candidate[rows])
+        for rows in np.split(np.arange(len(scene)), starts[1:])
+    ]
+    return {
+        "sample_id": np.concatenate(ids),
+        "heuristic_score": score,
+        "label": label,
+        "label_version": np.full(len(scene), formula.VERSION, np.int16),
+    }
+
+
+def _made_files(run: Run, made: Columns) -> dict[str, bytes]:
+    """Metadata and the chunks of the columns, by path within the attempt's folder."""
+    schema, layout = run.schema, run.layout
+    files = dict(group_metadata(schema, layout, run.manifest.spec_hash))
+    rows = layout.samples_per_shard
+    for field in schema.sample_fields:
+        if field.name in made:
+            step = chunk_rows(schema, field, rows)
+            for i in range(rows // step):
+                part = made[field.name][i * step : (i + 1) * step]
+                files[f"{field.name}/{chunk_key(field, i)}"] = encode_chunk(field, part)
+    return files
+
+
+def _write(
+    run: Run, source: Run, before: Commit, attempt: str, files: dict[str, bytes]
+) -> tuple[tuple[FileEntry, ...], int]:
+    """Put the files whose bytes are new and adopt the others; the commit's entries, and bytes put."""
+    old, new = shard_folder(before.shard, before.attempt), shard_folder(before.shard, attempt)
+    entries: list[FileEntry] = []
+    fresh: dict[str, bytes] = {}
+    for entry in before.files:
+        data = files.get(entry.path)
+        made = entry if data is None else _entry(entry.path, data)
+        entries.append(made)
+        if data is not None and made != entry:
+            fresh[f"{new}/{entry.path}"] = data
+        else:
+            run.storage.adopt(source.storage, f"{old}/{entry.path}", f"{new}/{entry.path}")
+    run.storage.put_many(fresh)
+    run.storage.sync(f"{new}/{entry.path}" for entry in entries)
+    return tuple(entries), sum(map(len, fresh.values()))
+
+
+def _entry(path: str, data: bytes) -> FileEntry:
+    return FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())

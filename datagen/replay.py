@@ -1,0 +1,219 @@
+"""`datagen replay`: a scene made again and compared stage by stage; or one shard alone, nothing caught."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from datagen.arms import refuse_missing_packages
+from datagen.console import print_json, print_rows
+from datagen.drawing.replay_picture import draw_replay
+from datagen.job_options import HousesAgain, ObjectsAgain, ScenesFromAgain
+from datagen.remaking import Origin, open_origin
+from datagen.replaying import chosen_rows, open_replayer, what_differs_here
+from datagen.replaying_shard import replay_shard
+from datagen.replaying_stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+from schemas.fields import SceneRows
+from schemas.identity import sample_ids
+from schemas.merged import open_runs
+from schemas.run import Run
+from schemas.scene_rows import read_scene
+from workers.scenes.recall import recall_scene
+
+_PREFIX_AT_LEAST = 6
+_SHOWN = 5
+
+
+def replay(
+    run: Annotated[str, Parameter(help="The run's folder or address, also of merged runs.")],
+    sample: Annotated[
+        str | None,
+        Parameter(help="A sample's id, 32 hexadecimal digits, or as many as make it the only one."),
+    ] = None,
+    /,
+    *,
+    scene: Annotated[
+        int | None, WHOLE_NUMBER, Parameter(help="Index of a scene, instead of a sample.")
+    ] = None,
+    shard: Annotated[
+        int | None, WHOLE_NUMBER, Parameter(help="Index of a shard, instead: runs here, with nothing caught.")
+    ] = None,
+    out: Annotated[
+        Path | None, Parameter(help="A .png file: the stored scene beside the replayed one.")
+    ] = None,
+    houses: HousesAgain = None,
+    objects: ObjectsAgain = None,
+    scenes_from: ScenesFromAgain = None,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+) -> int:
+    """Draw a sample's scene again from its seeds, as a worker does, and compare it with what is stored.
+
+    Stage by stage: equal bit for bit, or how many values differ and by how much. Then the sample's label is
+    worked out again from the stored poses. Ends with 0 where all is equal, with 1 where anything differs.
+
+    With --shard, a shard runs alone in this process, in quarantine or not: an exception ends in its
+    traceback, and a debugger stops where it is raised. Nothing is written.
+    """
+    if sum(given is not None for given in (sample, scene, shard)) != 1:
+        problem = "name one thing to replay"
+        raise InputError("datagen replay", "SAMPLE_ID", problem, "Give a sample's id, or --scene, or --shard")
+    if out is not None and (out.suffix.lower() != ".png" or not out.parent.is_dir()):
+        problem = "is not a .png file in a folder that exists"
+        raise InputError(out, "--out", problem, "Give such a name")
+    runs = open_runs(run)
+    if sample is not None:
+        found, index, row = find_sample(runs, sample)
+    else:
+        found, index, row = _only(run, runs, "--scene" if shard is None else "--shard"), scene, None
+    refuse_missing_packages(found.manifest.spec.label_source)
+    if shard is not None:
+        if out is not None:
+            raise InputError("--out", str(out), "a shard has no picture", "Take it out, or give --scene")
+        return replay_shard(run, found, shard, open_origin(found, houses, objects, scenes_from), json)
+    assert index is not None
+    stored = read_scene(found, index)
+    return _compare(run, found, stored, row, open_origin(found, houses, objects, scenes_from), out, json)
+
+
+def find_sample(runs: list[Run], text: str) -> tuple[Run, int, int]:
+    """(run, scene, row in its scene) of the committed sample whose id begins with these digits.
+
+    Ids are hashes of specification, scene and candidate, so they are counted out and nothing is read but
+    the list of commits. InputError where none or more than one fits.
+    """
+    place = runs[0].storage.url if len(runs) == 1 else f"{len(runs)} merged runs"
+    wanted = text.lower()
+    if not re.fullmatch(f"[0-9a-f]{{{_PREFIX_AT_LEAST},32}}", wanted):
+        problem = f"is not {_PREFIX_AT_LEAST} to 32 hexadecimal digits"
+        raise InputError("SAMPLE_ID", text[:40], problem, "Give the first digits of a sample_id")
+    whole = bytes.fromhex(wanted[: len(wanted) // 2 * 2])
+    found: list[tuple[Run, int, int]] = []
+    for run in runs:
+        layout, n = run.layout, run.n
+        for shard in sorted(run.committed()):
+            scenes, samples = layout.rows_wanted(shard, n)
+            first = shard * layout.scenes_per_shard
+            for scene in range(first, first + scenes):
+                count = min(
+                    layout.candidates_per_scene, samples - (scene - first) * layout.candidates_per_scene
+                )
+                for row, sample_id in enumerate(_ids(run, scene, count)):
+                    if sample_id.startswith(whole) and sample_id.hex().startswith(wanted):
+                        found.append((run, scene, row))
+            if len(found) > _SHOWN:
+                break
+    if not found:
+        mend = "Give the id of a committed sample of this run"
+        raise InputError("SAMPLE_ID", text, f"is no sample of {place}", mend)
+    if len(found) > 1:
+        shown = ", ".join(_ids(r, s, k + 1)[k].hex() for r, s, k in found[:_SHOWN])
+        raise InputError(
+            "SAMPLE_ID", text, f"begins more than one id of {place} ({shown})", "Give more digits"
+        )
+    return found[0]
+
+
+def _ids(run: Run, scene: int, count: int) -> list[bytes]:
+    ids = sample_ids(run.manifest.spec_hash, scene, np.arange(count, dtype=np.int32))
+    return [row.tobytes() for row in ids]
+
+
+def _only(place: str, runs: list[Run], option: str) -> Run:
+    if len(runs) == 1:
+        return runs[0]
+    parts = ", ".join(run.storage.url for run in runs[:3])
+    problem = f"each of the {len(runs)} merged runs has its own"
+    raise InputError(place, option, problem, f"Give a sample's id, or name a part: {parts}")
+
+
+def _compare(
+    place: str, run: Run, stored: SceneRows, row: int | None, origin: Origin, out: Path | None, json: bool
+) -> int:
+    replayer = open_replayer(run, origin)
+    scene = int(stored.record["scene_index"])
+    shard = scene // run.layout.scenes_per_shard
+    drawn = None if replayer.drawing is None else replayer.redraw(scene)
+    stages = [] if drawn is None else compare_stages(run.schema, stored, drawn)
+    rows = range(len(stored.samples["label"])) if row is None else [row]
+    kept = chosen_rows(stored, rows)
+    recomputed = compare_stages(run.schema, kept, replayer.recompute(stored, rows), RECOMPUTED)
+    equal = all(stage.equal for stage in (*stages, *recomputed))
+    report: dict[str, Any] = {
+        "run": run.storage.url,
+        "scene": scene,
+        "shard": shard,
+        "sample": None if row is None else _sample_of(stored, row),
+        "equal": equal,
+        "drawn_again": drawn is not None,
+        "stages": [_plain(stage) for stage in stages],
+        "recomputed": [_plain(stage) for stage in recomputed],
+        "differs_here": what_differs_here(run, shard),
+        "picture": None if out is None else str(out),
+    }
+    if out is not None:
+        again = recall_scene(replayer.world, (drawn or stored).record)
+        before = recall_scene(replayer.world, stored.record)
+        draw_replay(report, run.manifest.spec, (before, stored), (again, drawn or stored), row, out)
+    if json:
+        print_json(report)
+    else:
+        _print(place, report)
+    return 0 if equal else 1
+
+
+def _sample_of(stored: SceneRows, row: int) -> dict[str, Any]:
+    samples = stored.samples
+    return {
+        "id": samples["sample_id"][row].tobytes().hex(),
+        "candidate": row,
+        "base_xy_m": [float(v) for v in samples["base_xy_m"][row]],
+        "label": int(samples["label"][row]),
+        "heuristic_score": float(samples["heuristic_score"][row]),
+    }
+
+
+def _plain(stage: StageComparison) -> dict[str, Any]:
+    differences = [
+        {"field": d.field, "differing": d.differing, "largest": d.largest, "unit": d.unit}
+        for d in stage.differences
+    ]
+    return {"stage": stage.stage, "fields": stage.fields, "equal": stage.equal, "differences": differences}
+
+
+def _words(stage: dict[str, Any]) -> str:
+    if stage["equal"]:
+        return "equal"
+    return "; ".join(
+        f"{d['field']} in {d['differing']}"
+        + ("" if d["largest"] is None else f", by up to {d['largest']:.3g} {d['unit'].strip('1')}").rstrip()
+        for d in stage["differences"]
+    )
+
+
+def _print(place: str, report: dict[str, Any]) -> None:
+    sample = report["sample"]
+    rows = [(s["stage"], f"{s['fields']} fields", _words(s)) for s in report["stages"]]
+    if not report["drawn_again"]:
+        rows.append(
+            ("draw", "-", "not drawn again: the run that drew the scenes is not there (--scenes-from)")
+        )
+    rows += [
+        (f"{s['stage']}, from stored poses", f"{s['fields']} fields", _words(s)) for s in report["recomputed"]
+    ]
+    name = f"scene {report['scene']} of {place}"
+    if sample is not None:
+        x, y = sample["base_xy_m"]
+        name = f"sample {sample['id']}, candidate {sample['candidate']} of {name}, base ({x:.3f}, {y:.3f}) m"
+    print_rows(name, rows, ("stage", "compared", "result"))
+    end = [("result", "equal, bit for bit" if report["equal"] else "different")]
+    if report["differs_here"]:
+        end.append(("not as where it was made", "; ".join(report["differs_here"])))
+    if report["picture"]:
+        end.append(("picture", report["picture"]))
+    print_rows("", end)
