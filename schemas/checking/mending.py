@@ -43,7 +43,7 @@ class Mended:
     resealed: bool = False
     left: list[Finding] = field(default_factory=list[Finding])
     checked: Checked = field(default_factory=Checked)
-    untouched: int = 0  # files that have the stamps they had before
+    untouched: int = 0  # files as old and as long as before; their digests were checked
     changed: list[str] = field(default_factory=list[str])  # others that changed meanwhile, though not by this
 
     @property
@@ -65,21 +65,26 @@ def mend_place(
     where all bad files of its shard have. What is left is in the result. InputError as `check_place`.
     """
     mended = Mended()
-    before = {file.key: file.stamp for file in place.list("")}
+    before = _times(place)
     refused: dict[str, str] = {}  # key -> why; not tried twice
     for _ in range(_PASSES):
         found = _pass(place, remake, workers, seen, mended, refused)
         if not found:
             break
-    after = {file.key: file.stamp for file in place.list("")}
-    for key, stamp in before.items():
+    after = _times(place)
+    for key, time in before.items():
         if key in mended.written or (mended.resealed and key.startswith(f"{SEALED}/")):
             continue
-        if after.get(key) == stamp:
+        if after.get(key) == time:
             mended.untouched += 1
         else:
             mended.changed.append(key)
     return mended
+
+
+def _times(place: Storage) -> dict[str, tuple[float, int]]:
+    """When each file was written, and its size; what links to it does not matter."""
+    return {file.key: (file.modified_s, file.size) for file in place.list("")}
 
 
 def _pass(

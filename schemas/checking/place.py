@@ -21,6 +21,7 @@ from schemas.checking.sealed import (
     slices_of,
 )
 from schemas.checking.shards import ShardForm, check_shard, form_of
+from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Commit
 from schemas.storage import Storage
@@ -80,7 +81,9 @@ def check_place(
     for run in roots.runs:
         wanted[run.manifest.spec_hash], found = check_plans(run)
         yield from (below(roots.folder_of(run), finding) for finding in found)
-    yield from check_notes(place)
+        yield from (below(roots.folder_of(run), finding) for finding in check_notes(run.storage))
+    if roots.is_merged:
+        yield from check_notes(place)
     root, found = read_root(place, wanted)
     yield from found
     slices = slices_of(root, roots.runs) if root else {}
@@ -117,13 +120,19 @@ def _shards_of(run: Run, slice_: SealedSlice | None) -> list[int]:
 def _look_at(subject: _Subject, shard: int) -> _Looked:
     """One shard: its commit, its account, its files and rows, its chunks in the sealed store."""
     run, prefix = subject.run, subject.prefix
-    listed = {file.key: file for file in run.storage.list(f"shards/{shard:06d}")}
+    folder = f"shards/{shard:06d}"
+    try:
+        listed = {file.key: file for file in run.storage.list(folder)}
+    except InputError as error:  # something in it is no file: nothing there is trusted
+        key = error.place.removeprefix(f"{run.storage.url}/")
+        return _Looked(
+            shard, None, [below(prefix, Finding(key, "foreign", error.problem, error.mend, shard))]
+        )
     found = check_commit(run, shard, listed)
     findings, commit = list(found.findings), found.commit
     if commit is not None:
         findings += check_account(run, commit)
-        folder = f"shards/{shard:06d}/{commit.attempt}/"
-        own = {key: file for key, file in listed.items() if key.startswith(folder)}
+        own = {key: f for key, f in listed.items() if key.startswith(f"{folder}/{commit.attempt}/")}
         findings += check_shard(run, subject.form, commit, own)
     findings = [below(prefix, finding) for finding in findings]
     if commit is not None and subject.slice_ is not None and shard in subject.slice_.positions:

@@ -15,7 +15,7 @@ from schemas.storage import Storage
 
 Record = TypeVar("Record", bound=BaseModel)
 
-_BACKUP = "Restore the file from a backup"
+BACKUP = "Restore the file from a backup"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +52,23 @@ def read(
     return Read(key, data, None if problem else record, problem)
 
 
-def compare(ours: Read[Record], copy: Read[Record], shard: int | None = None) -> list[Finding]:
-    """What is wrong with a record and its second copy; each restores the other."""
+def compare(
+    ours: Read[Record], copy: Read[Record], shard: int | None = None, mend: str = BACKUP
+) -> list[Finding]:
+    """What is wrong with a record and its second copy; each restores the other.
+
+    `mend` is for two that are sound and differ.
+    """
     if ours.record is not None and copy.record is not None:
         if ours.data == copy.data:
             return []
-        return [Finding(ours.key, "record", f"is not what its copy {copy.key} holds", _BACKUP, shard)]
+        return [Finding(ours.key, "record", f"is not what its copy {copy.key} holds", mend, shard)]
     if ours.record is not None and ours.data is not None:
         return [curable(copy.key, "record", copy.problem, Restore(ours.data), shard)]
     if copy.record is not None and copy.data is not None:
         return [curable(ours.key, "record", ours.problem, Restore(copy.data), shard)]
     bad = [one for one in (ours, copy) if one.problem != "missing"]
-    return [Finding(one.key, "record", f"{one.problem}; so is its copy", _BACKUP, shard) for one in bad]
+    return [Finding(one.key, "record", f"{one.problem}; so is its copy", BACKUP, shard) for one in bad]
 
 
 def sound(ours: Read[Record], copy: Read[Record]) -> Record | None:

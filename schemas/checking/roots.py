@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import compare, read, sound
 from schemas.errors import InputError
+from schemas.lineage import LINEAGE, Lineage
 from schemas.merged import MERGED, part_folder
 from schemas.record_files import encode_record
 from schemas.run import Run, copy_key
@@ -17,6 +18,7 @@ from schemas.run_records import FORMAT_VERSION, Manifest, Merged, Plan
 from schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
+_BROKEN_OFF = "Merge the runs again: a merge was broken off, and the next one finishes it"
 
 
 class AnyRecord(BaseModel):
@@ -81,9 +83,7 @@ def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]
     merged = sound(ours, copy)
     if merged is not None:
         _refuse_other_format(place, MERGED, merged.format_version)
-        # One that was merged before copies were kept has none.
-        gone = copy.data is None and copy.problem == "missing"
-        return merged.parts, [] if gone and ours.record is not None else compare(ours, copy)
+        return merged.parts, compare(ours, copy, mend=_BROKEN_OFF)
     hashes: set[str] = set()
     for folder in sorted({"/".join(f.key.split("/")[:2]) for f in place.list("parts")}):
         run, _ = _open_run(place.below(folder)) if folder.count("/") == 1 else (None, [])
@@ -152,10 +152,13 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
     return n, findings
 
 
-def check_notes(place: Storage) -> Iterator[Finding]:
-    """Records about a place on which no row rests: of jobs, and of where merged shards came from."""
-    for folder in ("jobs", "lineage"):
-        for file in place.list(folder):
-            if file.key.endswith(".json") and (problem := read(place, file.key, AnyRecord).problem):
-                mend = "Restore the file from a backup, or remove it: no sample rests on it"
-                yield Finding(file.key, "record", problem, mend)
+def check_notes(storage: Storage) -> Iterator[Finding]:
+    """Records on which no row rests: of jobs, and of where merged shards came from."""
+    key = LINEAGE
+    lineage, copy = read(storage, key, Lineage), read(storage, copy_key(key), Lineage)
+    if {lineage.problem, copy.problem} != {"missing"}:
+        yield from compare(lineage, copy, mend=_BROKEN_OFF)
+    mend = "Restore the file from a backup, or remove it: no sample rests on it"
+    for file in storage.list("jobs"):
+        if file.key.endswith(".json") and (problem := read(storage, file.key, AnyRecord).problem):
+            yield Finding(file.key, "record", problem, mend)
