@@ -11,7 +11,7 @@ from functools import lru_cache
 from cluster.guard import Meter, this_host, utc_now
 from cluster.task import JobCannotGoOn, Product, ShardTask
 from schemas.errors import InputError
-from schemas.run import Run
+from schemas.run import Run, commit_key
 from schemas.run_records import Commit
 from schemas.scene_rows import read_scenes
 from schemas.shard_files import encode_shard
@@ -35,6 +35,8 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     run, world, source = open_task(task)
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
+        if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
+            return Product(False, 0, 0, meter.cost())
     stored = None if source is None else read_scenes(source, task.scene_indices)
     with ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
         made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)

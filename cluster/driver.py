@@ -4,6 +4,7 @@
         fill the window: retries that are due first, then new shards
         wait a moment for reports, and settle each: ledger, then done, retry or quarantine
         look after attempts that are silent beyond their deadline
+        look for what other drivers have committed, once there was a sign of one
         heed a request to stop
 
 The driver alone owns attempts: executors never repeat one by themselves.
@@ -12,6 +13,7 @@ The driver alone owns attempts: executors never repeat one by themselves.
 from __future__ import annotations
 
 import heapq
+import random
 import secrets
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from cluster.executor import Executor
+from cluster.open_shards import OpenShards
 from cluster.policy import (
     Durations,
     Policy,
@@ -33,6 +36,7 @@ from cluster.stop import StopRequest
 from cluster.tally import End, JobSummary, Tally
 from cluster.task import AttemptReport
 from schemas.run_records import Commit, LedgerEntry, Outcome
+from schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
 # Upper bound of one wait, so that a request to stop is heeded soon.
@@ -60,6 +64,10 @@ class Books(Protocol):
         """The shard's commit record, if there is one."""
         ...
 
+    def missing(self) -> ShardRanges:
+        """Shards that nobody has committed or given up, as it is now."""
+        ...
+
 
 class Events(Protocol):
     """What a progress display hears."""
@@ -80,6 +88,7 @@ class Events(Protocol):
 @dataclass
 class _Flight:
     order: Order
+    number: int  # of this driver's attempts
     submitted_s: float
     check_s: float  # when to look after it next
     begun: bool = False
@@ -122,7 +131,6 @@ class _Driver(Generic[T]):
     ) -> None:
         self._make_task, self._executor, self._books = make_task, executor, books
         self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
-        self._fresh = iter(shards)
         self._tally = Tally(len(shards))
         self._flights: dict[str, _Flight] = {}
         self._troubled: dict[int, Trouble] = {}
@@ -131,6 +139,11 @@ class _Driver(Generic[T]):
         self._numbered = 0
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
+        self._open = OpenShards(shards, random.Random(self._name))
+        # The number of the first attempt that began after this driver last went elsewhere.
+        self._here_since = 1
+        self._look_s = float("inf")  # when to look at what others do; never before there was a sign of one
+        self._looked_s = float("-inf")
         self._next_check_s = float("inf")
         self._end: End | None = None  # set once nothing new is begun
         self._cause = ""
@@ -147,6 +160,8 @@ class _Driver(Generic[T]):
             for report in self._executor.wait(self._patience_s()):
                 self._settle(report)
             self._look_after_silent()
+            if self._clock() >= self._look_s:
+                self._look_for_others()
             self._tally.in_flight = len(self._flights)
             self._events.tick(self._tally)
         failed = too_many_quarantined(self._policy, self._tally.quarantined, self._tally.shards)
@@ -168,7 +183,7 @@ class _Driver(Generic[T]):
             return heapq.heappop(self._due)[1]
         if len(self._due) >= self._policy.max_waiting:
             return None
-        return next(self._fresh, None)
+        return self._open.next()
 
     def _submit(self, shard: int) -> None:
         trouble = self._troubled.get(shard, Trouble())
@@ -181,7 +196,7 @@ class _Driver(Generic[T]):
         )
         now_s = self._clock()
         check_s = now_s + order.deadline_s + self._policy.grace_s
-        self._flights[order.attempt] = _Flight(order, now_s, check_s)
+        self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s)
         self._next_check_s = min(self._next_check_s, check_s)
         self._tally.retries += bool(trouble.attempts)
         self._executor.submit(self._make_task(order))
@@ -207,6 +222,8 @@ class _Driver(Generic[T]):
         self._tally.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
+        if report.outcome == "superseded":
+            self._make_way(flight)
         if decision.action == "done":
             self._troubled.pop(shard, None)
         elif decision.action == "retry":
@@ -239,6 +256,24 @@ class _Driver(Generic[T]):
             cost=commit.cost,
             host=commit.host,
         )
+
+    # Others --------------------------------------------------------------------------------
+
+    def _make_way(self, flight: _Flight) -> None:
+        """Another driver was faster at a shard: go on elsewhere, and look what it has done."""
+        if flight.number >= self._here_since:
+            self._open.go_elsewhere()
+            self._here_since = self._numbered + 1
+        self._look_s = min(self._look_s, self._looked_s + self._policy.look_s)
+
+    def _look_for_others(self) -> None:
+        start_s = self._clock()
+        dropped = self._open.keep(self._books.missing()) if len(self._open) else 0
+        self._tally.elsewhere += dropped
+        self._looked_s = self._clock()
+        took_s = self._looked_s - start_s
+        # Listing a large run takes time: at most a small share of the driver's.
+        self._look_s = self._looked_s + max(self._policy.look_s, self._policy.look_factor * took_s)
 
     # Silence -------------------------------------------------------------------------------
 

@@ -36,6 +36,8 @@ class Policy:
     kill_s: float = 10.0  # how long the driver waits for a killed attempt to be reported
     max_quarantined_share: float = 0.01  # of the shards of this job; above it the job has failed
     give_up_after: int = 20  # quarantined shards before the share may end the job early
+    look_s: float = 5.0  # between two looks at what other drivers of the run have committed
+    look_factor: float = 20.0  # and at least so many times as long as the last look took
     max_waiting: int = 1000  # shards that wait for a retry; with more, no new shard is begun
 
 

@@ -20,6 +20,7 @@ class Tally:
     shards: int  # of this job, without those that were done before it began
     committed: int = 0
     superseded: int = 0  # shards that another driver or an earlier attempt had committed
+    elsewhere: int = 0  # shards that another driver had committed before an attempt began here
     quarantined: int = 0
     quarantined_shards: list[int] = field(default_factory=list)  # the first few
     retries: int = 0
@@ -35,7 +36,7 @@ class Tally:
     @property
     def finished(self) -> int:
         """Shards that need no further attempt."""
-        return self.committed + self.superseded + self.quarantined
+        return self.committed + self.superseded + self.elsewhere + self.quarantined
 
     def count(self, report: AttemptReport) -> None:
         """Add one ended attempt."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import isfinite
 from typing import Literal, get_args
 
@@ -18,6 +18,7 @@ from schemas.record_files import compact_record, decode_record
 from schemas.run_records import FORMAT_VERSION, Commit, Cost, Digest, Host, LedgerEntry, Outcome
 
 _STAGES = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s")
+_COST_FIELDS = set(Cost.model_fields)
 _OUTCOMES: frozenset[str] = frozenset(get_args(Outcome))
 # Longer causes and larger numbers stay in their records alone: a table keeps floats.
 _MAX_CAUSE_CHARS = 1000
@@ -119,28 +120,8 @@ class HeadTable:
 
     def head(self, row: int) -> CommitHead | EndHead:
         """The head in a row. ValueError, KeyError or TypeError where the columns do not make one."""
-        numbers: dict[str, float] = {}
-        parts: dict[str, dict[str, float]] = {name: {} for name in (*_STAGES, "redraws")}
-        for name, column in self.numbers.items():
-            value = column[row]
-            if value is not None:
-                group, dot, key = name.partition(".")
-                if dot:
-                    parts[group][key] = value
-                else:
-                    numbers[name] = value
-        cost = None
-        if "wall_s" in numbers:
-            cost = Cost.model_construct(
-                wall_s=numbers["wall_s"],
-                cpu_s=numbers["cpu_s"],
-                stage_wall_s=parts["stage_wall_s"],
-                stage_cpu_s=parts["stage_cpu_s"],
-                stage_gpu_s=parts["stage_gpu_s"],
-                peak_rss_bytes=int(numbers["peak_rss_bytes"]),
-                written_bytes=int(numbers["written_bytes"]),
-            )
-        attempt, shard = self.texts["attempt"][row], int(numbers["shard"])
+        cost = self._cost(row)
+        attempt, shard = self.texts["attempt"][row], self._integer("shard", row)
         if self.kind == "ends":
             outcome = self.texts["outcome"][row]
             if outcome not in _OUTCOMES:
@@ -151,13 +132,49 @@ class HeadTable:
         return CommitHead(
             shard,
             attempt,
-            int(numbers["scenes"]),
-            int(numbers["samples"]),
-            int(numbers["positives"]),
-            {name: int(count) for name, count in parts["redraws"].items()},
+            self._integer("scenes", row),
+            self._integer("samples", row),
+            self._integer("positives", row),
+            {name: int(count) for name, count in self._part("redraws", row).items()},
             cost,
             _host(self.texts["host"][row]),
         )
+
+    def _cost(self, row: int) -> Cost | None:
+        wall_s = self.numbers.get("wall_s")
+        if wall_s is None or (seconds := wall_s[row]) is None:
+            return None
+        cpu_s = self.numbers["cpu_s"][row]
+        if cpu_s is None:
+            raise ValueError("a cost without CPU seconds")
+        return Cost.model_construct(  # validated when its record was read
+            _COST_FIELDS,
+            wall_s=seconds,
+            cpu_s=cpu_s,
+            stage_wall_s=self._part("stage_wall_s", row),
+            stage_cpu_s=self._part("stage_cpu_s", row),
+            stage_gpu_s=self._part("stage_gpu_s", row),
+            peak_rss_bytes=self._integer("peak_rss_bytes", row),
+            written_bytes=self._integer("written_bytes", row),
+        )
+
+    def _part(self, group: str, row: int) -> dict[str, float]:
+        return {
+            key: value for key, column in self._groups.get(group, ()) if (value := column[row]) is not None
+        }
+
+    def _integer(self, name: str, row: int) -> int:
+        return int(self.numbers[name][row])  # type: ignore[arg-type] - None is the TypeError that is told
+
+    @cached_property
+    def _groups(self) -> dict[str, list[tuple[str, Sequence[float | None]]]]:
+        """Columns named `group.key`, by their group."""
+        groups: dict[str, list[tuple[str, Sequence[float | None]]]] = {}
+        for name, column in self.numbers.items():
+            group, dot, key = name.partition(".")
+            if dot:
+                groups.setdefault(group, []).append((key, column))
+        return groups
 
 
 @lru_cache(maxsize=256)

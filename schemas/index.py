@@ -33,6 +33,7 @@ _FOLDER = "index"
 _FILE = re.compile(r"index/([0-9]{1,9})\.json\.gz")
 AnyHead = CommitHead | EndHead
 _KINDS: tuple[Kind, ...] = ("ends", "commits")
+_ATTEMPT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 # Rows of a full file. One below half of it is joined with others when the index grows.
 ROWS_PER_FILE = 16_384
 _MAX_FILE_BYTES = 64 * 2**20
@@ -206,6 +207,8 @@ def _checked(run: Run, table: HeadTable, row: int) -> AnyHead | None:
         return None
     if isinstance(head, EndHead):
         return head if head.attempt == table.names[row] else None
+    if not _ATTEMPT.fullmatch(head.attempt):
+        return None
     layout = run.layout
     sizes = (int(table.names[row]), layout.scenes_per_shard, layout.samples_per_shard)
     return head if (head.shard, head.scenes, head.samples) == sizes else None

@@ -12,6 +12,7 @@ from cluster.policy import Trouble
 from cluster.tally import Tally
 from cluster.task import AttemptReport
 from schemas.run_records import Commit, Cost, LedgerEntry
+from schemas.shard_ranges import ShardRanges
 
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]
@@ -133,6 +134,9 @@ class PaperBooks:
 
     def commit_of(self, shard: int) -> Commit | None:
         return self.commits.get(shard)
+
+    def missing(self) -> ShardRanges:
+        return ShardRanges.of(range(10**9)).without(ShardRanges.of(self.commits))
 
 
 @dataclass

@@ -9,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cluster.driver import Order, drive
+from cluster.open_shards import OpenShards
 from cluster.policy import Policy
 from cluster.stop import StopRequest
 from cluster.tally import JobSummary, Tally
 from schemas.errors import InputError
 from schemas.run_records import Commit, Cost, Host, LedgerEntry
+from schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
 
 LENIENT = Policy(max_quarantined_share=1.0)
@@ -230,6 +232,89 @@ def test_whatever_fails_every_shard_ends_once_and_every_attempt_is_in_the_ledger
     assert sorted(final) == list(range(12))
     wall_s = sum(e.cost.wall_s for e in books.entries if e.cost)
     assert tally.useful_wall_s + tally.wasted_wall_s == pytest.approx(wall_s)
+
+
+class Other:
+    """Another driver with as many slots, begun at the same moment: it goes through the shards in order."""
+
+    def __init__(self, clock: FakeClock, shards: int, slots: int) -> None:
+        self.clock, self.shards, self.slots = clock, shards, slots
+        self.done: set[int] = set()
+        self.ours: set[int] = set()
+        self.at, self.step_s = 0, 0.0
+
+    def advance(self) -> None:
+        while self.step_s + 5.0 <= self.clock.now_s:
+            self.step_s += 5.0
+            for _ in range(self.slots):
+                while self.at in self.ours:
+                    self.at += 1
+                if self.at < self.shards:
+                    self.done.add(self.at)
+                    self.at += 1
+
+    def fate(self, order: Order, n: int) -> Fate:
+        self.advance()
+        if order.shard in self.done:
+            return ("superseded", 0.01)
+        if self.at <= order.shard < self.at + self.slots:  # at work there now
+            return ("superseded", 5.0)
+        self.ours.add(order.shard)
+        return ("committed", 5.0)
+
+
+@pytest.mark.parametrize("shards", [40, 400, 4000])
+def test_a_driver_makes_way_for_another(shards: int) -> None:
+    clock = FakeClock()
+    other = Other(clock, shards, slots=4)
+
+    class SharedBooks(PaperBooks):
+        def missing(self) -> ShardRanges:
+            other.advance()
+            return ShardRanges.of(range(shards)).without(ShardRanges.of(other.done | other.ours))
+
+    books = SharedBooks()
+    executor = SimulatedExecutor(clock, other.fate, slots=4)
+    summary = drive(range(shards), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
+    tally = summary.tally
+    assert summary.end == "complete" and summary.remaining == 0
+    clock.now_s += 5.0 * shards  # what the other is at work at counts as done here
+    other.advance()
+    assert tally.committed == len(other.ours) and other.done | other.ours == set(range(shards))
+    assert tally.committed + tally.superseded + tally.elsewhere == shards
+    assert tally.committed > shards // 3
+    # Twice the first window, and some more wherever the two met: no longer everything.
+    assert tally.wasted_wall_s <= 5.0 * (24 + shards // 50)
+
+
+@given(st.sets(st.integers(0, 80)), st.integers(0, 2**32), st.lists(st.integers(0, 3), max_size=80))
+def test_open_shards_are_given_once_or_dropped(shards: set[int], seed: int, moves: list[int]) -> None:
+    rng, open_ = random.Random(seed), OpenShards(sorted(shards), random.Random(seed))
+    given_out: list[int] = []
+    dropped: set[int] = set()
+    for move in moves:
+        if move == 0:
+            open_.go_elsewhere()
+        elif move == 1:
+            gone = {shard for shard in shards if rng.random() < 0.2}
+            dropped |= gone - set(given_out)
+            before = len(open_)
+            assert open_.keep(ShardRanges.of(shards - gone)) == before - len(open_)
+        elif (shard := open_.next()) is not None:
+            given_out.append(shard)
+    while (shard := open_.next()) is not None:
+        given_out.append(shard)
+    assert len(open_) == 0 and len(set(given_out)) == len(given_out)
+    assert set(given_out) | dropped == shards and not set(given_out) & dropped
+
+
+def test_open_shards_come_in_order_while_nobody_else_is_there() -> None:
+    open_ = OpenShards([7, 3, 4, 1], random.Random(0))
+    assert [open_.next() for _ in range(5)] == [1, 3, 4, 7, None]
+    open_ = OpenShards(range(10), random.Random(0))
+    assert [open_.next(), open_.next()] == [0, 1]
+    assert open_.keep(ShardRanges.of([2, 3, 8, 9])) == 4  # others are far ahead: it stays here
+    assert [open_.next() for _ in range(5)] == [2, 3, 8, 9, None]
 
 
 def test_twenty_thousand_shards_on_a_bad_cluster() -> None:

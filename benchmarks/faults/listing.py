@@ -1,0 +1,134 @@
+"""Seconds until a large run answers: open and resume, status, audit, with and without the index.
+
+python -m benchmarks.faults.listing [--commits 1000 10000 100000] [--keep FOLDER]
+
+The records are real, one commit of some sixty files a shard; the files of the shards themselves are not
+made, because none of these verbs reads them. Each answer is timed in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from schemas.heads import head_of_commit
+from schemas.index import Heads, refresh
+from schemas.record_files import encode_record, now
+from schemas.run import Run, commit_key
+from schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
+from schemas.shard_files import encode_shard
+from tests.made_runs import commit_of, make_run, rows_of
+
+_ANSWERS = {
+    "open + missing": "from schemas.run import Run; len(Run.open(place).missing())",
+    "status": "from schemas.run import Run; from datagen.standing import status_report; status_report(Run.open(place))",
+    "audit": "from schemas.run import Run; from datagen.accounts import account_for; account_for([Run.open(place)])",
+}
+_TIMED = """
+import json, sys, time
+from pathlib import Path
+place = sys.argv[1]
+{imports}
+start_s = time.perf_counter()
+{answer}
+took_s = time.perf_counter() - start_s
+peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+print(json.dumps([took_s, int(peak.split()[1]) / 1024]))
+"""
+_STAGES = ("draw", "settle", "observe", "visibility", "write")
+
+
+def make_large(folder: Path, commits: int) -> Run:
+    """A run with the records of this many shards, written without waiting for the disk."""
+    run = make_run(folder, n=10 * commits, shards=())
+    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, 0))
+    for name in ("commits", "ledger"):
+        (folder / name).mkdir(exist_ok=True)
+    for shard in range(len(run.committed()), commits):
+        entries = tuple(
+            FileEntry(path=path, size=len(data), sha256=f"{shard:032x}{i:032x}")
+            for i, (path, data) in enumerate(files.items())
+        )
+        attempt = f"{shard:06d}-0a1b2c3d-{shard:06d}"
+        seconds = {
+            stage: 0.1 + (shard * 7919 + i * 104729) % 1_000_003 / 1e6 for i, stage in enumerate(_STAGES)
+        }
+        cost = Cost(
+            wall_s=sum(seconds.values()) + 0.01,
+            cpu_s=sum(seconds.values()),
+            stage_wall_s=seconds,
+            stage_cpu_s=seconds,
+            peak_rss_bytes=400_000_000 + shard,
+            written_bytes=sum(entry.size for entry in entries),
+        )
+        host = Host(name="node", cpu="cpu", cores=64, memory_bytes=2**38, pid=shard // 200)
+        commit = commit_of(run, shard, attempt, entries, shard % 10, {"no_base": shard % 3})
+        commit = commit.model_copy(update={"cost": cost, "host": host})
+        end = LedgerEntry(
+            attempt=attempt,
+            shard=shard,
+            outcome="committed",
+            started=now(),
+            ended=now(),
+            cost=cost,
+            host=host,
+        )
+        start = AttemptStart(attempt=attempt, shard=shard, started=now(), host="node")
+        (folder / commit_key(shard)).write_bytes(encode_record(commit))
+        (folder / f"ledger/{attempt}.start.json").write_bytes(encode_record(start))
+        (folder / f"ledger/{attempt}.json").write_bytes(encode_record(end))
+    return run
+
+
+def answer_times(run: Run) -> dict[str, tuple[float, float]]:
+    """Seconds and MiB of peak memory of each answer, in a fresh process each."""
+    times: dict[str, tuple[float, float]] = {}
+    for name, answer in _ANSWERS.items():
+        *imports, answer = answer.split("; ")
+        program = _TIMED.format(imports="\n".join(imports), answer=answer)
+        told = subprocess.run(
+            [sys.executable, "-c", program, run.storage.url], check=True, capture_output=True, text=True
+        )
+        took_s, mib = json.loads(told.stdout)
+        times[name] = (took_s, mib)
+    return times
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--commits", type=int, nargs="*", default=[1000, 10_000, 100_000])
+    parser.add_argument("--keep", type=Path, help="make the runs here and keep them")
+    options = parser.parse_args()
+    print(f"{'commits':>8} {'':16} {'with index':>20} {'without':>20}")
+    for commits in options.commits:
+        with tempfile.TemporaryDirectory() as scratch:
+            run = make_large((options.keep or Path(scratch)) / f"run-{commits}", commits)
+            without = answer_times(run)
+            start_s = time.perf_counter()
+            refresh(run)
+            refresh_s = time.perf_counter() - start_s
+            heads = next(Heads(run).commits())
+            assert heads == head_of_commit(run.commit_of(0))
+            for name, (took_s, mib) in answer_times(run).items():
+                before_s, before_mib = without[name]
+                print(
+                    f"{commits:>8} {name:16} {took_s:>8.2f} s {mib:>5.0f} MiB {before_s:>8.2f} s {before_mib:>5.0f} MiB"
+                )
+            size = sum(f.size for f in run.storage.list("index"))
+            files = sum(1 for _ in run.storage.list("index"))
+            print(
+                f"{commits:>8} {'index anew':16} {refresh_s:>8.2f} s, {files} files, {size / 2**20:.1f} MiB"
+            )
+            start_s = time.perf_counter()
+            refresh(run)
+            print(f"{commits:>8} {'index as it is':16} {time.perf_counter() - start_s:>8.2f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
