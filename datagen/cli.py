@@ -27,10 +27,16 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
 # Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
     "submit": ("datagen.submit:submit", "Make labels: start a run, or resume it."),
+    "resume": ("datagen.resume:resume", "Make what is missing of a run, or of merged runs."),
+    "extend": ("datagen.extend:extend", "Want more labels of a run, and make them."),
+    "cancel": ("datagen.cancel:cancel", "Ask the jobs of a run to stop, and wait for their end."),
+    "logs": ("datagen.logs:logs", "What happened in a run, in order of time."),
     "status": ("datagen.status:status", "How far a run is, and what failed."),
     "seal": ("datagen.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
     "unseal": ("datagen.seal:unseal", "Remove that store; the run keeps every shard."),
     "merge": ("datagen.merge:merge", "One run of several that were made apart."),
+    "verify": ("datagen.verify:verify", "Whether a run is what it says, to the last byte."),
+    "repair": ("datagen.repair:repair", "Mend what verify finds, and touch nothing else."),
     "replay": ("datagen.replay:replay", "One sample's scene made again, beside what is stored."),
     "relabel": ("datagen.relabel:relabel", "Labels by another rule, from stored distances."),
     "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),

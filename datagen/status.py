@@ -1,79 +1,114 @@
-"""`datagen status`: how far a run is, and what failed."""
+"""`datagen status`: how far a run is, who works on it, and what failed."""
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from datagen.console import print_json, print_rows
-from schemas.index import Heads
-from schemas.run import Run
-from schemas.seal import sealed_root
-from schemas.shard_ranges import ShardRanges
+from datagen.job_records import health_line, jobs_report
+from datagen.standing import place_report
+from schemas.jobs import Jobs
+from schemas.storage import Storage, open_storage
 
 
 def status(
-    run: Annotated[str, Parameter(help="The run's folder.")],
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
     *,
+    stacks: Annotated[bool, Parameter(negative=(), help="With one stack of each cause of failure.")] = False,
     json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
 ) -> int:
-    """How far a run is: shards, labels, failed attempts by cause, quarantine."""
-    report = status_report(Run.open(run))
+    """How far a run is: shards, labels, jobs at work, failed attempts by cause, quarantine.
+
+    Of merged runs the sums, and one line a part.
+    """
+    place = open_storage(run, probe=False, create=False)
+    report = place_report(place, stacks)
     if json:
-        print_json(report)
+        print_json(report | {"jobs": jobs_report(place)})
     else:
-        _print(run, report)
+        _print(run, place, report)
     return 0
 
 
-def status_report(run: Run) -> dict[str, Any]:
-    """The state of a run as plain values."""
-    heads, n = Heads(run), run.n
-    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(heads.shards)
-    quarantined = run.quarantined()
-    labels = labels_made = positives = 0
-    winners: set[str] = set()
-    for commit in heads.commits():
-        labels += run.layout.rows_wanted(commit.shard, n)[1]
-        labels_made += commit.samples
-        positives += commit.positives
-        winners.add(commit.attempt)
-    outcomes: Counter[str] = Counter()
-    causes: Counter[str] = Counter()
-    for entry in heads.ends():
-        outcomes[entry.outcome] += 1
-        if entry.cause:
-            causes[f"{entry.outcome}: {entry.cause}"] += 1
-    unfinished = {start.attempt for start in heads.unfinished()} - winners
-    root, absent = sealed_root(run.storage), planned.without(committed)
-    part = root.part(run.manifest.spec_hash) if root else None
-    return {
-        "run": run.storage.url,
-        "label_source": run.manifest.spec.label_source,
-        "spec_hash": run.manifest.spec_hash,
-        "scenes_from": run.manifest.sources.get("scenes_from"),
-        "created": run.manifest.created,
-        "n": n,
-        "labels": labels,
-        # Commits count whole shards, and so more than n where the last one is cut.
-        "labels_made": labels_made,
-        "positives": positives,
-        "shards": {
-            "planned": len(planned),
-            "committed": len(planned) - len(absent),
-            "quarantined": sorted(quarantined),
-            "missing": len(absent.without(ShardRanges.of(quarantined))),
-        },
-        "attempts": dict(sorted(outcomes.items())),
-        "attempts_without_end": len(unfinished),
-        "causes": dict(causes.most_common(20)),
-        # An older seal, of a shorter run or with fewer shards, does not count.
-        "sealed": part is not None and part.n == n and absent == part.missing_shards,
-        "sealed_labels": part.n if part else None,
-        "complete": not absent,
-    }
+def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
+    shards = report["shards"]
+    given_up = len(shards["quarantined"])
+    state = "complete" if report["complete"] else f"{shards['missing']} shards to make"
+    if given_up:
+        state += f", {given_up} in quarantine: {shards['quarantined'][:10]}"
+    attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
+    rows = [
+        ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
+        ("shards", f"{shards['committed']} of {shards['planned']} committed; {state}"),
+        ("attempts", attempts),
+        ("sealed", _seal(report)),
+        ("specification", report["spec_hash"][:16] or "of each part its own"),
+        ("created", report["created"]),
+    ]
+    if report["scenes_from"]:
+        rows.append(("scenes from", report["scenes_from"]))
+    if report["attempts_without_end"]:
+        rows.insert(3, ("without end", f"{report['attempts_without_end']} attempts run now, or were lost"))
+    print_rows(f"run {name}", rows)
+    _print_jobs(place)
+    _print_parts(report)
+    _print_lineage(report)
+    _print_failures(name, report)
+
+
+def _print_jobs(place: Storage) -> None:
+    """Whoever may be at work, and the latest job where that is nobody."""
+    jobs = Jobs(place).all()
+    shown = [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]
+    if shown:
+        print_rows("jobs", [(job.id, health_line(job)) for job in shown])
+
+
+def _print_parts(report: dict[str, Any]) -> None:
+    parts = report.get("parts", ())
+    if parts:
+        rows = [
+            (
+                part["run"].rsplit("/", 1)[-1],
+                f"{part['labels']:,} of {part['n']:,}",
+                f"{part['shards']['committed']} of {part['shards']['planned']}",
+                str(len(part["shards"]["quarantined"])),
+            )
+            for part in parts
+        ]
+        print_rows("parts", rows, ("part", "labels", "shards", "quarantined"))
+
+
+def _print_lineage(report: dict[str, Any]) -> None:
+    rows = [(source["address"], str(source["shards"]), source["created"]) for source in report["lineage"]]
+    if rows:
+        print_rows("merged from", rows, ("run", "shards", "created"))
+
+
+def _print_failures(name: str, report: dict[str, Any]) -> None:
+    if report["budgets"]:
+        rows = [
+            (
+                row["outcome"],
+                str(row["attempts"]),
+                str(row["shards"]),
+                f"{row['most_on_one_shard']} of {row['budget']}" if row["budget"] else "-",
+            )
+            for row in report["budgets"]
+        ]
+        print_rows("failures", rows, ("kind", "attempts", "shards", "most on one shard"))
+    if report["causes"]:
+        rows = [(cause, str(n)) for cause, n in report["causes"].items()]
+        print_rows("causes", rows, ("cause", "attempts"))
+    for cause, stack in report.get("stacks", {}).items():
+        print_rows(cause, [(line, "") for line in stack.splitlines()])
+    given_up = report["quarantine"]
+    if given_up:
+        rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in given_up[:20]]
+        print_rows("quarantine", rows, ("shard", "attempts", "last cause"))
+        print_rows(f"try them again: datagen resume {name} --quarantined", [])
 
 
 def _seal(report: dict[str, Any]) -> str:
@@ -81,29 +116,4 @@ def _seal(report: dict[str, Any]) -> str:
         return "yes, data.zarr"
     if report["sealed_labels"] is None:
         return "no"
-    return f"data.zarr is older ({report['sealed_labels']:,} labels): submit the run again to seal it anew"
-
-
-def _print(place: str, report: dict[str, Any]) -> None:
-    shards = report["shards"]
-    state = "complete" if report["complete"] else f"{shards['missing']} shards to make"
-    if shards["quarantined"]:
-        state += f", {len(shards['quarantined'])} in quarantine: {shards['quarantined'][:10]}"
-    attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
-    rows = [
-        ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
-        ("shards", f"{shards['committed']} of {shards['planned']} committed; {state}"),
-        ("attempts", attempts),
-        ("sealed", _seal(report)),
-        ("specification", report["spec_hash"][:16]),
-        ("created", report["created"]),
-    ]
-    if report["scenes_from"]:
-        rows.append(("scenes from", report["scenes_from"]))
-    if report["attempts_without_end"]:
-        rows.insert(3, ("without end", f"{report['attempts_without_end']} attempts run now, or were lost"))
-    print_rows(f"run {place}", rows)
-    if report["causes"]:
-        print_rows(
-            "causes", [(cause, str(n)) for cause, n in report["causes"].items()], ("cause", "attempts")
-        )
+    return f"data.zarr is older ({report['sealed_labels']:,} labels): datagen seal makes it anew"

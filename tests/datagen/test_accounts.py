@@ -6,7 +6,7 @@ from pathlib import Path
 
 from datagen.accounts import account_for
 from datagen.audit import audit_report
-from datagen.status import status_report
+from datagen.standing import status_report
 from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from tests.made_runs import make_run, write
