@@ -59,6 +59,14 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
     return 0
 
 
+def detached_words() -> list[str]:
+    """In a detached job, the options with which its command would be handed over in the same way again."""
+    jobs_api = os.environ.get(JOBS_API, "")
+    if not jobs_api:
+        return []
+    return ["--detach"] if head_token(jobs_api) else ["--detach", "--address", jobs_api]
+
+
 def _await_begin(jobs: RayJobs, submission: str) -> str:
     until_s = time.monotonic() + _BEGUN_WITHIN_S
     while True:

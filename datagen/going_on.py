@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 
 from datagen.arms import refuse_missing_packages
+from datagen.detach import detached_words
 from datagen.doctor.engines import probe_render_device
 from datagen.job import JobPlan, Work, carry_out
 from datagen.job_options import Placing, absolute_place, absolute_source, resumable, words_of
@@ -66,8 +67,9 @@ def go_on(
 ) -> int:
     """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
     words = ["resume", absolute_place(name), *(given or Sources()).words(), *placing.words()]
-    if placing.address != "local":
-        words += ["--address", placing.address]
+    words += detached_words() or words_of(
+        {"--address": None if placing.address == "local" else placing.address}
+    )
     with resumable(words):
         return carry_out(JobPlan(place, name, works, placing, words))
 

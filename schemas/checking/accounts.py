@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from schemas.checking.commits import odd_cost, start_from
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import read
+from schemas.quarantine import name_before
 from schemas.record_files import encode_record, now
 from schemas.run import Run
 from schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord
@@ -107,7 +108,7 @@ def check_quarantine(run: Run) -> Iterator[Finding]:
         record = read(run.storage, file.key, QuarantineRecord)
         problem = record.problem
         if record.record is not None:
-            problem = _misnamed(f"{record.record.shard:06d}.json", name)
+            problem = _misnamed(f"{record.record.shard:06d}.json", name_before(name))
         if problem:
             yield Finding(file.key, "record", problem, mend)
 
