@@ -32,6 +32,7 @@ from typing import TypeVar
 from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from schemas.cost import StageClock
 from schemas.run_records import Cost, Host, Outcome
+from schemas.storage_errors import StoreFailure
 
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.
@@ -83,7 +84,8 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
             product = function(task, meter)
         except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
             cause = " ".join(str(error).split())
-            ends_job = isinstance(error, JobCannotGoOn)
+            # A store that gives no answer gives none to the next shard either.
+            ends_job = isinstance(error, JobCannotGoOn | StoreFailure)
             return AttemptReport(
                 attempt=task.attempt,
                 shard=task.shard,

@@ -35,6 +35,7 @@ from schemas.run_records import (
 )
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
+from schemas.storage_errors import StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # A commit with its file entries takes some 30 kB of memory.
@@ -219,9 +220,10 @@ class Run:
             for path, data in files.items()
         )
         try:
-            for path, data in files.items():
-                self.storage.put(f"{folder}/{path}", data)
+            self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
             self.storage.sync(f"{folder}/{path}" for path in files)
+        except StoreFailure:
+            raise  # it would not delete either
         except InputError:
             with suppress(InputError):
                 self.storage.delete(f"{folder}/{path}" for path in files)
@@ -261,9 +263,9 @@ class Run:
         """Refuse a commit one of whose files has other bytes than were committed."""
         self.check_files(commit)
         folder = shard_folder(commit.shard, commit.attempt)
-        for entry in commit.files:
-            key = f"{folder}/{entry.path}"
-            data = self.storage.get(key, entry.size)
+        keys = (f"{folder}/{entry.path}" for entry in commit.files)
+        largest = max((entry.size for entry in commit.files), default=0)
+        for entry, (key, data) in zip(commit.files, self.storage.get_many(keys, largest), strict=True):
             if data is None or sha256(data).hexdigest() != entry.sha256:
                 raise InputError(
                     f"{self.storage.url}/{key}",

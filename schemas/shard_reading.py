@@ -117,29 +117,36 @@ class ShardPlace:
 
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
         """The shard's rows of each array. InputError names a missing, foreign or damaged file."""
-        return {array.name: self._read_array(array) for array in arrays}
+        wanted = list(arrays)
+        chunks = [(array, path) for array in wanted for path in self._paths(array)]
+        keys = (f"{self.folder}/{path}" if self.folder else path for _, path in chunks)
+        parts: dict[str, list[Array]] = {array.name: [] for array in wanted}
+        found = self.storage.get_many(keys, MAX_DECODED_BYTES)
+        for (array, path), (key, data) in zip(chunks, found, strict=True):
+            place = f"{self.storage.url}/{key}"
+            self._refuse_other_size(place, path, array, data)
+            parts[array.name].append(decode_chunk(place, array, data or b""))
+        return {array.name: self._joined(array, parts[array.name]) for array in wanted}
 
-    def _read_array(self, array: StoredArray) -> Array:
+    def _paths(self, array: StoredArray) -> list[str]:
+        """Paths of the chunks that hold the wanted rows."""
         scene = array.dims[0] == "scene"
         full, rows = (self.full_scenes, self.scenes) if scene else (self.full_samples, self.samples)
         count = full // array.chunk_rows
-        parts: list[Array] = []
-        for i in range(self.ordinal * count, self.ordinal * count + -(-rows // array.chunk_rows)):
-            path = f"{array.name}/" + ".".join(["c", str(i), *("0" for _ in array.shape[1:])])
-            parts.append(decode_chunk(*self._fetch(path, array)))
-        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        return whole[:rows]
+        first = self.ordinal * count
+        chunks = range(first, first + -(-rows // array.chunk_rows))
+        return [f"{array.name}/" + ".".join(["c", str(i), *("0" for _ in array.shape[1:])]) for i in chunks]
 
-    def _fetch(self, path: str, array: StoredArray) -> tuple[str, StoredArray, bytes]:
-        key = f"{self.folder}/{path}" if self.folder else path
-        data = self.storage.get(key, MAX_DECODED_BYTES)
-        place = f"{self.storage.url}/{key}"
+    def _joined(self, array: StoredArray, parts: list[Array]) -> Array:
+        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return whole[: self.scenes if array.dims[0] == "scene" else self.samples]
+
+    def _refuse_other_size(self, place: str, path: str, array: StoredArray, data: bytes | None) -> None:
         if data is None:
             raise InputError(place, array.name, "no such file, though it was committed", _MEND)
         if self.sizes is not None and self.sizes.get(path) != len(data):
             problem = f"{len(data)} bytes, where the commit has {self.sizes.get(path)}"
             raise InputError(place, array.name, problem, _MEND)
-        return place, array, data
 
 
 def committed_place(storage: Storage, folder: str, commit: Commit, scenes: int, samples: int) -> ShardPlace:
@@ -150,10 +157,10 @@ def committed_place(storage: Storage, folder: str, commit: Commit, scenes: int, 
 
 def read_metadata(storage: Storage, folder: str, names: Iterable[str]) -> dict[str, StoredArray]:
     """The named arrays' metadata from a group's folder."""
+    listed = list(names)
+    keys = (f"{folder}/{name}/zarr.json" if folder else f"{name}/zarr.json" for name in listed)
     found: dict[str, StoredArray] = {}
-    for name in names:
-        key = f"{folder}/{name}/zarr.json" if folder else f"{name}/zarr.json"
-        data = storage.get(key, MAX_META_BYTES)
+    for name, (key, data) in zip(listed, storage.get_many(keys, MAX_META_BYTES), strict=True):
         if data is None:
             raise InputError(f"{storage.url}/{key}", "", "no such file", _MEND)
         found[name] = parse_metadata(f"{storage.url}/{key}", name, data)
