@@ -184,5 +184,5 @@ def _plan(runs: Sequence[Run]) -> Plan:
     plans = [plan for run in runs if (plan := run.plan()) is not None]
     if not plans:
         problem = "no plan says how many samples are wanted"
-        raise InputError(runs[0].storage.url, "plans", problem, "Submit the run again")
+        raise InputError(runs[0].storage.url, "plans", problem, "Say it with `datagen extend`")
     return min(plans, key=lambda plan: (-plan.n, plan.created))

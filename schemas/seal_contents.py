@@ -107,7 +107,7 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
         absent = sorted(set(range(run.layout.shards_for(n))) - set(done))
         sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
     if not shards:
-        raise InputError(place.url, "commits", "no shard is committed", "Submit the run again")
+        raise InputError(place.url, "commits", "no shard is committed", "Make some with `datagen resume`")
     last = next(part for part in reversed(sealed) if part.shards)
     scenes, samples = last.run.layout.rows_wanted(last.shards[-1], last.n)
     shards[-1] = SealedShard(shards[-1].folder, scenes, samples)
@@ -149,5 +149,5 @@ def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> Non
             f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}",
             "files",
             f"the commit lacks or adds {len(odd)} files, first {odd[0]}",
-            "Remove this shard's commit and submit the run again",
+            "Mend it with `datagen repair`",
         )

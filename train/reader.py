@@ -140,7 +140,7 @@ class SampleReader:
                 f"{place.storage.url}/{place.folder}",
                 "sample_scene_index",
                 "a sample names a scene that its shard lacks",
-                "Remove the shard's commit and submit the run again",
+                "Mend it with `datagen repair`",
             )
         samples = {name: _native(read[name]) for name in self._sample_fields}
         samples["scene_row"] = bounded.astype(np.int64)
@@ -172,7 +172,9 @@ def _open(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], di
     n = run.n
     commits = [commit for commit in run.commits() if commit.shard < run.layout.shards_for(n)]
     if not commits:
-        raise InputError(run.storage.url, "commits", "no shard is committed", "Submit the run again")
+        raise InputError(
+            run.storage.url, "commits", "no shard is committed", "Make some with `datagen resume`"
+        )
     folders = [shard_folder(commit.shard, commit.attempt) for commit in commits]
     digests = [{entry.path: entry.sha256 for entry in commit.files} for commit in commits]
     for name in names:
@@ -186,7 +188,7 @@ def _open(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], di
                     f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}/{path}",
                     name,
                     "differs from the other shards' metadata",
-                    "Remove the shard's commit and submit the run again",
+                    "Mend it with `datagen repair`",
                 )
     arrays = read_metadata(run.storage, folders[0], names)
     shards = [
