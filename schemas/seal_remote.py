@@ -16,7 +16,7 @@ from schemas.seal_metadata import ROOT, SEALED, sealed_root
 from schemas.shard_files import TABLES
 from schemas.storage import Storage
 
-_AT_ONCE = 32  # requests under way
+_AT_ONCE = 16  # requests under way
 _WAITING = 4 * _AT_ONCE
 
 Item = TypeVar("Item")
@@ -26,56 +26,48 @@ def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
     """Make data.zarr below the place from the chunks of the contents and the metadata, root last.
 
     A store whose shards are the first of the new one's stays open meanwhile: chunks are added to it, and
-    the root switches over. Any other is closed first by the removal of its root, and made anew. A kill
-    leaves the old store, the new one, or none; what lies there without a root counts as nothing.
+    the root switches over. Any other is removed first, from its root on. A kill leaves the old store, the
+    new one, or none; what lies there without a root counts as nothing.
     """
     place = contents.place
     old = sealed_root(place)
     kept = contents.digests.index(old.rows_sha256) if old and old.rows_sha256 in contents.digests else 0
     if not kept:
-        close_prefix(place)
-    arrays = [path for path in metadata if path != ROOT]
+        unseal_prefix(place)
     for table in TABLES:
         for field in contents.schema.table(table):
             _copy_chunks(contents, field, kept)
-    known = {f"{SEALED}/{path.split('/')[0]}" for path in arrays}
-    foreign = (f.key for f in place.list(SEALED) if f.key.rsplit("/", 1)[0] not in {*known, SEALED})
-    at_once(lambda key: place.delete([key]), foreign)
-    at_once(lambda path: place.put(f"{SEALED}/{path}", metadata[path]), arrays)
+    place.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
     place.put(f"{SEALED}/{ROOT}", metadata[ROOT])
 
 
 def unseal_prefix(place: Storage) -> None:
-    """Remove data.zarr below the place, its root first."""
-    close_prefix(place)
-    at_once(lambda key: place.delete([key]), (f.key for f in place.list(SEALED)))
-
-
-def close_prefix(place: Storage) -> None:
-    """Remove what opens data.zarr below the place: its root and then the arrays' metadata."""
+    """Remove data.zarr below the place: its root, then the arrays' metadata, so that nothing opens while
+    chunks go."""
     place.delete([f"{SEALED}/{ROOT}"])
-    at_once(
-        lambda key: place.delete([key]),
-        [f.key for f in place.list(SEALED) if f.key.endswith(f"/{ROOT}")],
-    )
+    place.delete([f.key for f in place.list(SEALED) if f.key.endswith(f"/{ROOT}")])
+    place.delete(f.key for f in place.list(SEALED))
 
 
 def _copy_chunks(contents: Contents, field: Field, kept: int) -> None:
-    """Copy an array's chunks but those that the first `kept` shards left there; remove what is no chunk."""
+    """Copy an array's chunks but those that the first `kept` shards left there; remove what is no chunk.
+
+    What a killed seal left beyond them may be of other shards, and is copied anew.
+    """
     place, folder = contents.place, f"{SEALED}/{field.name}"
     there = {f.key.removeprefix(f"{folder}/") for f in place.list(folder)} - {ROOT}
 
     def missing() -> Iterator[tuple[str, str]]:
         for position, source, name in contents.chunks(field):
             if not (name in there and position < kept):
-                yield source, name
+                yield source, f"{folder}/{name}"
             there.discard(name)
 
-    at_once(lambda pair: place.link_or_copy(pair[0], f"{folder}/{pair[1]}"), missing())
-    at_once(lambda name: place.delete([f"{folder}/{name}"]), list(there))
+    _at_once(lambda pair: place.link_or_copy(*pair), missing())
+    place.delete([f"{folder}/{name}" for name in sorted(there)])
 
 
-def at_once(do: Callable[[Item], object], items: Iterable[Item]) -> None:
+def _at_once(do: Callable[[Item], object], items: Iterable[Item]) -> None:
     """Do it to all items, several at a time and in no order; the first failure ends it and is raised."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         under_way: set[Future[object]] = set()

@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from schemas.errors import InputError
-from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, units, use_small_schema
+from schemas.fields import SCHEMAS
+from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, small_schema, units
 from tests.faults.crash_points_shim import Call, Mode, Shim, read_log
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -335,7 +336,7 @@ def main() -> None:
     parser.add_argument("--trace", type=Path, help="only run the operations, and log their calls there")
     parser.add_argument("--only", action="append", default=[], help="an operation")
     options = parser.parse_args()
-    use_small_schema()
+    SCHEMAS["heuristic"] = small_schema()
     chosen = [op for op in OPERATIONS if not options.only or op.name in options.only]
     memory = Path("/dev/shm")  # copies there are quick; a kill is the same on every file system
     with tempfile.TemporaryDirectory(prefix="crash-points-", dir=memory if memory.is_dir() else None) as work:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cluster.books import close_lost_attempts
 from schemas.errors import InputError
-from schemas.fields import SCHEMAS
+from schemas.fields import SCHEMAS, RecordSchema
 from schemas.merged import MERGED, open_runs, part_folder
 from schemas.record_files import encode_record
 from schemas.run import Run
@@ -37,10 +37,10 @@ class Operation:
     resume: Callable[[Path], None] | None = None
 
 
-def use_small_schema() -> None:
-    """Let shards of this process have seven arrays."""
+def small_schema() -> RecordSchema:
+    """The schema of these shards, for `SCHEMAS["heuristic"]`."""
     schema = SCHEMAS["heuristic"]
-    SCHEMAS["heuristic"] = replace(
+    return replace(
         schema,
         scene_fields=tuple(f for f in schema.scene_fields if f.name in _KEPT),
         sample_fields=tuple(f for f in schema.sample_fields if f.name in _KEPT),
