@@ -1,0 +1,119 @@
+"""Records of jobs: who lives, who is dead, and requests that stand."""
+
+from __future__ import annotations
+
+import os
+import platform
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import InputError
+from schemas.jobs import JobRecord, Jobs, JobState, new_job_id
+from schemas.quarantine import lift_quarantine, lifted_records
+from schemas.run_records import QuarantineRecord
+from schemas.storage import open_storage
+from tests.made_runs import make_run
+
+NOBODY = 2**22 + 1  # beyond the largest number that a process can have
+
+
+def record_of(started: datetime, pid: int, host: str = "") -> JobRecord:
+    return JobRecord(
+        id=new_job_id(),
+        command=("datagen", "submit"),
+        host=host or platform.node(),
+        pid=pid,
+        started=started.isoformat(),
+        address="local",
+    )
+
+
+@pytest.mark.parametrize(
+    ("pid", "host", "minutes", "health"),
+    [
+        (os.getpid(), "", 0, "live"),
+        (os.getpid(), "", 10, "live"),  # it is there, however long it says nothing
+        (NOBODY, "", 0.5, "live"),  # not before a minute: hosts of one name are not one host
+        (NOBODY, "", 2, "dead"),
+        (1, "elsewhere", 0.5, "live"),
+        (1, "elsewhere", 2, "silent"),
+    ],
+)
+def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(
+    pid: int, host: str, minutes: float, health: str, tmp_path: Path
+) -> None:
+    jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
+    record = record_of(at, pid, host)
+    jobs.begin(record)
+    heard = at - timedelta(minutes=minutes)
+    jobs.tell(JobState(id=record.id, updated=heard.isoformat(), phase="making"))
+    (job,) = jobs.all()
+    assert job.health(at) == health
+    jobs.tell(JobState(id=record.id, updated=heard.isoformat(), phase="ended", end="complete"))
+    (job,) = jobs.all()
+    assert job.health(at) == "ended"
+
+
+def test_a_process_that_only_has_the_number_is_not_the_job(tmp_path: Path) -> None:
+    # This process began before now, and long after the job did.
+    jobs, at = Jobs(open_storage(tmp_path)), datetime.now(UTC)
+    jobs.begin(record_of(at - timedelta(days=3000), os.getpid()))
+    assert jobs.all()[0].health(at) == "dead"
+
+
+def test_a_request_to_end_at_once_is_not_taken_back_by_a_gentler_one(tmp_path: Path) -> None:
+    jobs, job = Jobs(open_storage(tmp_path)), new_job_id()
+    assert jobs.stop_order(job) is None
+    for at_once, now in ((False, False), (True, True), (False, True)):
+        jobs.ask_to_stop(job, at_once)
+        order = jobs.stop_order(job)
+        assert order is not None and order.now is now
+
+
+def test_a_torn_state_is_as_if_it_were_absent_and_a_damaged_record_is_named(tmp_path: Path) -> None:
+    jobs = Jobs(open_storage(tmp_path))
+    record = record_of(datetime.now(UTC), os.getpid())
+    jobs.begin(record)
+    (tmp_path / f"jobs/{record.id}.state.json").write_bytes(b"")
+    (tmp_path / f"jobs/{record.id}.stop.json").write_text('{"now": true}')
+    (job,) = jobs.all()
+    assert job.state is None and job.order is None and job.record == record
+    with pytest.raises(InputError, match="already begun"):
+        jobs.begin(record.model_copy(update={"pid": 3}))
+    file = tmp_path / f"jobs/{record.id}.json"
+    file.write_bytes(file.read_bytes().replace(b"datagen", b"datagex"))
+    with pytest.raises(InputError, match=record.id):
+        jobs.all()
+
+
+def test_lifting_keeps_every_record_and_a_cut_lift_is_completed(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", n=50, shards=[0, 2, 4])
+
+    def give_up(shard: int, cause: str) -> None:
+        run.quarantine(
+            QuarantineRecord(
+                shard=shard, seed=0, first_scene=0, scenes=2, attempts=("a",), causes=(cause,), stacks=("",),
+                created=cause,
+            )
+        )  # fmt: skip
+
+    give_up(1, "first")
+    give_up(3, "other")
+    assert list(run.missing()) == []
+    assert lift_quarantine(run) == [1, 3]
+    assert list(run.missing()) == [1, 3] and run.quarantined() == set()
+    give_up(1, "second")
+    # As if a lift had been killed between its two steps.
+    here = tmp_path / "run/quarantine"
+    (here / "000001.lifted-2.json").write_bytes((here / "000001.json").read_bytes())
+    assert lift_quarantine(run) == [1] and lift_quarantine(run) == []
+    assert [(r.shard, r.causes[0]) for r in lifted_records(run)] == [
+        (1, "first"),
+        (1, "second"),
+        (3, "other"),
+    ]
+    assert sorted(p.name for p in here.iterdir()) == [
+        "000001.lifted-1.json", "000001.lifted-2.json", "000003.lifted-1.json",
+    ]  # fmt: skip
