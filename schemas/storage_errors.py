@@ -89,7 +89,7 @@ def store_trouble(error: Exception) -> StoreTrouble:
         return StoreTrouble("the bucket is in another region", mend, passing=False)
     if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
         return StoreTrouble(f"access denied ({code or status})", _KEYS_MEND, passing=False)
-    if status:
+    if status and not status.startswith("2"):
         shown = f"{status} {code}" if code else status
         if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
             mend = f"Wait until the store has recovered, {_RESUME}"

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.s3_servers import environment, make_bucket, moto_server
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -17,3 +21,20 @@ def assets() -> Path:
     if not (folder / "ycb" / "objects.json").is_file():
         pytest.skip(f"no real assets at {folder}: set DATAGEN_ASSETS to a folder with ycb/ and procthor/")
     return folder
+
+
+@pytest.fixture(scope="session")
+def s3_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Port of moto's S3 server on the loopback address."""
+    with moto_server(tmp_path_factory.mktemp("moto") / "log") as port:
+        yield port
+
+
+@pytest.fixture
+def bucket(s3_port: int, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A new bucket, as `s3://name`; the environment names its server."""
+    name = f"test-{secrets.token_hex(6)}"
+    make_bucket(s3_port, name)
+    for variable, value in environment(s3_port).items():
+        monkeypatch.setenv(variable, value)
+    return f"s3://{name}"

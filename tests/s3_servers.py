@@ -1,0 +1,209 @@
+"""An S3 server of one's own on the loopback address, and a proxy before it that misbehaves as told."""
+
+from __future__ import annotations
+
+import random
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections import Counter
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.client import HTTPConnection, HTTPException
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+_BROKEN = b"<Error><Code>InternalError</Code><Message>made up</Message></Error>"
+_BUSY = b"<Error><Code>SlowDown</Code><Message>made up</Message></Error>"
+_HOP = ("connection", "keep-alive", "transfer-encoding", "content-length", "date", "server")
+
+
+@contextmanager
+def moto_server(log: Path) -> Generator[int]:
+    """moto's S3 server in a process of its own; its port."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
+    with log.open("wb") as out:
+        command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
+    try:
+        end_s = time.monotonic() + 60
+        while True:
+            with suppress(OSError):
+                socket.create_connection(("127.0.0.1", port), 1).close()
+                break
+            if process.poll() is not None or time.monotonic() > end_s:
+                raise RuntimeError(f"moto did not start: {log.read_text()[-2000:]}")
+            time.sleep(0.05)
+        yield port
+    finally:
+        process.kill()
+        process.wait()
+
+
+def make_bucket(port: int, bucket: str) -> None:
+    """Make a bucket on a server."""
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/{bucket}", method="PUT")
+    urllib.request.urlopen(request, timeout=20).close()
+
+
+def environment(port: int) -> dict[str, str]:
+    """What tells a client to use the server at this port."""
+    return {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+        "AWS_ALLOW_HTTP": "true",
+        "AWS_REGION": "us-east-1",
+        "AWS_ACCESS_KEY_ID": "AKIAMADEUP",
+        "AWS_SECRET_ACCESS_KEY": "a-secret-that-nobody-may-see",
+        "NO_PROXY": "127.0.0.1",
+    }
+
+
+@dataclass
+class Faults:
+    """What the proxy does to requests. Chances are drawn request by request; `script` comes first."""
+
+    error: float = 0.0  # 500 or 503, and nothing was done
+    lost_answer: float = 0.0  # done, and yet answered 500
+    hold: float = 0.0  # no answer for `hold_s`; done or not, one time in two each
+    cut: float = 0.0  # done; the answer breaks off in the middle of its body
+    hold_s: float = 0.0
+    seed: int = 0
+    down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all is 503
+    forgets_create_only: bool = False  # a store that knows no If-None-Match
+    late_error_of_copies: int = 0  # copies that answer 200 with an error in the body, and are not made
+    script: list[str] = field(default_factory=list[str])  # kinds for the next requests, in turn
+    seen: Counter[str] = field(default_factory=Counter[str])
+    down: bool = False
+
+    def __post_init__(self) -> None:
+        self._random, self._lock = random.Random(self.seed), threading.Lock()
+
+    def kind(self) -> str:
+        """What becomes of the next request."""
+        with self._lock:
+            self.seen["requests"] += 1
+            if self.down_after and self.seen["requests"] > self.down_after[0]:
+                self.down_after.pop(0)
+                self.down = True
+            kind = "down" if self.down else self.script.pop(0) if self.script else self._drawn()
+            self.seen[kind] += 1
+            return kind
+
+    def _drawn(self) -> str:
+        at = self._random.random()
+        for kind, chance in {
+            "error": self.error,
+            "lost_answer": self.lost_answer,
+            "hold_before": self.hold / 2,
+            "hold_after": self.hold / 2,
+            "cut": self.cut,
+        }.items():
+            if at < chance:
+                return kind
+            at -= chance
+        return "pass"
+
+
+@contextmanager
+def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
+    """A proxy before the server at port `upstream` that does what `faults` says; its port."""
+    # One at a time: moto looks whether a key exists and writes it in two steps.
+    conditional = threading.Lock()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = True
+
+        def handle_any(self) -> None:
+            body = self.rfile.read(int(self.headers.get("content-length") or 0))
+            kind = faults.kind()
+            if kind in ("error", "down"):
+                status, text = random.choice([(500, _BROKEN), (503, _BUSY)])
+                return self._answer(status, {}, text)
+            if kind == "hold_before":
+                time.sleep(faults.hold_s)
+                return self._break_off()
+            status, headers, answer = self._forward(body)
+            if kind == "hold_after":
+                time.sleep(faults.hold_s)
+                return self._break_off()
+            if kind == "lost_answer":
+                return self._answer(500, {}, _BROKEN)
+            if kind == "cut" and self.command != "HEAD" and len(answer) > 1:
+                self._head(status, headers, len(answer))
+                self.wfile.write(answer[: len(answer) // 2])
+                return self._break_off()
+            return self._answer(status, headers, answer)
+
+        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any
+
+        def _forward(self, body: bytes) -> tuple[int, Mapping[str, str], bytes]:
+            headers = {k: v for k, v in self.headers.items() if k.lower() not in _HOP}
+            if "x-amz-copy-source" in self.headers and faults.late_error_of_copies > 0:
+                faults.late_error_of_copies -= 1
+                return 200, {"Content-Type": "application/xml"}, _BROKEN
+            if faults.forgets_create_only:
+                headers = {k: v for k, v in headers.items() if k.lower() != "if-none-match"}
+            if "if-none-match" in self.headers:
+                with conditional:
+                    return self._upstream(headers, body)
+            return self._upstream(headers, body)
+
+        def _upstream(self, headers: Mapping[str, str], body: bytes) -> tuple[int, Mapping[str, str], bytes]:
+            connection = HTTPConnection("127.0.0.1", upstream, timeout=60)
+            try:
+                connection.request(self.command, self.path, body, dict(headers))
+                answer = connection.getresponse()
+                data = answer.read()
+                kept = {k: v for k, v in answer.getheaders() if k.lower() not in _HOP}
+                if self.command == "HEAD":
+                    kept["Content-Length"] = answer.getheader("content-length") or "0"
+                return answer.status, kept, data
+            except (OSError, HTTPException):
+                return 503, {}, _BUSY
+            finally:
+                connection.close()
+
+        def _head(self, status: int, headers: Mapping[str, str], size: int) -> None:
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            if "Content-Length" not in headers:
+                self.send_header("Content-Length", str(size))
+            self.end_headers()
+
+        def _answer(self, status: int, headers: Mapping[str, str], data: bytes) -> None:
+            with suppress(OSError):  # whoever asked may have given up
+                self._head(status, headers, len(data))
+                if self.command != "HEAD":
+                    self.wfile.write(data)
+
+        def _break_off(self) -> None:
+            self.close_connection = True
+            with suppress(OSError):
+                self.connection.shutdown(socket.SHUT_RDWR)
+
+        def log_message(self, *_: Any) -> None:
+            return
+
+    class Server(ThreadingHTTPServer):
+        daemon_threads = True
+        request_queue_size = 128
+
+        def handle_error(self, *_: Any) -> None:
+            return  # a client that went away
+
+    server = Server(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    try:
+        yield server.server_address[1]
+    finally:
+        server.shutdown()
+        server.server_close()

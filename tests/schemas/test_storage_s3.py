@@ -1,0 +1,270 @@
+"""Storage on S3: the same verbs, one winner also behind a store that fails, errors of one line."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+
+import pytest
+
+from schemas.errors import InputError
+from schemas.storage import Storage, open_storage
+from schemas.storage_errors import StoreFailure
+from tests.s3_servers import Faults, environment, faulty_proxy
+
+Behind = Callable[[Faults], AbstractContextManager[Storage]]
+
+
+@pytest.fixture
+def behind(bucket: str, s3_port: int, monkeypatch: pytest.MonkeyPatch) -> Behind:
+    """A storage behind a proxy with faults."""
+
+    @contextmanager
+    def open_behind(faults: Faults) -> Iterator[Storage]:
+        with faulty_proxy(s3_port, faults) as port:
+            for name, value in environment(port).items():
+                monkeypatch.setenv(name, value)
+            monkeypatch.setenv("DATAGEN_STORE_TIMEOUT_S", "2")
+            yield open_storage(f"{bucket}/runs/a", probe=False)
+
+    return open_behind
+
+
+def test_the_verbs_are_those_of_a_folder(bucket: str):
+    s = open_storage(f"{bucket}/runs/a/")
+    assert (s.url, s.folder) == (f"{bucket}/runs/a", None)
+    s.put("a/b", b"12")
+    s.put("a/b", b"123")
+    s.put("ab/c", b"")
+    s.sync(["a/b"])
+    assert s.get("a/b", 10) == b"123" and s.get("a/none", 10) is None
+    assert [(f.key, f.size) for f in s.list("a")] == [("a/b", 3)]
+    assert sorted(f.key for f in s.list("")) == ["a/b", "ab/c"]
+    assert list(s.list("none")) == []
+    s.link_or_copy("a/b", "x/y")
+    s.delete(["a/b", "a/none"])
+    assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
+    again: Storage = pickle.loads(pickle.dumps(s))
+    assert again.get("x/y", 9) == b"123"
+    assert s.below("x").get("y", 9) == b"123"
+    with pytest.raises(InputError, match="3 bytes, more than the 2"):
+        s.get("x/y", 2)
+    with pytest.raises(InputError, match="not the name of a file below the root"):
+        s.get("../b/secret", 9)
+    assert open_storage(bucket).get("runs/a/x/y", 9) == b"123"
+
+
+def test_many_files_at_once_come_back_in_order(bucket: str):
+    s = open_storage(bucket)
+    files = {f"k/{i:03d}": b"%d" % i for i in range(60)}
+    s.put_many(files)
+    keys = [*reversed(files), "none"]
+    assert list(s.get_many(keys, 9)) == [*((k, files[k]) for k in reversed(files)), ("none", None)]
+    stamps = {f.key: f.stamp for f in s.list("k")}
+    assert stamps.keys() == files.keys() and all(stamps.values())
+    s.put("k/000", b"other")
+    changed = {f.key for f in s.list("k") if f.stamp != stamps[f.key]}
+    assert changed == {"k/000"}
+    with pytest.raises(InputError, match="more than the 1 that"):
+        list(s.get_many(files, 1))
+    s.delete(files)
+    assert list(s.list("k")) == []
+
+
+def test_a_file_is_adopted_from_wherever_it_lies(bucket: str, tmp_path):
+    local = open_storage(tmp_path)
+    a, b = open_storage(f"{bucket}/a"), open_storage(f"{bucket}/b/c")
+    local.put("x", b"local")
+    a.adopt(local, "x", "from/local")
+    b.adopt(a, "from/local", "from/a")
+    local.adopt(b, "from/a", "back")
+    assert (b.get("from/a", 9), local.get("back", 9)) == (b"local", b"local")
+    for ours, theirs in ((a, b), (a, local), (local, a)):
+        with pytest.raises(InputError, match="none: no such file"):
+            ours.adopt(theirs, "none", "y")
+    with pytest.raises(InputError, match="more than the 2"):
+        a.adopt(local, "x", "y", limit_bytes=2)
+
+
+def test_of_racing_writers_exactly_one_wins(behind: Behind):
+    with behind(Faults()) as s:
+        for round_ in range(5):
+            barrier = threading.Barrier(4)
+
+            def race(me: int, key: str = f"c/{round_}", barrier: threading.Barrier = barrier) -> bool:
+                barrier.wait()
+                return s.put_new(key, b"%d" % me * 1000)
+
+            with ThreadPoolExecutor(4) as pool:
+                won = list(pool.map(race, range(4)))
+            assert sum(won) == 1
+            assert s.get(f"c/{round_}", 5000) == b"%d" % won.index(True) * 1000
+
+
+def test_what_was_done_and_answered_by_an_error_is_done(behind: Behind):
+    faults = Faults(hold_s=3.0)
+    with behind(faults) as s:
+        # What happens to the request of the first writer, and to that of one who comes too late.
+        for i, (first, second) in enumerate([("lost_answer", "hold_before"), ("hold_after", "error")]):
+            faults.script = [first]
+            assert s.put_new(f"c/{i}", b"ours")
+            assert s.put_new(f"c/{i}", b"ours")
+            faults.script = [second]
+            assert not s.put_new(f"c/{i}", b"theirs")
+            assert s.get(f"c/{i}", 9) == b"ours"
+        for verb in (
+            lambda: s.put("p", b"1"),
+            lambda: s.delete(["p", "none"]),
+            lambda: s.link_or_copy("c/0", "copy"),
+            lambda: s.exists("c/0"),
+        ):
+            faults.script = ["lost_answer"]
+            verb()
+        assert (s.exists("p"), s.get("copy", 9)) == (False, b"ours")
+
+
+def test_answers_that_break_off_are_asked_for_again(behind: Behind):
+    faults = Faults()
+    with behind(faults) as s:
+        s.put_many({f"k/{i}": b"%d" % i * 1000 for i in range(20)})
+        faults.script = ["cut", "cut"]
+        assert s.get("k/7", 2000) == b"7" * 1000
+        faults.script = ["cut", "error", "cut"]
+        assert len(list(s.list("k"))) == 20
+        faults.script = ["cut", "error", "lost_answer"] * 4
+        assert len(dict(s.get_many([f"k/{i}" for i in range(20)], 2000))) == 20
+        faults.late_error_of_copies = 1
+        s.link_or_copy("k/1", "copy")
+        assert s.get("copy", 2000) == b"1" * 1000
+
+
+def test_a_store_that_ignores_create_only_is_refused(behind: Behind, bucket: str):
+    with behind(Faults(forgets_create_only=True)):
+        with pytest.raises(InputError, match="create-only writes are not honoured here") as e:
+            open_storage(f"{bucket}/runs/a")
+        assert bucket in str(e.value) and "\n" not in str(e.value)
+        assert list(open_storage(bucket, probe=False).list("")) == []
+
+
+def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypatch: pytest.MonkeyPatch):
+    faults = Faults()
+    with behind(faults) as s:
+        monkeypatch.setenv("DATAGEN_STORE_TIMEOUT_S", "0.4")
+        s = open_storage(s.url)
+        faults.down = True
+        for verb in (
+            lambda: s.put_new("a", b""),
+            lambda: s.get("a", 9),
+            lambda: list(s.list("")),
+            lambda: s.put_many({"a": b"", "b": b""}),
+        ):
+            before = faults.seen["requests"]
+            with pytest.raises(StoreFailure, match=r"the store answers 50[03] .*Wait until the store") as e:
+                verb()
+            assert faults.seen["requests"] - before >= 2
+            assert "\n" not in str(e.value) and "made up" not in str(e.value)
+
+
+@contextmanager
+def answering(answer: bytes | None) -> Iterator[int]:
+    """A port where every connection gets this answer, or none."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        held: list[socket.socket] = []
+
+        def serve() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                held.append(connection)
+                if answer is not None:
+                    connection.recv(65536)
+                    connection.sendall(answer)
+                    connection.close()
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield server.getsockname()[1]
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def answer(status: str, code: str) -> bytes:
+    body = f"<Error><Code>{code}</Code><Message>the key AKIAMADEUP is bad</Message></Error>".encode()
+    return f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body
+
+
+@pytest.mark.parametrize(
+    ("reply", "problem"),
+    [
+        (answer("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Check AWS_ACCESS_KEY_ID"),
+        (answer("403 Forbidden", "SignatureDoesNotMatch"), "access denied (SignatureDoesNotMatch)"),
+        (answer("400 Bad Request", "ExpiredToken"), "access denied (ExpiredToken)"),
+        (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Make the bucket first"),
+        (answer("301 Moved", "PermanentRedirect"), "the bucket is in another region. Set AWS_REGION"),
+        (answer("501 Not Implemented", "NotImplemented"), "the store refuses (501 NotImplemented)"),
+        (answer("503 Slow Down", "SlowDown"), "the store answers 503 SlowDown. Wait until"),
+        (b"SSH-2.0-OpenSSH\r\n\r\n", "is not that of an S3 store. Check that AWS_ENDPOINT_URL"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "is not that of an S3 store"),
+        (None, "the store does not answer in time. Check the network, or allow more with"),
+    ],
+)
+def test_every_trouble_is_one_line_with_its_mend(
+    reply: bytes | None, problem: str, monkeypatch: pytest.MonkeyPatch
+):
+    with answering(reply) as port:
+        told_of(port, problem, monkeypatch)
+
+
+def test_a_port_where_nobody_listens(monkeypatch: pytest.MonkeyPatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    told_of(port, "the store cannot be reached (the connection fails). Check AWS_ENDPOINT_URL", monkeypatch)
+
+
+def told_of(port: int, problem: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in environment(port).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("DATAGEN_STORE_TIMEOUT_S", "0.3")
+    s = open_storage("s3://bucket/runs/a", probe=False)
+    for verb in (lambda: s.put_new("commits/7", b"x"), lambda: list(s.list("commits"))):
+        start_s = time.monotonic()
+        with pytest.raises(StoreFailure) as e:
+            verb()
+        told = str(e.value)
+        assert problem in told and told.startswith("s3://bucket/runs/a/commits")
+        assert "\n" not in told and "AKIA" not in told and "secret" not in told and "127.0.0.1" not in told
+        assert time.monotonic() - start_s < 60  # the bound is far below; a hang is not
+
+
+def test_addresses_and_settings_that_cannot_be_used(bucket: str, monkeypatch: pytest.MonkeyPatch):
+    for place, problem in [
+        ("s3://", "does not name a bucket"),
+        ("s3:///x", "does not name a bucket"),
+        ("s3://B_/x", "does not name a bucket"),
+        ("s3://key:secret@bucket/x", "holds more than a bucket and a prefix"),
+        ("s3://bucket/x?secret=1", "holds more than a bucket and a prefix"),
+        ("s3://bucket/../x", "has an empty part, or one of dots"),
+        ("s3://bucket/a//b", "has an empty part, or one of dots"),
+        ("gs://bucket/x", "neither a folder nor an s3:// address"),
+    ]:
+        with pytest.raises(InputError, match=problem) as e:
+            open_storage(place)
+        assert "secret" not in str(e.value)
+    for name, value, problem in [
+        ("DATAGEN_STORE_TIMEOUT_S", "soon", "is not such a number"),
+        ("AWS_ALLOW_HTTP", "", r"is not encrypted \(http\). Set AWS_ALLOW_HTTP=true"),
+        ("AWS_ENDPOINT_URL", "not an address", "is not the address of a store"),
+        ("AWS_ENDPOINT_URL", "http://key:secret@host", "is not the address of a store"),
+        ("AWS_ENDPOINT_URL", "ftp://host", "is not the address of a store"),
+        ("AWS_ENDPOINT_URL", "http://[::", "is not the address of a store"),
+    ]:
+        with monkeypatch.context() as m:
+            m.setenv(name, value)
+            with pytest.raises(InputError, match=problem) as e:
+                open_storage(f"{bucket}/x")
+            assert name in str(e.value) and "secret" not in str(e.value)
