@@ -28,7 +28,7 @@ class Finding:
 def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: ShardTask) -> None:
     """Raise InputError that names the first machine that cannot make the run's shards.
 
-    `ask(function, *arguments, patience_s=...)` gives each other machine's answer by its address. A
+    `ask(function, *arguments, patience_s=...)` gives each other machine's answer by its name. A
     machine is fit when it sees this very run and can write to it, finds the sources, and has the
     same versions of what moves bits of labels. One that does not answer in time is passed over.
     """
@@ -39,8 +39,8 @@ def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: Sh
     finally:
         run.storage.delete([probe])
     here = versions_of(names)
-    for address, finding in sorted(found.items()):
-        place = f"machine {address}"
+    for machine, finding in sorted(found.items()):
+        place = f"machine {machine}"
         if finding.problem:
             raise InputError(place, "", finding.problem, _SHARED)
         if others := {n: v for n, v in finding.versions.items() if v != here[n]}:

@@ -61,7 +61,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         import ray
         from ray.exceptions import AuthenticationError
 
-        _forget_former_token()
+        forget_former_token()
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except (ConnectionError, ValueError, TimeoutError, AuthenticationError) as error:
@@ -174,7 +174,7 @@ def _turns_away(address: str, token: str | None) -> bool:
     return False
 
 
-def _forget_former_token() -> None:
+def forget_former_token() -> None:
     """Let Ray read its environment again: it keeps what it read once, in this process."""
     from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
 

@@ -13,9 +13,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from cluster.guard import Meter, collect_remains, guarded, obituary, resident_bytes
+from cluster.guard import Meter, Remains, collect_remains, guarded, obituary, resident_bytes
 from cluster.ray_cluster import RaySettings, first_line
-from cluster.ray_nodes import OtherNodes, attempts_begun, end_attempts, forget_job, remains_of
+from cluster.ray_nodes import (
+    OtherNodes,
+    Question,
+    attempts_begun,
+    end_attempts,
+    forget_job,
+    remains_of,
+)
 from cluster.task import AttemptReport, Product, Task
 from schemas.run_records import Outcome
 
@@ -23,6 +30,8 @@ _SLOTS_SEEN_FOR_S = 5.0
 _BEGUN_SEEN_FOR_S = 1.0
 # A forced cancellation ends a worker that heeds Ray at once; after this, others are ended by their note.
 _HEEDS_RAY_WITHIN_S = 1.0
+# How long other machines are waited for; they may have to start a process first.
+_BEGUN_WITHIN_S, _REMAINS_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
 
 T = TypeVar("T", bound=Task)
 
@@ -34,6 +43,14 @@ class _Death(Generic[T]):
     task: T
     outcome: Outcome
     cause: str
+
+
+@dataclass
+class _Inquest(Generic[T]):
+    """Deaths without remains on this machine, and what the other machines say of them."""
+
+    deaths: list[_Death[T]]
+    question: Question
 
 
 class RayExecutor(Generic[T]):
@@ -53,6 +70,7 @@ class RayExecutor(Generic[T]):
         self._work = ray.remote(**options)(work)
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
+        self._inquests: list[_Inquest[T]] = []
         self._killed: dict[str, float] = {}  # attempts to end, and when to do so by their notes elsewhere
         self._slots, self._slots_until_s = 1, 0.0
         self._begun_elsewhere: set[str] = set()
@@ -73,17 +91,22 @@ class RayExecutor(Generic[T]):
         self._jobs.add(task.notes)
 
     def wait(self, timeout_s: float) -> list[AttemptReport]:
-        if not self._tasks:
-            time.sleep(timeout_s)
-            return []
+        asked = [ref for inquest in self._inquests for ref in inquest.question.silent]
+        if not self._tasks and not asked:
+            if not self._inquests:
+                time.sleep(timeout_s)
+            return self._ended_inquests()
         self._end_stubborn()
-        refs = list(self._tasks)
+        refs = [*self._tasks, *asked]
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready:  # take along whatever else has ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
-        ended = [self._answer(ref) for ref in ready]
-        deaths = [death for death in ended if isinstance(death, _Death)]
-        return [r for r in ended if not isinstance(r, _Death)] + (self._obituaries(deaths) if deaths else [])
+        for inquest in self._inquests:
+            self.others.hear(inquest.question, ready)
+        ended = [self._answer(ref) for ref in ready if ref in self._tasks]
+        reports = [answer for answer in ended if not isinstance(answer, _Death)]
+        reports += self._obituaries([answer for answer in ended if isinstance(answer, _Death)])
+        return reports + self._ended_inquests()
 
     def has_begun(self, attempt: str) -> bool:
         ref = self._refs.get(attempt)
@@ -95,7 +118,9 @@ class RayExecutor(Generic[T]):
             self._begun_elsewhere = {
                 begun
                 for notes, flying in self._by_notes(self._tasks.values()).items()
-                for answer in self.others.ask(attempts_begun, notes, flying).values()
+                for answer in self.others.ask(
+                    attempts_begun, notes, flying, patience_s=_BEGUN_WITHIN_S
+                ).values()
                 for begun in answer
             }
             self._begun_until_s = time.monotonic() + _BEGUN_SEEN_FOR_S
@@ -112,7 +137,7 @@ class RayExecutor(Generic[T]):
     def close(self) -> None:
         """Remove what the job's workers left on other machines."""
         for notes in self._jobs - {""}:
-            self.others.ask(forget_job, notes)
+            self.others.ask(forget_job, notes, patience_s=_FORGOTTEN_WITHIN_S)
         self._jobs.clear()
 
     def _end_stubborn(self) -> None:
@@ -124,7 +149,7 @@ class RayExecutor(Generic[T]):
         self._killed.update(dict.fromkeys(due, float("inf")))
         stubborn = [self._tasks[ref] for a in due if (ref := self._refs.get(a)) is not None]
         for notes, attempts in self._by_notes(stubborn).items():
-            self.others.tell(end_attempts, notes, attempts)
+            self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # nothing is waited for
 
     def _memory(self, factor: float) -> dict[str, int]:
         if not self._settings.memory_bytes:
@@ -153,19 +178,41 @@ class RayExecutor(Generic[T]):
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
 
     def _obituaries(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
-        """Reports of dead attempts from what they left, on this machine or, asked in one go, on others."""
-        left = {d.task.attempt: collect_remains(d.task.notes, d.task.attempt) for d in deaths}
-        elsewhere = [d.task for d in deaths if left[d.task.attempt].note is None]
-        if elsewhere and self.others.alive():
-            for notes, attempts in self._by_notes(elsewhere).items():
-                for answer in self.others.ask(remains_of, notes, attempts).values():
-                    left |= answer
-            # A worker that died left its note on its machine. Where none has it, the machine went too.
-            gone = "its worker and the machine that had it are gone"
-            for i, d in enumerate(deaths):
-                if d.outcome == "crashed" and left[d.task.attempt].note is None:
-                    deaths[i] = _Death(d.task, "lost", gone)
-        return [obituary(d.task, d.outcome, d.cause, left[d.task.attempt]) for d in deaths]
+        """Reports of dead attempts from what they left here; other machines are asked about the rest."""
+        reports: list[AttemptReport] = []
+        unknown: dict[str, list[_Death[T]]] = defaultdict(list)
+        has_others = bool(deaths) and bool(self.others.alive())
+        for death in deaths:
+            remains = collect_remains(death.task.notes, death.task.attempt)
+            is_elsewhere = remains.note is None and death.outcome != "lost" and bool(death.task.notes)
+            if has_others and is_elsewhere:
+                unknown[death.task.notes].append(death)
+            else:
+                reports.append(obituary(death.task, death.outcome, death.cause, remains))
+        for notes, found in unknown.items():
+            attempts = [death.task.attempt for death in found]
+            question = self.others.put(remains_of, notes, attempts, patience_s=_REMAINS_WITHIN_S)
+            self._inquests.append(_Inquest(found, question))
+        return reports
+
+    def _ended_inquests(self) -> list[AttemptReport]:
+        """Reports of those whose remains were found, or that no machine knows of."""
+        reports: list[AttemptReport] = []
+        now_s = time.monotonic()
+        for inquest in list(self._inquests):
+            question, left = inquest.question, dict[str, Remains]()
+            for answer in question.answers.values():
+                left |= answer
+            if question.silent and len(left) < len(inquest.deaths) and now_s < question.until_s:
+                continue
+            self._inquests.remove(inquest)
+            for death in inquest.deaths:
+                remains, outcome, cause = left.get(death.task.attempt), death.outcome, death.cause
+                # A worker that died left its note on its machine. Where none has it, the machine went too.
+                if remains is None and outcome == "crashed":
+                    outcome, cause = "lost", "its worker is gone, and the machine that had it does not answer"
+                reports.append(obituary(death.task, outcome, cause, remains or Remains()))
+        return reports
 
     @staticmethod
     def _by_notes(tasks: Iterable[T]) -> dict[str, list[str]]:

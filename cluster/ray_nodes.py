@@ -6,14 +6,23 @@ import os
 import platform
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from cluster.guard import Remains, clear_notes, collect_remains, read_note
 
-_PATIENCE_S = 10.0  # a machine may have to start a process first
 _MUTE_S = 30.0  # a machine that did not answer is left alone for so long
+
+
+@dataclass
+class Question:
+    """A question to every other machine, and the answers so far, by the machine's name."""
+
+    silent: dict[Any, tuple[str, str]]  # reference to the answer -> the machine's id and name
+    until_s: float  # when those that are still silent are given up
+    answers: dict[str, Any] = field(default_factory=dict)
 
 
 class OtherNodes:
@@ -28,48 +37,55 @@ class OtherNodes:
         # The client of `ray://` runs on no machine of the cluster.
         self._own = "" if address.startswith("ray://") else str(ray.get_runtime_context().get_node_id())
         self._mute_until_s: dict[str, float] = {}
+        self._tasks: dict[Callable[..., Any], Any] = {}  # each is sent to the cluster once
 
     def alive(self) -> dict[str, str]:
-        """Address of each living machine but the driver's, by id."""
+        """Name of each living machine but the driver's, by id: address, and what tells neighbours apart."""
         return {
-            node["NodeID"]: node["NodeManagerAddress"]
+            node["NodeID"]: f"{node['NodeManagerAddress']} (node {node['NodeID'][:12]})"
             for node in self._ray.nodes()
             if node["Alive"] and node["NodeID"] != self._own
         }
 
-    def ask(
-        self, function: Callable[..., Any], *arguments: Any, patience_s: float = _PATIENCE_S
-    ) -> dict[str, Any]:
-        """What `function(*arguments)` gives on each machine, by its address, of those that answer in time."""
-        refs, answers = self._send(function, arguments), {}
-        if not refs:
-            return {}
-        ready, silent = self._ray.wait(list(refs), num_returns=len(refs), timeout=patience_s)
-        for ref in ready:
-            try:
-                answers[refs[ref][1]] = self._ray.get(ref)
-            except self._ray.exceptions.RayError:  # the machine went, or cannot load this package
-                continue
-        for ref in silent:
-            self._mute_until_s[refs[ref][0]] = time.monotonic() + _MUTE_S
-        return answers
+    def ask(self, function: Callable[..., Any], *arguments: Any, patience_s: float) -> dict[str, Any]:
+        """What `function(*arguments)` gives on each machine, by its name, of those that answer in time.
 
-    def tell(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Have `function(*arguments)` run on each machine, without waiting for it."""
-        self._send(function, arguments)
+        Waits for them, but leaves those alone for a while that were silent at the last time.
+        """
+        now_s = time.monotonic()
+        deaf = [node for node, until_s in self._mute_until_s.items() if now_s < until_s]
+        question = self.put(function, *arguments, patience_s=patience_s, but=deaf)
+        while question.silent and (left_s := question.until_s - time.monotonic()) > 0:
+            ready, _ = self._ray.wait(list(question.silent), num_returns=1, timeout=left_s)
+            self.hear(question, ready)
+        self._mute_until_s |= dict.fromkeys((n for n, _ in question.silent.values()), now_s + _MUTE_S)
+        return question.answers
 
-    def _send(self, function: Callable[..., Any], arguments: Sequence[Any]) -> dict[Any, tuple[str, str]]:
+    def put(
+        self, function: Callable[..., Any], *arguments: Any, patience_s: float, but: Sequence[str] = ()
+    ) -> Question:
+        """Put a question to every machine that is not among `but`, without waiting for answers."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        options: dict[str, Any] = {"num_cpus": 0, "max_retries": 0}
-        work, now_s = self._ray.remote(**options)(function), time.monotonic()
+        if function not in self._tasks:
+            options: dict[str, Any] = {"num_cpus": 0, "max_retries": 0}
+            self._tasks[function] = self._ray.remote(**options)(function)
         sent: dict[Any, tuple[str, str]] = {}
-        for node, address in self.alive().items():
-            if self._mute_until_s.get(node, 0.0) <= now_s:
+        for node, name in self.alive().items():
+            if node not in but:
                 pinned = NodeAffinitySchedulingStrategy(node, soft=False)
-                ref = work.options(scheduling_strategy=pinned).remote(*arguments)
-                sent[ref] = (node, address)
-        return sent
+                ref = self._tasks[function].options(scheduling_strategy=pinned).remote(*arguments)
+                sent[ref] = (node, name)
+        return Question(sent, time.monotonic() + patience_s)
+
+    def hear(self, question: Question, ready: Iterable[Any]) -> None:
+        """Take the answers that have come among these references."""
+        for ref in [r for r in ready if r in question.silent]:
+            _, name = question.silent.pop(ref)
+            try:
+                question.answers[name] = self._ray.get(ref)
+            except self._ray.exceptions.RayError:  # the machine went, or cannot load this package
+                continue
 
 
 # What the machines are asked; each of these runs there.

@@ -24,11 +24,12 @@ class ScriptedTask:
     notes: str
     words: tuple[str, ...] = ()
     memory_factor: float = 1.0
+    tries: str = ""  # folder that counts attempts, one file each; "" is beside the notes
 
 
 def perform(task: ScriptedTask, meter: Meter) -> Product:
-    """The task function. Attempts are counted by files beside the notes."""
-    tries = Path(task.notes).parent / "tries"
+    """The task function. Attempts are counted by files."""
+    tries = Path(task.tries) if task.tries else Path(task.notes).parent / "tries"
     tries.mkdir(exist_ok=True)
     n = len(list(tries.glob(f"{task.shard}-*")))
     (tries / f"{task.shard}-{n}-{os.getpid()}").touch()
@@ -43,6 +44,10 @@ def misbehave(word: str) -> None:
         ctypes.string_at(0)
     elif word == "exit":
         os._exit(3)
+    elif word == "silent_exit":
+        os._exit(0)
+    elif word == "abort":
+        os.abort()
     elif word == "system_exit":
         raise SystemExit(2)
     elif word == "kill":

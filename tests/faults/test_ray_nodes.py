@@ -1,0 +1,142 @@
+"""Several machines: what dies on another one is seen, ended and accounted for as if it were here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cluster.books import RunBooks, close_lost_attempts
+from cluster.driver import Order, drive
+from cluster.guard import notes_of_a_job
+from cluster.policy import Policy
+from cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
+from cluster.ray_executor import RayExecutor
+from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
+from cluster.stop import StopRequest
+from cluster.tally import Tally
+from schemas.run import Run
+from tests.cluster.simulated import Heard, PaperBooks
+from tests.faults.job import RandomRows, make_rows
+from tests.faults.scripted import ScriptedTask, perform
+from tests.made_runs import make_run
+
+POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
+
+
+@dataclass
+class Machines:
+    """A head without slots, where the driver is, and two machines of one slot with folders of their own."""
+
+    ray: Any
+    cluster: Any
+    folder: Path
+    settings: RaySettings
+    first: Any
+    second: Any
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    folder = tmp_path_factory.mktemp("machines")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in head_environment(new_token()).items():
+            patch.setenv(name, value)
+        # A machine that is gone is noticed within two seconds instead of twenty.
+        patch.setenv("RAY_health_check_period_ms", "500")
+        patch.setenv("RAY_health_check_failure_threshold", "3")
+        from ray.cluster_utils import Cluster
+
+        forget_former_token()
+        cluster = Cluster()
+
+        def add(name: str, slots: int) -> Any:
+            for part in ("tmp", "home"):
+                (folder / name / part).mkdir(parents=True)
+            own = {"TMPDIR": str(folder / name / "tmp"), "HOME": str(folder / name / "home")}
+            return cluster.add_node(
+                num_cpus=slots, object_store_memory=OBJECT_STORE_BYTES, include_dashboard=False, env_vars=own
+            )
+
+        add("head", 0)
+        first, second = add("first", 1), add("second", 1)
+        settings = RaySettings(address=cluster.address)
+        with ray_cluster(settings) as ray:
+            yield Machines(ray, cluster, folder, settings, first, second)
+        cluster.shutdown()
+
+
+def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
+    machines: Machines, tmp_path: Path
+) -> None:
+    words = {0: ("segfault",), 1: ("hang_with_lock",), 2: ("stop",), 3: ("silent_exit",), 4: ("raise",)}
+    (tmp_path / "tries").mkdir()
+    executor, books = RayExecutor(perform, machines.settings, machines.ray), PaperBooks()
+    with notes_of_a_job() as notes:
+
+        def make_task(order: Order) -> ScriptedTask:
+            script = words.get(order.shard, ())
+            # A stopped process has no clock; the driver's own deadline comes for it.
+            return ScriptedTask(
+                order.shard, order.attempt, 1.5, notes, script, order.memory_factor, str(tmp_path / "tries")
+            )
+
+        policy = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=4, grace_s=0.5)
+        summary = drive(range(8), make_task, executor, books, policy, Heard(), StopRequest())
+        left = [str(p) for p in machines.folder.rglob("*.stack")]
+        executor.close()
+    assert summary.tally.committed == 8
+    ends = {s: [e for e in books.entries if e.shard == s] for s in words}
+    assert {s: [e.outcome for e in of] for s, of in ends.items()} == {
+        0: ["crashed", "committed"],
+        1: ["hung", "committed"],
+        2: ["hung", "committed"],
+        3: ["crashed", "committed"],
+        4: ["failed", "committed"],
+    }
+    first = {s: of[0] for s, of in ends.items()}
+    assert first[0].cause == "Fatal Python error: Segmentation fault" and "misbehave" in first[0].stack
+    assert "deadline of 1.5 s" in first[1].cause and "misbehave" in first[1].stack
+    assert "ended by the driver" in first[2].cause
+    assert all(e.host is not None and e.host.pid > 0 and e.cost is not None for e in first.values())
+    assert left == [] and list(machines.folder.rglob("datagen-notes-*")) == []
+
+
+def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path: Path) -> None:
+    run, slots = make_run(tmp_path / "run", n=12 * 10, shards=()), machines.cluster
+    undisturbed = make_run(tmp_path / "undisturbed", n=12 * 10)
+    executor = RayExecutor(make_rows, machines.settings, machines.ray)
+    gone: list[str] = []
+
+    with notes_of_a_job() as notes:
+
+        def second_is_at_work() -> bool:
+            return any((machines.folder / "second" / "tmp" / notes).glob("*.stack"))
+
+        def kill_the_second(tally: Tally) -> None:
+            if not gone and tally.committed >= 3 and second_is_at_work():
+                gone.append("second")
+                slots.remove_node(machines.second, allow_graceful=False)
+
+        def make_task(order: Order) -> RandomRows:
+            return RandomRows(run.storage.url, 0.3, order.shard, order.attempt, order.deadline_s, notes)
+
+        heard = Heard(on_tick=kill_the_second)
+        summary = drive(run.missing(), make_task, executor, RunBooks(run), POLICY, heard, StopRequest())
+        executor.close()
+    assert gone and summary.end == "complete" and run.committed() == set(range(12))
+    assert close_lost_attempts(run) == 0
+    outcomes = [e.outcome for e in run.ledger.ends()]
+    assert outcomes.count("committed") == 12 and set(outcomes) == {"committed", "lost"}
+    assert run.quarantined() == set()
+    assert files_of_shards(run) == files_of_shards(undisturbed)
+
+
+def files_of_shards(run: Run) -> dict[int, list[tuple[str, str]]]:
+    """Names and digests of every committed file, checked against the disk."""
+    for shard in run.committed():
+        run.check_digests(run.commit_of(shard))
+    return {s: sorted((f.path, f.sha256) for f in run.commit_of(s).files) for s in run.committed()}
