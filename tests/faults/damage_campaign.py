@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,18 +39,19 @@ class Campaign:
     """How many damages of each kind there were, and those that went wrong."""
 
     tried: Counter[str] = field(default_factory=Counter[str])
+    mended: Counter[str] = field(default_factory=Counter[str])
     missed: list[str] = field(default_factory=list[str])
     not_restored: list[str] = field(default_factory=list[str])
     not_clean: list[str] = field(default_factory=list[str])
 
-    def rows(self) -> Iterator[tuple[str, int, int, int, int]]:
-        """(kind, tried, missed, not restored, not clean after), by kind."""
+    def rows(self) -> Iterator[tuple[str, int, int, int, int, int]]:
+        """(kind, tried, missed, mended, not restored, not clean after), by kind."""
         for kind in sorted(self.tried):
             counts = [
                 sum(one.startswith(f"{kind} ") for one in bad)
                 for bad in (self.missed, self.not_restored, self.not_clean)
             ]
-            yield kind, self.tried[kind], counts[0], counts[1], counts[2]
+            yield kind, self.tried[kind], counts[0], self.mended[kind], counts[1], counts[2]
 
 
 def make_place(folder: Path, n: int = 19, scenes_per_shard: int = 2, candidates_per_scene: int = 5) -> Run:
@@ -107,17 +108,23 @@ def keys_of(folder: Path) -> list[str]:
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
 
 
-def try_all(clean: Path, scratch: Path, damages: Iterator[Damage], campaign: Campaign) -> None:
-    """Do each damage to a run equal to `clean`, check it, mend it, and check it again."""
+def try_all(
+    clean: Path, scratch: Path, damages: Iterable[Damage], campaign: Campaign, mend_every: int = 1
+) -> None:
+    """Do each damage to a run equal to `clean` and check it; mend every so many of them, and check again."""
     shutil.rmtree(scratch, ignore_errors=True)
     copy_run(clean, scratch)
     whole = {key: (clean / key).read_bytes() for key in keys_of(clean)}
-    for damage in damages:
+    for number, damage in enumerate(damages):
         campaign.tried[damage.kind] += 1
         name = f"{damage.kind} {damage.key}"
-        apply(scratch, damage)
+        undo = apply(scratch, damage)
         if not [f for f in findings_at(scratch) if f.is_damage]:
             campaign.missed.append(name)
+        if number % mend_every:
+            undo()
+            continue
+        campaign.mended[damage.kind] += 1
         mended = mend_at(scratch)
         if mended.changed:
             campaign.not_restored.append(f"{name}: also touched {mended.changed[:3]}")
@@ -151,13 +158,19 @@ def copy_run(source: Path, target: Path) -> None:
             linked[inode] = to
 
 
-def apply(folder: Path, damage: Damage) -> None:
-    """Change the file in place, so that its hard links change with it; or remove its name."""
-    path = folder / damage.key
-    data = damage.change(path.read_bytes())
+def apply(folder: Path, damage: Damage) -> Callable[[], None]:
+    """Change the file in place, so that its hard links change with it, or remove its name; what undoes it."""
+    path, held = folder / damage.key, folder.parent / "held"
+    before = path.read_bytes()
+    data = damage.change(before)
     if data is None:
-        path.unlink()
-        return
+        path.rename(held)
+        return lambda: held.rename(path) and None
+    _overwrite(path, data)
+    return lambda: _overwrite(path, before)
+
+
+def _overwrite(path: Path, data: bytes) -> None:
     mode = path.stat().st_mode
     path.chmod(0o644)
     with path.open("r+b") as f:
