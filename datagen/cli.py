@@ -40,6 +40,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "replay": ("datagen.replay:replay", "One sample's scene made again, beside what is stored."),
     "relabel": ("datagen.relabel:relabel", "Labels by another rule, from stored distances."),
     "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
+    "gc": ("datagen.gc:gc", "Remove what a run holds and nothing names."),
     "show": ("datagen.show:show", "A picture of one scene of a run."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),

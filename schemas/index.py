@@ -113,12 +113,10 @@ def refresh(run: Run) -> int:
         "ends": _ends_of(run.ledger.stamps()),
         "commits": run.commit_stamps(),
     }
-    new, spent = 0, set[str]()
+    new, spent = 0, set(unreadable_files(run))
     pending: dict[Kind, HeadTable] = {kind: table_of(kind, []) for kind in _KINDS}
     known: dict[Kind, set[str]] = {kind: set() for kind in _KINDS}
-    readable: set[str] = set()
     for key, table in _read_tables(run):
-        readable.add(key)
         names, current = known[table.kind], stamps[table.kind]
         rows = [
             row
@@ -130,7 +128,6 @@ def refresh(run: Run) -> int:
             spent.add(key)
             if rows:
                 pending[table.kind] = _flushed(run, joined(pending[table.kind], table.take(rows)))
-    spent |= set(index_files(run)) - readable  # damaged, or of another run
     for kind in _KINDS:
         missing = [name for name in stamps[kind] if name not in known[kind]]
         read: list[tuple[str, str, AnyHead]] = []
@@ -157,6 +154,12 @@ def refresh(run: Run) -> int:
 def index_files(run: Run) -> list[str]:
     """Keys of the index's files."""
     return sorted(file.key for file in run.storage.list(_FOLDER) if _FILE.fullmatch(file.key))
+
+
+def unreadable_files(run: Run) -> list[str]:
+    """Keys of files of the index that are damaged, or of another run: they hold nothing."""
+    readable = {key for key, _ in _read_tables(run)}
+    return [key for key in index_files(run) if key not in readable]
 
 
 def _flushed(run: Run, table: HeadTable) -> HeadTable:

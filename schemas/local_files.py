@@ -131,6 +131,19 @@ class LocalFiles:
                 finally:
                     os.close(here)
 
+    def remove_empty(self, folder: str) -> None:
+        """Remove a folder with the folders in it, as far as they hold no file."""
+        folders, name = _split(folder)
+        with suppress(FileNotFoundError):
+            here = self._walk(folders)
+            try:
+                for _, below, _, fd in os.fwalk(name, topdown=False, dir_fd=here):
+                    for child in below:
+                        _remove_folder(child, fd)
+                _remove_folder(name, here)
+            finally:
+                os.close(here)
+
     def take(self, source: LocalFiles, source_key: str, key: str) -> None:
         """A second name for a file of `source`, or a copy where no link can be; replaces an older file."""
         from_folders, from_name = _split(source_key)
@@ -269,6 +282,14 @@ def _drafted(name: str, folder: int) -> Generator[str]:
 def _split(key: str) -> tuple[tuple[str, ...], str]:
     *folders, name = key.split("/")
     return tuple(folders), name
+
+
+def _remove_folder(name: str, here: int) -> None:
+    try:
+        os.rmdir(name, dir_fd=here)
+    except OSError as e:
+        if e.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT, errno.ENOTDIR):
+            raise
 
 
 def _with_parents(folders: tuple[str, ...]) -> Iterator[tuple[str, ...]]:

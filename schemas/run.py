@@ -38,6 +38,8 @@ from schemas.storage import Storage, open_storage
 from schemas.storage_errors import StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
+# The mark in the folder of an attempt that is being removed.
+REMOVING = "removing"
 # A commit with its file entries takes some 30 kB of memory.
 _COMMITS_KEPT = 1000
 
@@ -233,9 +235,11 @@ class Run:
     def commit(self, commit: Commit) -> bool:
         """Publish a shard. False when another attempt has won; its files then are garbage.
 
-        The attempt's folder keeps a copy of the record, from which a damaged one is restored.
+        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit
+        of an attempt whose files are removed as garbage meanwhile is taken back (schemas/garbage.py).
         """
-        self.check_files(commit)
+        if (problem := self._lack(commit, committing=True)) is not None:
+            raise problem
         record = encode_record(commit)
         copy = commit_copy_key(commit.shard, commit.attempt)
         self.storage.put(copy, record)
@@ -243,21 +247,32 @@ class Run:
         won = self.storage.put_new(commit_key(commit.shard), record)
         if not won:
             self.storage.delete([copy])
+        elif (problem := self._lack(commit, committing=True)) is not None:
+            self.storage.delete([commit_key(commit.shard)])
+            raise problem
         return won
 
     def check_files(self, commit: Commit) -> None:
         """Refuse a commit whose files are absent or of another size (bytes are not read)."""
+        if (problem := self._lack(commit)) is not None:
+            raise problem
+
+    def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
         sizes = {f.key: f.size for f in self.storage.list(folder)}
+        if committing and (mark := f"{folder}/{REMOVING}") in sizes:
+            place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
+            return InputError(place, "", problem, "Submit the run again")
         for entry in commit.files:
             size = sizes.get(f"{folder}/{entry.path}")
             if size != entry.size:
-                raise InputError(
+                return InputError(
                     f"{self.storage.url}/{folder}/{entry.path}",
                     "",
                     "missing" if size is None else f"{size} bytes, where the commit has {entry.size}",
                     f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
                 )
+        return None
 
     def check_digests(self, commit: Commit) -> None:
         """Refuse a commit one of whose files has other bytes than were committed."""

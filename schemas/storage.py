@@ -119,6 +119,12 @@ class Storage:
         else:
             self._files.delete(_checked(self.url, key) for key in keys)
 
+    def remove_empty(self, folder: str) -> None:
+        """Remove a folder in which no file is left; object stores have none."""
+        files = self._files
+        if isinstance(files, LocalFiles):
+            self._try(folder, lambda: files.remove_empty(folder))
+
     def link_or_copy(self, source: str, target: str) -> None:
         """A second name for the same bytes; one of that name is replaced. See `adopt`."""
         self.adopt(self, source, target)

@@ -25,15 +25,16 @@ from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of
 
 _ANSWERS = {
-    "open + missing": "from schemas.run import Run; len(Run.open(place).missing())",
-    "status": "from schemas.run import Run; from datagen.standing import status_report; status_report(Run.open(place))",
-    "audit": "from schemas.run import Run; from datagen.accounts import account_for; account_for([Run.open(place)])",
+    "open + missing": ("from schemas.run import Run", "len(Run.open(place).missing())"),
+    "status": ("from datagen.standing import status_report", "status_report(Run.open(place))"),
+    "audit": ("from datagen.accounts import account_for", "account_for([Run.open(place)])"),
 }
 _TIMED = """
 import json, sys, time
 from pathlib import Path
+from schemas.run import Run
 place = sys.argv[1]
-{imports}
+{imported}
 start_s = time.perf_counter()
 {answer}
 took_s = time.perf_counter() - start_s
@@ -55,9 +56,7 @@ def make_large(folder: Path, commits: int) -> Run:
             for i, (path, data) in enumerate(files.items())
         )
         attempt = f"{shard:06d}-0a1b2c3d-{shard:06d}"
-        seconds = {
-            stage: 0.1 + (shard * 7919 + i * 104729) % 1_000_003 / 1e6 for i, stage in enumerate(_STAGES)
-        }
+        seconds = {stage: (shard * 7919 + i * 104729) % 1_000_003 / 1e6 for i, stage in enumerate(_STAGES)}
         cost = Cost(
             wall_s=sum(seconds.values()) + 0.01,
             cpu_s=sum(seconds.values()),
@@ -88,9 +87,8 @@ def make_large(folder: Path, commits: int) -> Run:
 def answer_times(run: Run) -> dict[str, tuple[float, float]]:
     """Seconds and MiB of peak memory of each answer, in a fresh process each."""
     times: dict[str, tuple[float, float]] = {}
-    for name, answer in _ANSWERS.items():
-        *imports, answer = answer.split("; ")
-        program = _TIMED.format(imports="\n".join(imports), answer=answer)
+    for name, (imported, answer) in _ANSWERS.items():
+        program = _TIMED.format(imported=imported, answer=answer)
         told = subprocess.run(
             [sys.executable, "-c", program, run.storage.url], check=True, capture_output=True, text=True
         )
@@ -116,15 +114,11 @@ def main() -> None:
             heads = next(Heads(run).commits())
             assert heads == head_of_commit(run.commit_of(0))
             for name, (took_s, mib) in answer_times(run).items():
-                before_s, before_mib = without[name]
-                print(
-                    f"{commits:>8} {name:16} {took_s:>8.2f} s {mib:>5.0f} MiB {before_s:>8.2f} s {before_mib:>5.0f} MiB"
-                )
-            size = sum(f.size for f in run.storage.list("index"))
-            files = sum(1 for _ in run.storage.list("index"))
-            print(
-                f"{commits:>8} {'index anew':16} {refresh_s:>8.2f} s, {files} files, {size / 2**20:.1f} MiB"
-            )
+                columns = [f"{s:>8.2f} s {m:>5.0f} MiB" for s, m in ((took_s, mib), without[name])]
+                print(f"{commits:>8} {name:16} {' '.join(columns)}")
+            sizes = [file.size for file in run.storage.list("index")]
+            told = f"{refresh_s:>8.2f} s, {len(sizes)} files, {sum(sizes) / 2**20:.1f} MiB"
+            print(f"{commits:>8} {'index anew':16} {told}")
             start_s = time.perf_counter()
             refresh(run)
             print(f"{commits:>8} {'index as it is':16} {time.perf_counter() - start_s:>8.2f} s", flush=True)

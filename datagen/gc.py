@@ -1,0 +1,107 @@
+"""`datagen gc`: remove what a run holds and nothing names."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from cluster.books import refresh_index
+from datagen.console import print_json, print_rows, size
+from datagen.counting import counting
+from schemas.errors import InputError
+from schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
+from schemas.merged import open_runs
+from schemas.storage import Storage, open_storage
+
+_AGE = re.compile(r"([0-9]{1,9})(s|m|h|d)")
+_UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+_SHOWN = 100
+
+
+def gc(
+    run: Annotated[str, Parameter(help="The run's folder or s3:// address.")],
+    *,
+    older_than: Annotated[
+        str, Parameter(help="What was written later than this ago stays: 90s, 30m, 24h or 7d.")
+    ] = "24h",
+    dry_run: Annotated[bool, Parameter(negative=(), help="Tell what would go, and remove nothing.")] = False,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+) -> int:
+    """Remove files that no commit names: of attempts that lost or never committed, drafts and probes.
+
+    What is committed stays, and so does what began since the first job that is at work now, whatever its
+    age. It may run beside jobs and be interrupted at any time; called again, it goes on. Records of the
+    ledger are never removed.
+    """
+    place = open_storage(run, probe=False, create=False)
+    age_s = age_of(older_than)
+    with counting("looking", as_json=json or None) as seen:
+        garbage = find_garbage(place, age_s, time.time(), seen)
+    swept = Swept()
+    if not dry_run:
+        with counting("removing", "pieces", as_json=json or None) as seen:
+            swept = remove(place, garbage, seen)
+    report = gc_report(place, garbage, swept, dry_run)
+    if json:
+        print_json(report)
+    else:
+        _print(run, report)
+    return 1 if swept.damaged else 0
+
+
+def age_of(text: str) -> float:
+    """The seconds of an age like 24h. Raises InputError for anything else."""
+    found = _AGE.fullmatch(text.strip())
+    if found is None:
+        raise InputError("--older-than", text, "not an age", "Give a whole number of s, m, h or d, like 24h")
+    return int(found[1]) * _UNIT_S[found[2]]
+
+
+def remove(place: Storage, garbage: list[Garbage], seen: Seen = lambda done, of: None) -> Swept:
+    """Remove all of it, and bring the indices of the place's runs up to date."""
+    total = Swept()
+    for done, piece in enumerate(garbage):
+        seen(done, len(garbage))
+        total = total.plus(sweep(piece))
+    for run in open_runs(place):
+        refresh_index(run)
+    return total
+
+
+def gc_report(place: Storage, garbage: list[Garbage], swept: Swept, dry_run: bool) -> dict[str, Any]:
+    """What was found and removed, as plain values; sizes in bytes."""
+    files, sizes, pieces = Counter[str](), Counter[str](), Counter[str]()
+    for piece in garbage:
+        files[piece.kind] += piece.files
+        sizes[piece.kind] += piece.bytes
+        pieces[piece.kind] += 1
+    return {
+        "run": place.url,
+        "dry_run": dry_run,
+        "found": {
+            kind: {"pieces": pieces[kind], "files": files[kind], "bytes": sizes[kind]} for kind in KINDS
+        },
+        "removed": {"files": swept.files, "bytes": swept.bytes},
+        "committed_meanwhile": swept.spared,
+        "damaged": list(swept.damaged),
+        "first": [f"{piece.storage.url}/{piece.key}" for piece in garbage[:_SHOWN]],
+    }
+
+
+def _print(place: str, report: dict[str, Any]) -> None:
+    rows = [
+        (kind, str(found["pieces"]), str(found["files"]), size(found["bytes"]))
+        for kind, found in report["found"].items()
+    ]
+    done = "would be removed" if report["dry_run"] else "removed"
+    print_rows(f"{done} from {place}", rows, ("kind", "pieces", "files", "size"))
+    if report["committed_meanwhile"]:
+        print_rows("committed meanwhile, and kept", [("attempts", str(report["committed_meanwhile"]))])
+    if report["damaged"]:
+        mend = f"datagen repair {place}"
+        rows = [(key, mend) for key in report["damaged"][:_SHOWN]]
+        print_rows("their attempts died in their commit while their files went", rows, ("commit", "mend"))
