@@ -9,7 +9,7 @@ from pathlib import Path
 from schemas.errors import InputError
 from schemas.merge_plan import Union, plan_union, refuse_incompatible
 from schemas.merge_writing import Written, begin_union, replace_record, write_union
-from schemas.merged import MERGED, open_runs, part_folder
+from schemas.merged import MERGED, open_runs, part_folder, wanted
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.resharding import common_layout
 from schemas.run import Run, refuse_foreign
@@ -102,7 +102,7 @@ def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
 
 def _seal(place: Storage) -> str:
     """Seal the place unless it is sealed as it stands."""
-    if not any(run.committed() for run in open_runs(place)):
+    if not wanted(open_runs(place)).labels:
         return ""
     root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
     if place.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:
