@@ -1,19 +1,18 @@
 """A small job as a program of its own, for tests that interrupt or kill it.
 
-python -m tests.faults.job RUN SECONDS_PER_SHARD
+python -m tests.faults.job RUN SECONDS_PER_SHARD [ADDRESS]
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
 
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
-from cluster.guard import Meter
+from cluster.guard import Meter, notes_of_a_job
 from cluster.policy import Policy
 from cluster.progress import progress
 from cluster.ray_cluster import RaySettings, ray_cluster
@@ -48,11 +47,11 @@ def make_rows(task: RandomRows, meter: Meter) -> Product:
 
 def main() -> int:
     """Run the missing shards; print the summary as JSON."""
-    place, seconds = sys.argv[1], float(sys.argv[2])
-    run, settings = Run.open(place), RaySettings(workers=2)
+    place, seconds, address = sys.argv[1], float(sys.argv[2]), (*sys.argv[3:], "local")[0]
+    run, settings = Run.open(place), RaySettings(address=address, workers=2)
     missing = run.missing()
     with (
-        tempfile.TemporaryDirectory() as notes,
+        notes_of_a_job() as notes,
         ray_cluster(settings) as ray,
         stop_on_signals(StopRequest()) as stop,
         progress(run.layout.samples_per_shard, len(missing)) as display,
@@ -63,6 +62,7 @@ def main() -> int:
 
         executor = RayExecutor(make_rows, settings, ray)
         summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
+        executor.close()
     said = {"end": summary.end, "closed": close_lost_attempts(run), "outcomes": summary.tally.outcomes}
     print(json.dumps(said))
     return summary.exit_code
