@@ -86,10 +86,11 @@ def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:
 
 
 def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
-    """`have` labels grown by whole shards until they are n together: evenly, and the last one cut.
+    """`have` labels grown by whole shards until they are n together: evenly, and what is left to the last.
 
     `per_shard` are the labels of one shard of each. Each further shard goes to whoever was given the
-    fewest labels so far, the first of equals.
+    fewest labels so far, the first of equals. A store is cut at its end alone, so that only the last may
+    want a part of a shard.
     """
     # What everybody gets in any case is given at once: n may be a million shards away.
     missing = n - sum(have)
@@ -98,9 +99,9 @@ def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
     missing -= sum(given)
     line = [(labels, k) for k, labels in enumerate(given)]
     heapify(line)
-    while missing > 0:
+    while missing >= per_shard[line[0][1]]:
         labels, k = line[0]
-        more = min(per_shard[k], missing)
-        missing, given[k] = missing - more, labels + more
+        missing, given[k] = missing - per_shard[k], labels + per_shard[k]
         heapreplace(line, (given[k], k))
+    given[-1] += missing
     return [a + b for a, b in zip(have, given, strict=True)]
