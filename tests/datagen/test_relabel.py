@@ -1,0 +1,273 @@
+"""`datagen relabel`: the run that `submit --scenes-from` would make, from stored numbers and shared files."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen import cli
+from schemas.merged import open_runs
+from schemas.record_files import encode_record
+from schemas.run import Run, shard_folder
+from tests.datagen.forged import forge
+from tests.refusals import refused
+from tests.sim_extra import needs_sim
+from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
+
+SCENES = 6
+N = SCENES * PER_SCENE
+OWN = {"label", "heuristic_score", "sample_id"}  # what another rule changes
+RULE = ("--mu", "0.7", "--distance", "mount-over-reach")
+TOML = "[heuristic]\nmu = 0.7\ndistance = 'mount-over-reach'\n"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six scenes, one a shard. Tests only read it."""
+    return make_small_run(tmp_path_factory.mktemp("source") / "run", N)
+
+
+@pytest.fixture(scope="module")
+def relabelled(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same scenes by another rule. Tests only read it."""
+    out = tmp_path_factory.mktemp("relabelled") / "run"
+    assert cli.run(["relabel", str(source), "--out", str(out), *RULE]) == 0
+    return out
+
+
+def test_it_is_the_run_that_casting_rays_again_gives(source: Path, relabelled: Path, tmp_path: Path) -> None:
+    (tmp_path / "rule.toml").write_text(TOML)
+    again = ["--scenes-from", str(source), "--config", str(tmp_path / "rule.toml"), "--workers", "0"]
+    assert cli.run(["submit", "heuristic", "--n", str(N), "--out", str(tmp_path / "cast"), *again]) == 0
+    ours, theirs = Run.open(relabelled), Run.open(tmp_path / "cast")
+    assert ours.manifest.spec == theirs.manifest.spec and ours.n == theirs.n
+    assert ours.manifest.sources == theirs.manifest.sources
+    assert_equal_runs(arrays_of(relabelled), arrays_of(tmp_path / "cast"))
+    for mine, other in zip(ours.commits(), theirs.commits(), strict=True):
+        assert {e.path: e for e in mine.files} == {e.path: e for e in other.files}
+        assert (mine.positives, mine.redraws) == (other.positives, other.redraws)
+    assert (arrays_of(relabelled)["label"] != arrays_of(source)["label"]).any()
+
+
+def test_only_labels_scores_and_ids_are_written(source: Path, relabelled: Path) -> None:
+    before, after = Run.open(source), Run.open(relabelled)
+    written = set[str]()
+    for shard in range(SCENES):
+        old, new = before.commit_of(shard), after.commit_of(shard)
+        for a, b in zip(old.files, new.files, strict=True):
+            assert a.path == b.path
+            inodes = [
+                (folder / shard_folder(shard, commit.attempt) / a.path).stat().st_ino
+                for folder, commit in ((source, old), (relabelled, new))
+            ]
+            if inodes[0] != inodes[1]:
+                written.add(a.path.split("/")[0])
+            else:
+                assert a == b
+    assert written == {*OWN, "zarr.json"}
+    assert all(c.cost.written_bytes < 12_000 for c in after.commits())
+
+
+def test_the_source_keeps_every_byte(source: Path, tmp_path: Path) -> None:
+    held = files_of(source)
+    assert cli.run(["relabel", str(source), "--out", str(tmp_path / "run"), "--tau", "0.3"]) == 0
+    assert files_of(source) == held
+
+
+def test_every_attempt_is_accounted_for(relabelled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = Run.open(relabelled)
+    ends = list(run.ledger.ends())
+    assert len(ends) == SCENES and {end.outcome for end in ends} == {"committed"}
+    assert run.ledger.unfinished() == []
+    for end in ends:
+        assert end.cost is not None and end.cost.wall_s >= sum(end.cost.stage_wall_s.values()) > 0
+    report = json_of(capsys, ["status", str(relabelled)])
+    assert report["complete"] and report["sealed"] and report["labels"] == N
+
+
+def test_a_file_says_the_rule_and_an_option_wins_over_it(
+    source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rule.toml").write_text(TOML.replace("0.7", "0.9") + "tau = 0.4546\n")
+    out = tmp_path / "run"
+    told = json_of(
+        capsys,
+        ["relabel", str(source), "--out", str(out), "--config", str(tmp_path / "rule.toml"), "--mu", "0.7"],
+    )
+    assert told["end"] == "complete" and told["labels"] == N
+    before, after = arrays_of(source)["label"].astype(int), arrays_of(out)["label"].astype(int)
+    assert (told["now_good"], told["now_bad"]) == ((after > before).sum(), (after < before).sum())
+    assert told["positives"] == after.sum()
+    assert_equal_runs(arrays_of(out), arrays_of(relabelled))
+    assert told["spec_hashes"] == [Run.open(relabelled).manifest.spec_hash]
+
+
+def test_it_resumes_where_it_was_ended(source: Path, relabelled: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert cli.run(["relabel", str(source), "--out", str(out), *RULE]) == 0
+    kept = (out / "commits/000000.json").read_bytes()
+    for shard in (1, 4):
+        (out / f"commits/{shard:06d}.json").unlink()
+    assert cli.run(["relabel", str(source), "--out", str(out), *RULE]) == 0
+    assert (out / "commits/000000.json").read_bytes() == kept
+    assert_equal_runs(arrays_of(out), arrays_of(relabelled))
+
+
+def test_it_follows_a_source_that_is_not_finished_and_grows(
+    source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "part"
+    shutil.copytree(source, part)
+    (part / "commits/000002.json").unlink()
+    out = tmp_path / "run"
+    told = json_of(capsys, ["relabel", str(part), "--out", str(out), *RULE])
+    assert told["labels"] == N - PER_SCENE and told["shards_to_come"] == 1
+    assert json_of(capsys, ["status", str(out)])["shards"]["missing"] == 1
+    make_small_run(part, N + 2 * PER_SCENE)  # resumes and extends
+    told = json_of(capsys, ["relabel", str(part), "--out", str(out), *RULE])
+    assert told["labels"] == 3 * PER_SCENE and told["shards_to_come"] == 0
+    longer, shorter = arrays_of(out), arrays_of(relabelled)
+    np.testing.assert_array_equal(longer["label"][:N], shorter["label"])
+    assert json_of(capsys, ["status", str(out)])["complete"]
+
+
+def test_a_relabelled_run_is_relabelled_from_the_same_scenes(
+    source: Path, relabelled: Path, tmp_path: Path
+) -> None:
+    back = tmp_path / "back"
+    assert (
+        cli.run(["relabel", str(relabelled), "--out", str(back), "--mu", "0.53", "--distance", "planar"]) == 0
+    )
+    assert Run.open(back).manifest.spec.scenes_hash == Run.open(source).manifest.spec_hash
+    before, after = arrays_of(source), arrays_of(back)
+    assert_equal_runs(
+        {k: v for k, v in before.items() if k != "sample_id"},
+        {k: v for k, v in after.items() if k != "sample_id"},
+    )
+
+
+def test_merged_runs_are_relabelled_part_by_part(
+    source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = make_small_run(tmp_path / "other", N, "--seed", "5")
+    merged, out = tmp_path / "merged", tmp_path / "run"
+    assert cli.run(["merge", str(source), str(other), "--out", str(merged)]) == 0
+    told = json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])
+    assert told["labels"] == 2 * N and len(told["spec_hashes"]) == 2
+    assert cli.run(["relabel", str(other), "--out", str(tmp_path / "alone"), *RULE]) == 0
+    alone = {r.manifest.spec_hash: r for r in map(Run.open, (relabelled, tmp_path / "alone"))}
+    parts = open_runs(out)
+    assert [part.manifest.spec_hash for part in parts] == sorted(alone)
+    whole = arrays_of(out)
+    each = [arrays_of(Path(alone[part.manifest.spec_hash].storage.url)) for part in parts]
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, np.concatenate([arrays[name] for arrays in each]), err_msg=name)
+    assert json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])["labels"] == 0
+
+
+def test_scenes_that_were_merged_twice_are_labelled_once(source: Path, tmp_path: Path) -> None:
+    cast, both = tmp_path / "cast", tmp_path / "both"
+    again = ["--out", str(cast), "--scenes-from", str(source), "--workers", "0"]
+    assert cli.run(["submit", "heuristic", "--n", str(2 * PER_SCENE), *again]) == 0
+    assert cli.run(["merge", str(source), str(cast), "--out", str(both)]) == 0
+    assert cli.run(["relabel", str(both), "--out", str(tmp_path / "one"), "--tau", "0.5"]) == 0
+    assert len(open_runs(tmp_path / "one")) == 1 and len(arrays_of(tmp_path / "one")["label"]) == N
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ((), ("heuristic", "nothing would change", "--mu")),
+        (("--mu", "0.53", "--tau", "0.4546"), ("nothing would change",)),
+        (("--mu", "nan"), ("heuristic.mu", "finite")),
+        (("--sigma-l", "0"), ("heuristic.sigma_l", "greater than 0")),
+        (("--d-min", "0.95"), ("heuristic", "d_max 0.92 must be above d_min 0.95")),
+        (("--distance", "far"), ("--distance",)),
+        (("--config", "missing.toml"), ("missing.toml", "cannot be read")),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_anything_is_written(
+    more: tuple[str, ...],
+    words: tuple[str, ...],
+    source: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "run"
+    refused(["relabel", str(source), "--out", str(out), *more], capsys, *words)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[visibility]\nwindow_px = 32\n", ("visibility", "those that the run stores", "--scenes-from")),
+        ("[scene]\nn_clutter = 3\n", ("scene",)),
+        ("[arm]\nrobot = 'panda'\n", ("arm", "heuristic has no arm")),
+        ("[heuristic]\nnu = 1\n", ("heuristic.nu",)),
+        ("heuristic = 3\n", ("heuristic",)),
+    ],
+)
+def test_a_file_may_change_the_rule_alone(
+    text: str, words: tuple[str, ...], source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rule.toml").write_text(text)
+    more = ["--config", str(tmp_path / "rule.toml"), "--tau", "0.5"]
+    refused(["relabel", str(source), "--out", str(tmp_path / "run"), *more], capsys, *words)
+
+
+def test_it_is_not_written_over_something_else(
+    source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    held = files_of(relabelled)
+    refused(["relabel", str(source), "--out", str(relabelled), "--mu", "0.8"], capsys, "heuristic.mu", "0.7")
+    refused(["relabel", str(source), "--out", str(source), "--mu", "0.8"], capsys, "another specification")
+    (tmp_path / "thesis.tex").write_text("text")
+    refused(["relabel", str(source), "--out", str(tmp_path), "--mu", "0.8"], capsys, "something else")
+    assert files_of(relabelled) == held
+
+
+def test_a_damaged_shard_is_given_up_and_the_others_are_labelled(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(source, broken)
+    file = next((broken / "shards/000003").glob("*/visibility/c.0"))
+    file.chmod(0o644)
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(data)
+    out = tmp_path / "run"
+    capsys.readouterr()
+    assert cli.run(["relabel", str(broken), "--out", str(out), *RULE]) == 1
+    assert "too many shards failed" in capsys.readouterr().err
+    run = Run.open(out)
+    assert run.committed() == set(range(SCENES)) - {3} and run.quarantined() == {3}
+    assert "damaged" in run.quarantine_records()[0].causes[-1]
+
+
+def test_labels_of_another_version_of_the_code_are_not_mixed(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = forge(source, tmp_path / "older", 0, lambda arrays: None)
+    spec = run.manifest.spec
+    older = spec.model_copy(update={"engines": {**spec.engines, "labels": "0"}})
+    manifest = run.manifest.model_copy(update={"spec": older, "spec_hash": older.hash()})
+    run.storage.put("manifest.json", encode_record(manifest))
+    arguments = ["relabel", str(tmp_path / "older"), "--out", str(tmp_path / "run"), *RULE]
+    refused(arguments, capsys, "engines.labels", "version 0", "--scenes-from")
+
+
+@needs_sim
+def test_labels_of_trials_do_not_follow_from_the_rule(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 24\nper_scene = 2\n")
+    plan = tmp_path / "plan"
+    more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
+    assert cli.run(["submit", "plan", "--n", "8", "--out", str(plan), *more]) == 0
+    arguments = ["relabel", str(plan), "--out", str(tmp_path / "run"), *RULE]
+    refused(arguments, capsys, "label_source", "plan labels do not follow", "submit heuristic --scenes-from")
