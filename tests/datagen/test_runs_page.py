@@ -1,0 +1,61 @@
+"""The commands of docs/runs.md do what the page shows, at small size."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+# Small runs in the command's own process: starting Ray eight times would cost more than the labels.
+SMALL = {
+    "--n 20000": "--n 120 --workers 0",
+    "--n 50000": "--n 300 --workers 0",
+    "datagen resume": "datagen resume --workers 0",
+    "--deep 20": "--deep 2",
+}
+
+
+def _script() -> ModuleType:
+    path = REPOSITORY / "scripts" / "console_page.py"
+    spec = importlib.util.spec_from_file_location("console_page", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["console_page"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(params=["folder", "s3"])
+def runs(request: pytest.FixtureRequest) -> str:
+    if request.param == "folder":
+        return "."
+    return request.getfixturevalue("bucket") + "/page"
+
+
+def test_the_page_of_runs(runs: str, assets: Path, tmp_path: Path) -> None:
+    script = _script()
+    commands = script.commands_of((REPOSITORY / "docs" / "runs.md").read_text())
+    assert len(commands) >= 10
+    environment = {
+        "RUNS": runs,
+        "ASSETS": str(assets),
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(REPOSITORY),
+        "PYTHONWARNINGS": "",
+    }
+    for command in commands:
+        text = command.text
+        for large, small in SMALL.items():
+            text = text.replace(large, small)
+        done = script.run_command(replace(command, lines=(text,)), tmp_path, environment)
+        told = "\n".join(done.output)
+        assert done.exit_code == command.exit_code, f"{text}\n{told}"
+        missing = set(script.labels_of(command.output)) - set(script.labels_of(done.output))
+        assert not missing, f"{text}\nno longer prints {missing}:\n{told}"
