@@ -15,6 +15,7 @@ from datagen.console import print_json
 from datagen.labelled import join_labelled, read_labelled
 from schemas.cost import STAGES
 from schemas.errors import InputError
+from schemas.merged import open_runs
 from schemas.run import Run
 from schemas.specification import Specification
 
@@ -43,7 +44,7 @@ def audit(
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "no run is named", "Name one or more run folders")
-    opened = [Run.open(place) for place in runs]
+    opened = [run for place in runs for run in open_runs(place)]
     by_source: dict[str, list[Run]] = {}
     for run in sorted(opened, key=lambda run: _fidelity(run.manifest.spec)):
         by_source.setdefault(run.manifest.spec.label_source, []).append(run)

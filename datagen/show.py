@@ -13,7 +13,7 @@ from datagen.console import print_rows
 from datagen.pictures import Shown, draw_arm, draw_heuristic
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
-from schemas.run import Run
+from schemas.merged import find_scene, open_runs
 from schemas.scene_rows import read_scene
 from workers.scenes.recall import recall_scene
 from workers.world import open_world
@@ -40,7 +40,7 @@ def show(
     """
     moving = _is_motion(out)
     candidate = _candidate(trial)
-    opened = Run.open(run)
+    opened, of_run = find_scene(open_runs(run), scene)
     spec, sources = opened.manifest.spec, opened.manifest.sources
     of_trial = trial is not None or moving
     if of_trial and spec.arm is None:
@@ -48,7 +48,7 @@ def show(
         mend = "Give a run of plan or sim, or --out FILE.png alone"
         raise InputError(run, "--trial" if trial is not None else "--out", problem, mend)
     refuse_missing_packages(spec.label_source)
-    rows = read_scene(opened, scene)
+    rows = read_scene(opened, of_run)
     world = open_world(
         spec, houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
     )

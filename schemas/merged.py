@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,3 +59,19 @@ def wanted(runs: Iterable[Run]) -> Wanted:
         labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
         missing += shards - len(done)
     return Wanted(n, labels, missing)
+
+
+def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
+    """The run that has scene `scene` of a place, and its index there: runs follow each other in order.
+
+    InputError where the place wants fewer scenes.
+    """
+    left = scene
+    for run in runs:
+        scenes = -(-run.n // run.layout.candidates_per_scene)
+        if 0 <= left < scenes:
+            return run, left
+        left -= scenes
+    last = scene - left - 1
+    problem = f"{scene} is not in this run" if len(runs) == 1 else f"{scene} is in none of these runs"
+    raise InputError(runs[0].storage.url, "--scene", problem, f"Choose one from 0 to {last}")

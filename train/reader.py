@@ -8,7 +8,7 @@ are those of the whole buffer and are shared by its batches: treat them as read-
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError, choices
+from schemas.merged import open_runs
 from schemas.run import Run, shard_folder
 from schemas.shard_reading import ShardPlace, StoredArray, committed_place, read_metadata
+from schemas.storage import open_storage
 from train.sealed import is_sealed_store, open_sealed
 
 Array = npt.NDArray[Any]
@@ -60,7 +62,7 @@ class _Block:
 
 
 class SampleReader:
-    """Samples of one or more runs, sealed or not; also of a sealed store that was copied alone.
+    """Samples of one or more runs, merged or not, sealed or not; also of a sealed store that came alone.
 
     `scene_fields` and `sample_fields` choose what is read (text fields on request). Float16 clouds
     come as float32. InputError names what is missing, foreign or damaged.
@@ -78,9 +80,9 @@ class SampleReader:
         self.fields: dict[str, StoredArray] = {}
         needed = list(dict.fromkeys([*scene_fields, *sample_fields, "scene_index", "sample_scene_index"]))
         for run_row, place in enumerate(places):
-            shards, arrays = _open(place, needed)
-            self._refuse_other_fields(str(place), arrays, scene_fields, sample_fields)
-            self._shards += [(run_row, shard, arrays) for shard in shards]
+            for shards, arrays in _open(place, needed):
+                self._refuse_other_fields(str(place), arrays, scene_fields, sample_fields)
+                self._shards += [(run_row, shard, arrays) for shard in shards]
         self._scene_fields = tuple(dict.fromkeys(scene_fields))
         self._sample_fields = tuple(dict.fromkeys(sample_fields))
 
@@ -165,37 +167,53 @@ class SampleReader:
                     raise InputError(place, name, problem, "Read runs of equal parameters together")
 
 
-def _open(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], dict[str, StoredArray]]:
+_Opened = tuple[list[ShardPlace], dict[str, StoredArray]]
+
+
+def _open(place: Path | str, names: Sequence[str]) -> list[_Opened]:
+    """The shards of the run, of each of the merged ones, or of the sealed store, with their arrays."""
     if is_sealed_store(place):
-        return open_sealed(place, names)
-    run = Run.open(place)
+        return [open_sealed(place, names)]
+    storage = open_storage(place, probe=False, create=False)
+    opened = [found for run in open_runs(storage) if (found := _open_run(run, names)) is not None]
+    if not opened:
+        raise InputError(storage.url, "commits", "no shard is committed", "Make some with `datagen resume`")
+    return opened
+
+
+def _open_run(run: Run, names: Sequence[str]) -> _Opened | None:
     n = run.n
     commits = [commit for commit in run.commits() if commit.shard < run.layout.shards_for(n)]
     if not commits:
-        raise InputError(
-            run.storage.url, "commits", "no shard is committed", "Make some with `datagen resume`"
-        )
+        return None
     folders = [shard_folder(commit.shard, commit.attempt) for commit in commits]
     digests = [{entry.path: entry.sha256 for entry in commit.files} for commit in commits]
-    for name in names:
-        path = f"{name}/zarr.json"
+    paths = [f"{name}/zarr.json" for name in names]
+    for name, path in zip(names, paths, strict=True):
         if path not in digests[0]:
             stored = [p.removesuffix("/zarr.json") for p in digests[0] if p.endswith("/zarr.json")]
             raise InputError(run.storage.url, name, "the run stores no such field", choices(stored))
-        for commit, digest in zip(commits, digests, strict=True):
-            if digest.get(path) != digests[0][path]:
-                raise InputError(
-                    f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}/{path}",
-                    name,
-                    "differs from the other shards' metadata",
-                    "Mend it with `datagen repair`",
-                )
     arrays = read_metadata(run.storage, folders[0], names)
+    for folder, digest in zip(folders, digests, strict=True):
+        # Merged runs may come from programs that word an array's meaning otherwise.
+        if any(digest.get(path) != digests[0][path] for path in paths):
+            _refuse_other_arrays(run, folder, arrays)
     shards = [
         committed_place(run.storage, folder, commit, *run.layout.rows_wanted(commit.shard, n))
         for folder, commit in zip(folders, commits, strict=True)
     ]
     return shards, arrays
+
+
+def _refuse_other_arrays(run: Run, folder: str, arrays: Mapping[str, StoredArray]) -> None:
+    for name, array in read_metadata(run.storage, folder, arrays).items():
+        if replace(array, attributes=arrays[name].attributes) != arrays[name]:
+            raise InputError(
+                f"{run.storage.url}/{folder}/{name}/zarr.json",
+                name,
+                "differs from the other shards' metadata",
+                "Mend it with `datagen repair`",
+            )
 
 
 def _join(blocks: Sequence[_Block]) -> _Block:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError, choices
+from schemas.merged import MERGED
 from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, read_metadata
 from schemas.storage import open_storage
 
@@ -18,7 +19,8 @@ def is_sealed_store(place: Path | str) -> bool:
     """Whether the place is named like a sealed store (`....zarr`) and is not a run of such a name."""
     if not str(place).rstrip("/").endswith(".zarr"):
         return False
-    return not open_storage(place, probe=False, create=False).exists("manifest.json")
+    storage = open_storage(place, probe=False, create=False)
+    return not storage.exists("manifest.json") and not storage.exists(MERGED)
 
 
 def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], dict[str, StoredArray]]:
