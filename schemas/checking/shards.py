@@ -78,7 +78,8 @@ def check_shard(
 ) -> Iterator[Finding]:
     """Every file of a committed shard against its entry, and the rows against the schema.
 
-    `listed` are the files below the shard's folder. Holds one shard's arrays at most.
+    `listed` are the files below the shard's folder; drafts that a killed writer left (.part) are for `gc`.
+    Holds one shard's arrays at most.
     """
     folder = shard_folder(commit.shard, commit.attempt)
     entries = {entry.path: entry for entry in commit.files}
@@ -87,7 +88,7 @@ def check_shard(
         yield Finding(f"commits/{commit.shard:06d}.json", "rows", problem, _WRITTEN_SO, commit.shard)
     for key in listed:
         path = key.removeprefix(f"{folder}/")
-        if path != key and path not in entries and path != "commit.json":
+        if path != key and path not in entries and path != "commit.json" and not path.endswith(".part"):
             problem = "no record knows this file in a committed attempt's folder"
             yield Finding(key, "foreign", problem, "Move it away: nothing reads it", commit.shard)
     kept: dict[str, Array] = {}

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
-from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, small_schema, units
+from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, damage, small_schema, units
 from tests.faults.crash_points_shim import Call, Mode, Shim, read_log
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -71,6 +71,7 @@ def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: in
     """Try the operations at all their points, or at so many of each kind of end."""
     findings: list[Finding] = []
     for operation in operations:
+        SCHEMAS["heuristic"] = small_schema(operation.fields)
         known = _reference(shim, work, operation)
         finding = Finding(operation.name, len(known.calls))
         for point in points(known.calls, sample):
@@ -99,6 +100,7 @@ def trace(shim: Shim, work: Path, operations: Iterable[Operation], log: Path) ->
     """Run the operations once each, and log their calls. Who traces finds them by the names looked for."""
     with log.open("wb") as f:
         for operation in operations:
+            SCHEMAS["heuristic"] = small_schema(operation.fields)
             _trace_one(shim, work / operation.name.replace(" ", "_"), operation, f)
 
 
@@ -132,7 +134,11 @@ def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
 
         _must(act)
     return _Reference(
-        _files(template), _files(after), _look(template), _look(after), read_log(log.read_text())
+        _files(template),
+        _files(after),
+        _look(template, operation),
+        _look(after, operation),
+        read_log(log.read_text()),
     )
 
 
@@ -163,7 +169,7 @@ def _try(
             if "\n" in told:
                 violated(f"an error of several lines: {told}")
             if call.kind not in ("unlink", "rmdir"):
-                for name in _drafts(_files(place).keys() - known.before_files.keys(), known):
+                for name in _drafts(_files(place), known):
                     violated(f"left behind: {name}")
         elif status != 0:
             violated(f"ended with {status}: {told}")
@@ -174,29 +180,34 @@ def _try(
         if known.after_files.get(name) == data and _bytes(place / name) != data:
             violated(f"changed {name}")
     # One fresh process looks, goes on as a user would, and looks again.
-    now, resumed = _look_and_resume(place, operation)
+    now, resumed, damaged = _look_and_resume(place, operation)
     _judge(now, known, finding, violated, ended)
     if _lasting(resumed) != _lasting(known.after):
         violated(f"resumed to something else: {_different(resumed, known.after)}")
+    other = {name for name in _files(place).keys() ^ known.after_files.keys() if "index/" not in name}
+    if operation.exact and other:
+        violated(f"resumed with other files: {sorted(other)}")
+    for what in damaged:
+        violated(f"resumed, and damaged: {what}")
 
 
-def _drafts(names: Iterable[str], known: _Reference) -> list[str]:
-    """Those of the new files that belong to nothing: drafts, and an attempt that is not written whole.
+def _drafts(now: Iterable[str], known: _Reference) -> list[str]:
+    """New files that belong to nothing: drafts, and those of an attempt that is not written whole.
 
     One that is, and lacks only its commit, is left to `gc`: its commit may be on its way.
     """
     drafts: list[str] = []
     by_attempt: dict[str, set[str]] = {}
-    for name in names:
-        if re.search(r"\.(part|partial)\b|#[0-9]+$", name):
-            drafts.append(name)
-        elif found := re.match(r"(.*/)?shards/[0-9]+/[^/]+/", name):
+    for name in now:
+        if found := re.match(r"(.*/)?shards/[0-9]+/[^/]+/", name):
             by_attempt.setdefault(found[0], set()).add(name)
+        if re.search(r"\.(part|partial)\b", name):
+            drafts.append(name)
     for folder, there in by_attempt.items():
         whole = {name for name in known.after_files if name.startswith(folder)}
         if whole - there - {f"{folder}commit.json"}:
-            drafts += sorted(there)
-    return drafts
+            drafts += there
+    return sorted(set(drafts) - known.before_files.keys())
 
 
 def _judge(
@@ -206,8 +217,8 @@ def _judge(
     states: set[str] = set()
     for name in sorted({*now, *known.before, *known.after}):
         old, value, new = known.before.get(name), now.get(name), known.after.get(name)
-        if old == new == value or (name.startswith("ledger ") and name not in known.after):
-            continue  # an attempt that has begun is no unit: its end, or the one who resumes, closes it
+        if old == new == value or (":ledger " in name and name not in known.before):
+            continue  # the account of a new attempt follows its commit, or comes with who resumes
         if value == new:
             states.add("there")
         elif value == old:
@@ -222,31 +233,33 @@ def _judge(
 
 def _lasting(found: Units) -> Units:
     """Units without the ledger's: whoever resumes is another attempt."""
-    return {name: value for name, value in found.items() if not name.startswith("ledger ")}
+    return {name: value for name, value in found.items() if ":ledger " not in name}
 
 
 def _different(one: Units, other: Units) -> list[str]:
     return [name for name in sorted({*one, *other}) if one.get(name) != other.get(name)]
 
 
-def _look(folder: Path) -> Units:
+def _look(folder: Path, operation: Operation) -> Units:
     """The units, seen by a process that has never seen the run."""
-    status, told = _in_child(lambda: json.dumps(units(folder)))
+    status, told = _in_child(lambda: json.dumps(units(folder, operation.places)))
     return json.loads(told) if status == 0 else {"readers": told}
 
 
-def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units]:
+def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units, list[str]]:
+    """(units, units when it was resumed, what `verify` finds then)."""
+
     def go() -> str:
-        now = units(folder)
+        now = units(folder, operation.places)
         try:
             (operation.resume or operation.act)(folder)
         except InputError as e:
-            return json.dumps([now, {"resuming": str(e)}])
-        return json.dumps([now, units(folder)])
+            return json.dumps([now, {"resuming": str(e)}, []])
+        return json.dumps([now, units(folder, operation.places), damage(folder, operation.places)])
 
     status, told = _in_child(go)
-    now, resumed = json.loads(told) if status == 0 else ({"readers": told}, {})
-    return now, resumed
+    now, resumed, damaged = json.loads(told) if status == 0 else ({"readers": told}, {}, [])
+    return now, resumed, damaged
 
 
 def _must(do: Callable[[], None]) -> None:
@@ -263,6 +276,7 @@ def _in_child(do: Callable[[], str | None]) -> tuple[int, str]:
         status, told = _DEFECT, ""
         try:
             os.close(reading)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # progress
             told, status = do() or "", 0
         except InputError as e:
             told, status = str(e), _REFUSED
@@ -336,7 +350,6 @@ def main() -> None:
     parser.add_argument("--trace", type=Path, help="only run the operations, and log their calls there")
     parser.add_argument("--only", action="append", default=[], help="an operation")
     options = parser.parse_args()
-    SCHEMAS["heuristic"] = small_schema()
     chosen = [op for op in OPERATIONS if not options.only or op.name in options.only]
     memory = Path("/dev/shm")  # copies there are quick; a kill is the same on every file system
     with tempfile.TemporaryDirectory(prefix="crash-points-", dir=memory if memory.is_dir() else None) as work:

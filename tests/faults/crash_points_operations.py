@@ -3,62 +3,87 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
-from cluster.books import close_lost_attempts
+from cluster.books import close_lost_attempts, refresh_index
+from datagen.gc import remove
+from datagen.relabel import relabel_all, relabelled_specification
+from schemas.checking.mending import mend_place
+from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS, RecordSchema
+from schemas.garbage import find_garbage
+from schemas.index import closed_ends, committed_heads
 from schemas.merged import MERGED, open_runs, part_folder
+from schemas.merging import carry_out, plan_merge
 from schemas.record_files import encode_record
-from schemas.run import Run
+from schemas.run import Run, publish
 from schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from schemas.seal import SEALED, seal, unseal
+from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
-from tests.made_runs import attempt, make_run, manifest_of, small_spec
+from tests.made_runs import attempt, make_run, manifest_of, rows_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the
 # code below them need of a schema is there: names, texts, a vector, both tables.
 _KEPT = ("scene_index", "house_id", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
+_KEPT_TO_RELABEL = (
+    *("distance_m", "mount_distance_m", "arm_reach_m", "visibility", "heuristic_score", "label_version"),
+    *("sample_id", "sample_scene_index", "candidate_index", "label", "scene_index", "redraws"),
+)
 
 Units = dict[str, str]
+_HEURISTIC = SCHEMAS["heuristic"]
 
 
 @dataclass(frozen=True)
 class Operation:
     """`prepare` makes what is there before, in a new folder; `act` is what is killed; `resume` is what
-    the user does then (the same again, where it is not given)."""
+    the user does then (the same again, where it is not given). `places` are the runs in the folder;
+    `exact` operations, resumed, leave the very files that they leave undisturbed."""
 
     name: str
     prepare: Callable[[Path], None]
     act: Callable[[Path], None]
     resume: Callable[[Path], None] | None = None
+    places: tuple[str, ...] = ("",)
+    fields: tuple[str, ...] = _KEPT
+    exact: bool = False
 
 
-def small_schema() -> RecordSchema:
-    """The schema of these shards, for `SCHEMAS["heuristic"]`."""
-    schema = SCHEMAS["heuristic"]
+def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
+    """A schema of few of the fields of heuristic runs, to stand for theirs in `SCHEMAS`."""
+    kept = set(fields)
     return replace(
-        schema,
-        scene_fields=tuple(f for f in schema.scene_fields if f.name in _KEPT),
-        sample_fields=tuple(f for f in schema.sample_fields if f.name in _KEPT),
+        _HEURISTIC,
+        scene_fields=tuple(f for f in _HEURISTIC.scene_fields if f.name in kept),
+        sample_fields=tuple(f for f in _HEURISTIC.sample_fields if f.name in kept),
     )
 
 
-def units(folder: Path) -> Units:
-    """What readers see of a run or of merged runs, unit by unit; each must be as before or as after.
+def units(folder: Path, places: Iterable[str] = ("",)) -> Units:
+    """What readers see of runs or of merged runs, unit by unit; each must be as before or as after.
 
     A record that is refused, or a shard whose bytes are not those committed, is a unit of its own value.
     """
-    place = open_storage(folder, probe=False)
+    return {f"{place}:{name}": value for place in places for name, value in _units(folder / place).items()}
+
+
+def _units(folder: Path) -> Units:
     found: Units = {"sealed": _sealed(folder)}
     if not (folder / MERGED).exists() and not (folder / "manifest.json").exists():
         return found
-    for run in open_runs(place):
+    try:
+        runs = open_runs(open_storage(folder, probe=False))
+    except InputError as e:
+        return found | {"refused": e.problem}
+    for run in runs:
         name = run.manifest.spec_hash[:8]
-        found[f"{name} manifest"] = sha256(run.storage.get("manifest.json", 2**20) or b"").hexdigest()
+        found[f"{name} manifest"] = f"{run.manifest.spec_hash} {run.layout}"
         if run.n:
             found[f"{name} n"] = str(run.n)
         for shard in sorted(run.committed()):
@@ -68,7 +93,30 @@ def units(folder: Path) -> Units:
             found[f"ledger {name} end {entry.attempt}"] = entry.outcome
         for start in run.ledger.unfinished():
             found[f"ledger {name} begun {start.attempt}"] = str(start.shard)
+        if listed := _wrongly_listed(run):
+            found[f"{name} index"] = listed
     return found
+
+
+def _wrongly_listed(run: Run) -> str:
+    """In what the index differs from the records."""
+    try:
+        listed = [head.shard for head in committed_heads(run)], [end.attempt for end in closed_ends(run)]
+    except InputError as e:
+        return f"refused: {e.problem}"
+    told = sorted(run.committed()), [entry.attempt for entry in run.ledger.ends()]
+    return "" if listed == told else f"{listed}, not {told}"
+
+
+def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
+    """What `verify` finds. Until it is resumed, an operation that was killed may lack a second copy."""
+    return [
+        f"{place}: {finding.key}: {finding.problem}"
+        for place in places
+        if (folder / place).exists()
+        for finding in check_place(open_storage(folder / place, probe=False), Checked())
+        if finding.is_damage
+    ]
 
 
 def _commit(run: Run, shard: int) -> str:
@@ -142,7 +190,7 @@ def _merged(folder: Path) -> None:
     specs = sorted((small_spec(0), small_spec(1)), key=lambda spec: spec.hash())
     for spec in specs:
         make_run(folder / part_folder(spec.hash()), 15, spec=spec)
-    open_storage(folder).put_new(MERGED, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
+    publish(open_storage(folder), MERGED, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
 
 
 def _run(folder: Path, n: int, shards: list[int] | None) -> None:
@@ -151,6 +199,79 @@ def _run(folder: Path, n: int, shards: list[int] | None) -> None:
 
 def _seal(folder: Path) -> None:
     seal(open_storage(folder, probe=False))
+
+
+def _apart(folder: Path, seeds: tuple[int, int]) -> None:
+    for name, seed, shards in (("a", seeds[0], [0, 1]), ("b", seeds[1], [1, 2])):
+        make_run(folder / name, 30, shards=shards, spec=small_spec(seed))
+
+
+def _merge(folder: Path) -> None:
+    carry_out(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
+
+
+def _damaged_records(folder: Path) -> None:
+    run = make_run(folder, 30)
+    run.ledger.start("lost", 1)
+    _flip(folder / "commits/000001.json")
+    (folder / "copies/manifest.json").unlink()
+    (folder / "ledger/a-2.json").unlink()
+    (folder / "copies/plans/1.json").write_bytes(b"")
+
+
+def _damaged_manifest(folder: Path) -> None:
+    make_run(folder, 20)
+    _flip(folder / "manifest.json")
+
+
+def _damaged_files(folder: Path) -> None:
+    seal(make_run(folder, 30).storage)
+    _flip(folder / "shards/000001/a-1/label/c.0")
+    (folder / "shards/000002/a-2/zarr.json").unlink()
+    _flip(folder / SEALED / "house_id" / "zarr.json")
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 16
+    path.chmod(0o644)
+    path.write_bytes(data)
+
+
+def _repair(folder: Path) -> None:
+    def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+        return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, shard))
+
+    mended = mend_place(open_storage(folder, probe=False), remake)
+    for finding in mended.left:
+        raise InputError(finding.key, "", finding.problem, finding.mend)  # the command ends with 1
+
+
+def _littered(folder: Path) -> None:
+    run = make_run(folder, 30, shards=[0, 1])
+    write(run, 1, "loser")
+    write(run, 2, "late")
+    for draft in (f"{SEALED}.{7:016x}.partial/label", f"{SEALED}.{7:016x}.partial/rgb"):
+        (folder / draft).mkdir(parents=True)
+        (folder / draft / "c.0").write_bytes(b"1")
+    (folder / f"commits/000002.json.{7:016x}.part").write_bytes(b"{}")
+
+
+def _collect(folder: Path) -> None:
+    place = open_storage(folder, probe=False)
+    remove(place, find_garbage(place, 0.0, time.time() + 60))
+
+
+def _relabelled(folder: Path) -> None:
+    make_run(folder / "a", 30, shards=[0, 2], spec=small_spec(engines={"labels": "1"}))
+
+
+def _relabel(folder: Path) -> None:
+    source = Run.open(folder / "a")
+    spec = relabelled_specification(source, {"heuristic.tau": 0.5})
+    done = relabel_all(open_storage(folder / "out"), [source], [spec], json=True)
+    if done.end != "complete":
+        raise InputError(folder / "out", "", done.summaries[0].cause, "Again")  # as the command does
 
 
 OPERATIONS = (
@@ -168,4 +289,12 @@ OPERATIONS = (
     Operation("seal again", _sealed_and_grown, _seal),
     Operation("seal merged", _merged, _seal),
     Operation("unseal", _sealed_and_grown, lambda folder: unseal(open_storage(folder, probe=False))),
+    Operation("index", lambda folder: _run(folder, 40, None), lambda folder: refresh_index(Run.open(folder))),
+    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("a", "b", "out")),
+    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("a", "b", "out")),
+    Operation("repair manifest", _damaged_manifest, _repair),
+    Operation("repair records", _damaged_records, _repair),
+    Operation("repair files", _damaged_files, _repair),
+    Operation("gc", _littered, _collect, exact=True),
+    Operation("relabel", _relabelled, _relabel, places=("a", "out"), fields=_KEPT_TO_RELABEL),
 )
