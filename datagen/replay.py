@@ -14,7 +14,7 @@ from datagen.console import print_json, print_rows
 from datagen.drawing.replay_picture import draw_replay
 from datagen.job_options import HousesAgain, ObjectsAgain, ScenesFromAgain
 from datagen.remaking import Origin, open_origin
-from datagen.replaying import chosen_rows, open_replayer, what_differs_here
+from datagen.replaying import chosen_rows, open_replayer, origin_to_check, what_differs_here
 from datagen.replaying_shard import replay_shard
 from datagen.replaying_stages import RECOMPUTED, StageComparison, compare_stages
 from datagen.whole_number import WHOLE_NUMBER
@@ -78,7 +78,7 @@ def replay(
         return replay_shard(run, found, shard, open_origin(found, houses, objects, scenes_from), json)
     assert index is not None
     stored = read_scene(found, index)
-    return _compare(run, found, stored, row, open_origin(found, houses, objects, scenes_from), out, json)
+    return _compare(run, found, stored, row, origin_to_check(found, houses, objects, scenes_from), out, json)
 
 
 def find_sample(runs: list[Run], text: str) -> tuple[Run, int, int]:

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError
 import numpy as np
 
 from cluster.guard import this_host
-from datagen.remaking import Origin
+from datagen.remaking import Origin, open_origin
 from datagen.specify import label_engines, scene_engines
 from schemas.cost import StageClock
 from schemas.errors import InputError
@@ -22,7 +22,7 @@ from workers.run_shard import Columns, candidate_columns, scene_row
 from workers.scenes.draw import draw_scene
 from workers.scenes.recall import recall_candidates, recall_scene
 from workers.scenes.scene import SettledScene
-from workers.world import World, assemble_world
+from workers.world import World, assemble_world, open_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,23 @@ _NO_DRAWING = "the run that drew the scenes is not there any more"
 _MEND = "Give --scenes-from the run that drew them"
 
 
+def origin_to_check(
+    run: Run, houses: str | None = None, objects: str | None = None, scenes_from: str | None = None
+) -> Origin:
+    """The run's sources as `open_origin` gives them; without the run that drew its scenes where that is gone.
+
+    What is stored is enough to work out labels again. InputError as `open_origin`, also for a
+    `scenes_from` that is given and is not there.
+    """
+    if scenes_from is not None or run.manifest.spec.scenes_from is None or _source_of(run) is not None:
+        return open_origin(run, houses, objects, scenes_from)
+    spec, known = run.manifest.spec, run.manifest.sources
+    houses, objects = houses or known.get("houses", "builtin"), objects or known.get("objects", "builtin")
+    return Origin(open_world(spec, houses, objects), None)
+
+
 def open_replayer(run: Run, origin: Origin) -> Replayer:
-    """A run opened to make its scenes again, from `datagen.remaking.open_origin`."""
+    """A run opened to make its scenes again, from `origin_to_check` or `datagen.remaking.open_origin`."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
         drawn_by = _source_of(drawn_by)
