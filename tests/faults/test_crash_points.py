@@ -16,7 +16,7 @@ from tests.faults.crash_points_campaign import run_campaign, start
 from tests.faults.crash_points_operations import OPERATIONS
 from tests.faults.crash_points_shim import Call, build, read_log
 
-SAMPLE = 4
+SAMPLE = 2
 # Calls that leave files as they are. Any other one that touches a run must be known to the shim.
 READING = {
     "access", "close", "faccessat", "faccessat2", "fadvise64", "fcntl", "flock", "fstat", "fstatfs", "getcwd",

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
-import boto3
 import numpy as np
 import pytest
 import zarr
-from moto.server import ThreadedMotoServer
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
@@ -23,32 +20,11 @@ from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import attempt, manifest_of, rows_of, small_spec
 
 
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
-
-
 @pytest.fixture
-def place(endpoint: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Storage:
-    """An empty prefix of a bucket of its own."""
-    settings = {
-        "AWS_ENDPOINT_URL": endpoint,
-        "AWS_ALLOW_HTTP": "true",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_REGION": "us-east-1",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    for name, value in settings.items():
-        monkeypatch.setenv(name, value)
+def place(bucket: str, monkeypatch: pytest.MonkeyPatch) -> Storage:
+    """An empty prefix of a new bucket, for runs of few arrays."""
     monkeypatch.setitem(SCHEMAS, "heuristic", small_schema())
-    bucket = f"bucket-{abs(hash(request.node.name))}"
-    boto3.client("s3", endpoint_url=endpoint).create_bucket(Bucket=bucket)
-    return open_storage(f"s3://{bucket}/some/run")
+    return open_storage(f"{bucket}/some/run")
 
 
 def make(place: Storage, n: int, shards: list[int] | None = None) -> Run:
