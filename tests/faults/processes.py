@@ -1,0 +1,111 @@
+"""Attempts in processes of this machine that may be killed at any time: workers as they are, without Ray."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, TypeVar
+
+from cluster.guard import Meter, guarded, obituary, read_note
+from cluster.task import AttemptReport, Product, Task
+
+T = TypeVar("T", bound=Task)
+# Processes are forked from one that has loaded everything and done nothing: a new one takes milliseconds.
+FORKS = multiprocessing.get_context("forkserver")
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: Any
+    pipe: Connection
+    task: Any = None  # what it is at
+
+
+class ProcessExecutor(Generic[T]):
+    """`workers` processes that take tasks in turn; one that dies is replaced, and its attempt has crashed."""
+
+    def __init__(self, function: Callable[[T, Meter], Product], workers: int) -> None:
+        self._function, self.slots = function, workers
+        self._queue: deque[T] = deque()
+        self._ended: list[AttemptReport] = []
+        self._killed: set[str] = set()
+        self._workers = [self._new_worker() for _ in range(workers)]
+
+    def _new_worker(self) -> _Worker:
+        ours, theirs = FORKS.Pipe()
+        process = FORKS.Process(target=_work, args=(self._function, theirs), daemon=True)
+        process.start()
+        theirs.close()
+        return _Worker(process, ours)
+
+    def submit(self, task: T) -> None:
+        self._queue.append(task)
+        self._hand_out()
+
+    def _hand_out(self) -> None:
+        for worker in self._workers:
+            if self._queue and worker.task is None:
+                worker.task = self._queue.popleft()
+                try:
+                    worker.pipe.send(worker.task)
+                except OSError:
+                    continue  # it died while it was idle; `wait` sees that
+
+    def wait(self, timeout_s: float) -> list[AttemptReport]:
+        ended, self._ended = self._ended, []
+        busy = [worker for worker in self._workers if worker.task is not None]
+        if not busy and not ended:
+            time.sleep(timeout_s)
+        ready = set(wait([worker.pipe for worker in busy], 0 if ended else timeout_s)) if busy else set()
+        for worker in busy:
+            if worker.pipe in ready:
+                ended.append(self._report(worker))
+        self._hand_out()
+        return ended
+
+    def _report(self, worker: _Worker) -> AttemptReport:
+        task, worker.task = worker.task, None
+        try:
+            return worker.pipe.recv()
+        except (EOFError, OSError):
+            worker.pipe.close()
+            self._workers[self._workers.index(worker)] = self._new_worker()
+            if task.attempt in self._killed:
+                return obituary(task, "cancelled", "ended by force")
+            return obituary(task, "crashed", "the worker process died")
+
+    def has_begun(self, attempt: str) -> bool:
+        return any(
+            w.task and w.task.attempt == attempt and read_note(w.task.notes, attempt) for w in self._workers
+        )
+
+    def kill(self, attempt: str) -> None:
+        for task in [task for task in self._queue if task.attempt == attempt]:
+            self._queue.remove(task)
+            self._ended.append(obituary(task, "cancelled", "ended by force"))
+        for worker in self._workers:
+            if worker.task is not None and worker.task.attempt == attempt:
+                self._killed.add(attempt)
+                os.kill(worker.process.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Let the workers end."""
+        for worker in self._workers:
+            worker.pipe.close()
+        for worker in self._workers:
+            worker.process.join()
+
+
+def _work(function: Callable[[Any, Meter], Product], pipe: Connection) -> None:
+    """A worker's life: until its driver closes the pipe, or is gone."""
+    while True:
+        try:
+            pipe.send(guarded(function, pipe.recv()))
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            return
