@@ -47,7 +47,7 @@ def manifest_of(spec: Specification, layout: Layout) -> Manifest:
 
 
 def make_run(
-    folder: Path,
+    folder: Path | str,
     n: int = 50,
     scenes_per_shard: int = 2,
     candidates_per_scene: int = 5,

@@ -40,6 +40,8 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Committ
         copies = [c for c in copies if c.record is not None and _says_committed(run, c.record.attempt)]
     if len(copies) == 1:
         return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
+    if not listed and ours.data is None and ours.problem == "missing":
+        return CommittedShard(shard, None, ())  # there is nothing that it could have committed
     mend = "Restore the file from a backup; or remove it, and submit again: the shard is made anew"
     if ours.data is None and ours.problem == "missing":
         mend = "Submit the run again: the shard is open, and is made anew"

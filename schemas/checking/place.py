@@ -101,7 +101,7 @@ def check_place(
             for looked in _in_order(pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards):
                 yield from looked.findings
                 if slice_ is not None and looked.shard in slice_.positions:
-                    tally.add(run, slice_, looked.shard, looked.commit)
+                    tally.add(run, slice_, looked.shard, looked.commit, bool(looked.findings))
                 if looked.commit is not None:
                     committed[looked.shard] = looked.commit.attempt
                     _count(checked, looked.commit)

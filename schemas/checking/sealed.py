@@ -39,12 +39,13 @@ class SealedTally:
 
     digest: object = field(default_factory=sha256)
     shards: list[SealedShard] = field(default_factory=list[SealedShard])
-    unknown: int = 0  # shards without a commit
+    lost: int = 0  # shards whose commit is gone
+    unknown: int = 0  # shards of which there is nothing at all
 
-    def add(self, run: Run, slice_: SealedSlice, shard: int, commit: Commit | None) -> None:
-        """Count one shard of the store."""
+    def add(self, run: Run, slice_: SealedSlice, shard: int, commit: Commit | None, known: bool) -> None:
+        """Count one shard of the store; `known` where it has files, though no commit."""
         if commit is None:
-            self.unknown += 1
+            self.lost, self.unknown = self.lost + known, self.unknown + (not known)
             return
         scenes, samples = slice_.wanted(shard, run)
         self.shards.append(SealedShard(shard_folder(shard, commit.attempt), scenes, samples))
@@ -66,8 +67,7 @@ def read_root(place: Storage, wanted: Mapping[str, int]) -> tuple[SealedRoot | N
     except InputError as error:
         return None, [curable(key, "sealed", error.problem, Reseal())]
     if root is None:
-        # Where nothing can be renamed, a store without its root is one that was not finished.
-        if there and (place.folder is not None or place.exists(key)):
+        if there:  # in an object store also one that was not finished
             return None, [curable(key, "sealed", "missing, or does not say what was sealed", Reseal())]
         return None, []
     told = {part.spec_hash: part.n for part in root.parts}
@@ -155,8 +155,13 @@ def check_store(
 ) -> Iterator[Finding]:
     """The store's metadata, files that are too many, and whether it is behind its runs."""
     if tally.unknown:
-        problem = f"holds {tally.unknown} shards of which there is no commit"
+        problem = f"holds {tally.unknown} shards of which the run has nothing"
         yield curable(SEALED, "sealed", problem, Reseal())
+    if tally.lost:  # their rows are whole here: nothing is sealed over them
+        problem = f"holds {tally.lost} shards whose commits are lost: it cannot be checked"
+        mend = "Submit the run again: the shards are made again, and sealed with the others"
+        yield Finding(SEALED, "sealed", problem, mend)
+    if tally.unknown or tally.lost:
         return
     sealed = tuple(
         SealedRun(run, part.n, tuple(part.positions), part.missing)

@@ -54,7 +54,9 @@ class Campaign:
             yield kind, self.tried[kind], counts[0], self.mended[kind], counts[1], counts[2]
 
 
-def make_place(folder: Path, n: int = 19, scenes_per_shard: int = 2, candidates_per_scene: int = 5) -> Run:
+def make_place(
+    folder: Path | str, n: int = 19, scenes_per_shard: int = 2, candidates_per_scene: int = 5
+) -> Run:
     """A sealed run of few files, whose ledger has waste too."""
     run = make_run(folder, n, scenes_per_shard, candidates_per_scene)
     run.ledger.start("b-0", 0)

@@ -1,0 +1,193 @@
+"""`datagen repair` on real runs: only what is bad is made again, and only as it was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zarr
+
+from datagen import cli
+from schemas.checking.mending import mend_place
+from schemas.errors import InputError
+from schemas.record_files import signed_json
+from schemas.run import Run
+from schemas.storage import open_storage
+from tests.faults.damage_campaign import Damage, apply, copy_run, make_place, remake
+from tests.made_runs import files_of
+from tests.small_runs import PER_SCENE, make_small_run
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three scenes. Tests only read it."""
+    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 3 * PER_SCENE)
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """The finished run with its links, to be damaged."""
+    copy_run(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def damage(run: Path, pattern: str) -> str:
+    """Change one byte of the first file of that pattern; its key."""
+    key = str(sorted(run.glob(pattern))[0].relative_to(run))
+    apply(run, Damage("", key, lambda data: data[:-1] + bytes([data[-1] ^ 1])))
+    return key
+
+
+def repaired(run: Path, capture: pytest.CaptureFixture[str], code: int, *more: str) -> dict[str, Any]:
+    """What repair says, with the exit code that it must have."""
+    capture.readouterr()
+    assert cli.run(["repair", str(run), "--json", *more]) == code
+    return json.loads(capture.readouterr().out)
+
+
+def test_damage_is_undone_to_the_last_byte_and_nothing_else_is_touched(
+    finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = files_of(finished)
+    shard = damage(copied, "shards/000001/*/rgb/c.0.0.0")
+    metadata = damage(copied, "shards/000000/*/label/zarr.json")
+    records = [damage(copied, f"{key}") for key in ("manifest.json", "commits/000000.json", "plans/1.json")]
+    (copied / "copies/manifest.json").write_bytes(whole["copies/manifest.json"])
+    times = {p: p.stat().st_mtime_ns for p in copied.rglob("*") if p.is_file()}
+    report = repaired(copied, capsys, 0)
+    assert report["records"] == sorted(records)
+    assert (report["files_made_again"], report["shards_made_again"]) == ([shard], [1])
+    assert report["files_from_copies"] == [metadata]
+    assert (report["sealed_anew"], report["files_changed_by_others"], report["left"]) == (True, [], [])
+    assert files_of(copied) == whole
+    touched = {str(p.relative_to(copied)) for p, time in times.items() if p.stat().st_mtime_ns != time}
+    assert {key for key in touched if not key.startswith("data.zarr/")} == {shard, metadata, *records}
+    again = repaired(copied, capsys, 0)
+    assert not any(again[k] for k in ("records", "files_made_again", "files_from_copies", "sealed_anew"))
+    assert cli.run(["verify", str(copied)]) == 0
+
+
+def test_a_shard_that_comes_out_otherwise_is_refused_and_left(
+    copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The commit has a digest that this machine does not give: another one made it."""
+    key = damage(copied, "shards/000001/*/rgb/c.0.0.0")
+    commit = Run.open(copied).commit_of(1)
+    record = commit.model_dump(mode="json")
+    for entry in record["files"]:
+        if entry["path"] == "rgb/c.0.0.0":
+            entry["sha256"] = "0" * 64
+    for name in ("commits/000001.json", f"shards/000001/{commit.attempt}/commit.json"):
+        (copied / name).write_bytes(signed_json(record))
+    before = files_of(copied / "shards")
+    report = repaired(copied, capsys, 1)
+    (left,) = [f for f in report["left"] if f["kind"] == "file"]
+    assert left["file"] == key and "other bytes" in left["mend"] and report["files_made_again"] == []
+    assert files_of(copied / "shards") == before
+    assert cli.run(["repair", str(copied)]) == 1
+    assert "differs here" in capsys.readouterr().out
+
+
+def test_sources_that_have_moved_are_named(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(copied, "shards/000001/*/rgb/c.0.0.0")
+    report = repaired(copied, capsys, 1, "--houses", "builtin:3")
+    assert any("builtin:3" in f["mend"] for f in report["left"])
+    assert repaired(copied, capsys, 0)["clean"]
+
+
+def test_several_processes_make_shards_again(
+    finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = [damage(copied, f"shards/00000{k}/*/rgb/c.0.0.0") for k in (0, 2)]
+    report = repaired(copied, capsys, 0, "--workers", "1")
+    assert report["files_made_again"] == sorted(keys)
+    assert files_of(copied) == files_of(finished)
+
+
+# Made-up runs: how mending goes about it ---------------------------------------------------------
+
+
+def test_a_mending_that_is_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
+    make_place(tmp_path / "clean", 39)
+    copy_run(tmp_path / "clean", tmp_path / "run")
+    keys = [damage(tmp_path / "run", f"shards/00000{k}/*/label/c.0") for k in range(4)]
+
+    def break_off(run: Run, shard: int) -> Any:
+        if shard == 2:
+            raise KeyboardInterrupt
+        return remake(run, shard)
+
+    place = open_storage(tmp_path / "run", probe=False)
+    with pytest.raises(KeyboardInterrupt):
+        mend_place(place, break_off)
+    mended = mend_place(place, remake)
+    assert mended.remade_files == keys[2:] and mended.left == []
+    assert files_of(tmp_path / "run") == files_of(tmp_path / "clean")
+
+
+def test_a_failing_simulator_leaves_its_shard_and_mends_the_others(tmp_path: Path) -> None:
+    make_place(tmp_path / "run", 39)
+    keys = [damage(tmp_path / "run", f"shards/00000{k}/*/label/c.0") for k in range(3)]
+
+    def fail(run: Run, shard: int) -> Any:
+        if shard == 1:
+            raise RuntimeError("the physics left sense")
+        return remake(run, shard)
+
+    mended = mend_place(open_storage(tmp_path / "run", probe=False), fail, workers=2)
+    assert sorted(mended.remade_files) == [keys[0], keys[2]]
+    assert {f.key for f in mended.left if f.kind == "file"} == {keys[1]}
+    assert any("left sense" in f.mend for f in mended.left)
+
+
+def test_a_deleted_chunk_comes_back_from_the_sealed_store(tmp_path: Path) -> None:
+    make_place(tmp_path / "clean", 19)
+    copy_run(tmp_path / "clean", tmp_path / "run")
+    key = "shards/000001/a-1/points_m/c.0.0.0"
+    (tmp_path / "run" / key).unlink()
+
+    def never(run: Run, shard: int) -> Any:
+        raise AssertionError("there was a second source")
+
+    mended = mend_place(open_storage(tmp_path / "run", probe=False), never)
+    assert mended.copied_files == [key] and mended.left == []
+    assert files_of(tmp_path / "run") == files_of(tmp_path / "clean")
+    assert (tmp_path / "run" / key).samefile(tmp_path / "run/data.zarr/points_m/c.1.0.0")
+
+
+def test_what_cannot_be_mended_is_left_and_said(tmp_path: Path) -> None:
+    run = make_place(tmp_path / "run", 19)
+    (tmp_path / "run/ledger/b-0.json").write_bytes(b"")
+    for key in ("commits/000001.json", "shards/000001/a-1/commit.json", "ledger/a-1.json"):
+        (tmp_path / "run" / key).unlink()
+    mended = mend_place(run.storage, remake)
+    assert {(f.kind, f.key) for f in mended.left if f.is_damage} == {
+        ("account", "ledger/b-0.json"),
+        ("lost", "commits/000001.json"),
+        ("sealed", "data.zarr"),
+    }
+    assert zarr.open_array(tmp_path / "run/data.zarr/label", mode="r").shape[0] == 19
+    with pytest.raises(InputError):
+        run.commit_of(1)
+
+
+def test_a_run_on_s3_is_checked_and_mended(bucket: str) -> None:
+    run = make_place(f"{bucket}/run", 19)
+    storage = run.storage
+    whole = {f.key: storage.get(f.key, 2**30) for f in storage.list("")}
+    for key in ("shards/000001/a-1/points_m/c.0.0.0", "data.zarr/rgb/c.0.0.0", "manifest.json"):
+        data = whole[key]
+        assert data is not None
+        storage.put(key, data[:-1] + b"\0")
+    storage.delete(["data.zarr/label/zarr.json", "shards/000000/a-0/label/c.0", "commits/000000.json"])
+    storage.put("data.zarr/label/c.7", b"")
+    mended = mend_place(storage, remake)
+    assert mended.left == [] and mended.remade_files == []  # the sealed store holds copies of its own
+    assert {f.key: storage.get(f.key, 2**30) for f in storage.list("")} == whole
+    storage.delete(["data.zarr/zarr.json"])
+    storage.put("shards/000001/a-1/points_m/c.0.0.0", b"0")
+    storage.put("data.zarr/points_m/c.1.0.0", b"0")
+    mended = mend_place(storage, remake)
+    assert mended.left == [] and mended.remade_shards == [1] and mended.resealed
