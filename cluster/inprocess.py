@@ -30,7 +30,7 @@ class InProcessExecutor(Generic[T]):
         if not self._queue and not self._cancelled:
             time.sleep(timeout_s)
         ended, self._cancelled = self._cancelled, []
-        while self._queue:
+        if self._queue:  # one at a time: between two the driver hears what is asked of it
             task = self._queue.popleft()
             try:
                 ended.append(guarded(self._function, task, deadline=False))

@@ -1,0 +1,125 @@
+"""`datagen cancel`, `logs` and `status` from another process than the one that works."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from datagen import cli
+from schemas.jobs import Job, Jobs
+from schemas.storage import open_storage
+from tests.refusals import refused
+from tests.small_runs import PER_SCENE, json_of, submit_arguments
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+N = 64 * PER_SCENE  # eight shards
+
+
+class Work:
+    """A job in a process of its own."""
+
+    def __init__(self, run: Path) -> None:
+        self.place = open_storage(run)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "datagen.cli", *submit_arguments(run, N)],
+            cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def job(self) -> Job:
+        (job,) = Jobs(self.place).all()
+        return job
+
+    def wait_until_it_makes_shards(self) -> Job:
+        while True:
+            jobs = Jobs(self.place).all()
+            if jobs and jobs[0].state is not None and jobs[0].state.phase == "making":
+                return jobs[0]
+            assert self.process.poll() is None, self.process.communicate()
+            time.sleep(0.05)
+
+
+def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    work = Work(run)
+    seen = work.wait_until_it_makes_shards()
+    assert seen.health() == "live" and seen.record.pid == work.process.pid
+    assert cli.run(["status", str(run)]) == 0
+    assert seen.id in (told := capsys.readouterr().out) and "labels/s" in told
+    assert cli.run(["cancel", str(run)]) == 0
+    told = capsys.readouterr()
+    assert "ended interrupted, exit code 130" in told.out and f"datagen resume {run}" in told.out
+    assert "asked to stop" in told.err  # the wait shows what it waits for
+    assert work.process.wait(60) == 130
+    job = work.job()
+    assert job.health() == "ended" and job.state is not None and job.state.in_flight == 0
+    (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
+    assert (shown["health"], shown["asked_to_stop"], shown["state"]["exit_code"]) == ("ended", "drain", 130)
+    capsys.readouterr()
+    assert cli.run(["logs", str(run), "--follow", "--json"]) == 0  # nobody works: it ends by itself
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [e["event"] for e in events] == ["job_began", "stop_asked", "job_ended"]
+    assert cli.run(["cancel", str(run)]) == 0
+    assert "none is at work" in capsys.readouterr().out
+
+
+def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> None:
+    work = Work(tmp_path / "run")
+    work.wait_until_it_makes_shards()
+    assert cli.run(["cancel", str(tmp_path / "run"), "--now"]) == 0
+    assert work.process.wait(60) == 130
+    job = work.job()
+    assert (
+        job.order is not None and job.order.now and job.state is not None and job.state.end == "interrupted"
+    )
+
+
+def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    work = Work(run)
+    job = work.wait_until_it_makes_shards()
+    work.process.kill()
+    assert work.process.wait(30) == -signal.SIGKILL
+    # A minute passes.
+    assert job.state is not None
+    before = (datetime.now(UTC) - timedelta(minutes=2)).isoformat()
+    Jobs(work.place).tell(job.state.model_copy(update={"updated": before}))
+    (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
+    assert shown["health"] == "dead"
+    assert cli.run(["status", str(run)]) == 0
+    assert "dead: its process is gone" in capsys.readouterr().out
+    assert cli.run(["cancel", str(run)]) == 0
+    assert "none is at work" in capsys.readouterr().out
+    assert cli.run(["logs", str(run)]) == 0
+    assert "is dead: last heard of then" in capsys.readouterr().out
+
+
+def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tests.made_runs import make_run
+    from tests.schemas.test_jobs import record_of
+
+    place = make_run(tmp_path / "run", n=10).storage
+    record = record_of(datetime.now(UTC) - timedelta(hours=3), 17, "another-host")
+    Jobs(place).begin(record)
+    assert cli.run(["cancel", str(tmp_path / "run")]) == 1
+    assert "silent, heard 3 h 0 min ago" in capsys.readouterr().out
+    assert Jobs(place).stop_order(record.id) is not None
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(["cancel"], capsys, "RUN")
+    for verb in ("cancel", "logs"):
+        refused([verb, str(tmp_path)], capsys, "not a run")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,123 @@
+"""`datagen logs` and `datagen status` of runs in which much went wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen import cli
+from schemas.quarantine import lift_quarantine
+from schemas.run import Run
+from schemas.run_records import LedgerEntry, Outcome, QuarantineRecord
+from tests.made_runs import make_run
+from tests.refusals import refused
+from tests.small_runs import json_of
+
+SEGFAULT = "Fatal Python error: Segmentation fault"
+STACK = "Current thread (most recent call first):\n  File settle.py, line 3 in settle"
+
+
+def at(minute: int) -> str:
+    return f"2026-01-01T00:{minute:02d}:00.000+00:00"
+
+
+def end(run: Run, shard: int, minute: int, outcome: Outcome, cause: str, stack: str = "") -> str:
+    attempt = f"{shard:06d}-aaaaaaaa-{minute:06d}"
+    run.ledger.end(
+        LedgerEntry(
+            attempt=attempt, shard=shard, outcome=outcome, cause=cause, stack=stack,
+            started=at(minute), ended=at(minute + 1),
+        )
+    )  # fmt: skip
+    return attempt
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Shard 1 crashed twice and was given up; shard 3 was lost and ran out of memory; others are fine."""
+    run = make_run(tmp_path_factory.mktemp("troubled") / "run", n=50, shards=[0, 2, 4])
+    causes = (f"crashed: {SEGFAULT}", "failed: ValueError: no rays")
+    attempts = (end(run, 1, 2, "crashed", SEGFAULT, STACK), end(run, 1, 6, "failed", "ValueError: no rays"))
+    end(run, 3, 4, "lost", "node died")
+    end(run, 3, 8, "out_of_memory", "MemoryError")
+    run.quarantine(
+        QuarantineRecord(
+            shard=1, seed=0, first_scene=2, scenes=2, attempts=attempts, causes=causes, stacks=(STACK, ""),
+            created=at(9),
+        )
+    )  # fmt: skip
+    return Path(run.storage.url)
+
+
+def lines_of(capture: pytest.CaptureFixture[str], *arguments: str) -> list[Any]:
+    capture.readouterr()
+    assert cli.run(["logs", *arguments, "--json"]) == 0
+    return [json.loads(line) for line in capture.readouterr().out.splitlines()]
+
+
+def test_failures_and_retries_are_told_in_order_of_time(
+    troubled: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    events = lines_of(capsys, str(troubled))
+    assert [(e["event"], e["shard"]) for e in events] == [
+        ("attempt_begins", 1),
+        ("attempt_crashed", 1),
+        ("attempt_begins", 3),
+        ("attempt_lost", 3),
+        ("attempt_begins", 1),  # the retry
+        ("attempt_failed", 1),
+        ("attempt_begins", 3),
+        ("attempt_out_of_memory", 3),
+        ("quarantined", 1),
+    ]
+    assert [e["at"] for e in events] == sorted(e["at"] for e in events)
+    assert "Segmentation fault" in events[1]["text"] and "stack" not in events[1]
+
+
+def test_stacks_and_one_shard(troubled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    events = lines_of(capsys, str(troubled), "--stacks", "--shard", "1")
+    assert {e["shard"] for e in events} == {1} and len(events) == 5
+    assert [e["event"] for e in events if "stack" in e] == ["attempt_crashed"]
+    fine = lines_of(capsys, str(troubled), "--shard", "2")
+    assert [e["event"] for e in fine if e["event"] != "attempt_begins"] == ["attempt_committed"]
+    assert lines_of(capsys, str(troubled), "--shard", "77") == []
+    assert cli.run(["logs", str(troubled), "--stacks"]) == 0
+    told = capsys.readouterr().out
+    assert "    Current thread" in told and "2026-01-01 00:03:00.000  shard 1 crashed" in told
+
+
+def test_status_tells_budgets_stacks_and_quarantine(
+    troubled: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = json_of(capsys, ["status", str(troubled), "--stacks"])
+    spent = {
+        row["outcome"]: (row["attempts"], row["most_on_one_shard"], row["budget"])
+        for row in report["budgets"]
+    }
+    assert spent == {
+        "crashed": (1, 1, 3), "failed": (1, 1, 3), "lost": (1, 1, 10), "out_of_memory": (1, 1, 2),
+    }  # fmt: skip
+    assert report["quarantine"] == [{"shard": 1, "attempts": 2, "cause": "failed: ValueError: no rays"}]
+    assert report["stacks"] == {f"crashed: {SEGFAULT}": STACK}
+    assert report["shards"] == {"planned": 5, "committed": 3, "quarantined": [1], "missing": 1}
+    assert cli.run(["status", str(troubled), "--stacks"]) == 0
+    told = capsys.readouterr().out
+    for words in ("1 of 10", "line 3 in settle", "no rays", f"datagen resume {troubled} --quarantined"):
+        assert words in told
+
+
+def test_a_lifted_quarantine_stays_in_the_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_run(tmp_path / "run", n=20, shards=[0])
+    run.quarantine(
+        QuarantineRecord(
+            shard=1, seed=0, first_scene=2, scenes=2, attempts=("a", "b"), causes=("x", "y"), stacks=("", ""),
+            created=at(1),
+        )
+    )  # fmt: skip
+    assert lift_quarantine(run) == [1]
+    (event,) = lines_of(capsys, run.storage.url)
+    assert event["event"] == "quarantined" and "taken out of it later" in event["text"]
+    refused(["logs", run.storage.url, "--driver"], capsys, "detached")
