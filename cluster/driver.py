@@ -214,7 +214,7 @@ class _Driver(Generic[T]):
         if report.outcome == "cancelled" and flight.verdict is not None:
             outcome, cause = flight.verdict
             report = replace(report, outcome=outcome, cause=cause)
-        if report.outcome in ("crashed", "hung", "lost", "out_of_memory", "cancelled"):
+        if report.outcome not in ("committed", "superseded"):
             report = self._what_the_run_says(report)
         shard = report.shard
         decision = decide(self._policy, self._troubled.get(shard, Trouble()), report)
@@ -241,16 +241,18 @@ class _Driver(Generic[T]):
         self._events.ended(report, decision.action)
 
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
-        """A worker may die after its commit and before its answer: the commit record decides."""
+        """A worker may die, or lose its store's answer, after its commit: the commit record decides."""
         commit = self._books.commit_of(report.shard)
         if commit is None:
             return report
         if commit.attempt != report.attempt:
-            return replace(report, outcome="superseded")
+            return report if report.outcome == "failed" else replace(report, outcome="superseded")
         return replace(
             report,
             outcome="committed",
             cause="",
+            stack="",
+            ends_job=False,
             labels=commit.samples,
             positives=commit.positives,
             cost=commit.cost,

@@ -73,9 +73,12 @@ class Faults:
     lost_answer: float = 0.0  # done, and yet answered 500
     hold: float = 0.0  # no answer for `hold_s`; done or not, one time in two each
     cut: float = 0.0  # done; the answer breaks off in the middle of its body
+    lost_creates: float = 0.0  # of create-only puts, in place of the above: done, and yet answered 500
     hold_s: float = 0.0
     seed: int = 0
-    down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all is 503
+    down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all fails
+    down_at_commits: list[int] = field(default_factory=list[int])  # done, not answered, then all fails
+    down_for_s: float = 0.0  # after a commit: long enough for its writer to give up
     forgets_create_only: bool = False  # a store that knows no If-None-Match
     late_error_of_copies: int = 0  # copies that answer 200 with an error in the body, and are not made
     script: list[str] = field(default_factory=list[str])  # kinds for the next requests, in turn
@@ -84,15 +87,32 @@ class Faults:
 
     def __post_init__(self) -> None:
         self._random, self._lock = random.Random(self.seed), threading.Lock()
+        self._up_s = float("inf")
 
-    def kind(self) -> str:
-        """What becomes of the next request."""
+    def kind(self, path: str, creates: bool) -> str:
+        """What becomes of the next request; `creates` is a put that must not replace."""
         with self._lock:
             self.seen["requests"] += 1
-            if self.down_after and self.seen["requests"] > self.down_after[0]:
+            if time.monotonic() >= self._up_s:
+                self.down, self._up_s = False, float("inf")
+            if creates and "/commits/" in path and not self.down:
+                self.seen["commits"] += 1
+                if self.down_at_commits and self.seen["commits"] > self.down_at_commits[0]:
+                    self.down_at_commits.pop(0)
+                    self.down, self._up_s = True, time.monotonic() + self.down_for_s
+                    self.seen["lost_commit"] += 1
+                    return "lost_answer"
+            if self.down_after and not self.down and self.seen["requests"] > self.down_after[0]:
                 self.down_after.pop(0)
                 self.down = True
-            kind = "down" if self.down else self.script.pop(0) if self.script else self._drawn()
+            if self.down:
+                kind = "down"
+            elif self.script:
+                kind = self.script.pop(0)
+            elif creates and self._random.random() < self.lost_creates:
+                kind = "lost_answer"
+            else:
+                kind = self._drawn()
             self.seen[kind] += 1
             return kind
 
@@ -123,7 +143,7 @@ def faulty_proxy(upstream: int, faults: Faults) -> Generator[int]:
 
         def handle_any(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length") or 0))
-            kind = faults.kind()
+            kind = faults.kind(self.path, "if-none-match" in self.headers)
             if kind in ("error", "down"):
                 status, text = random.choice([(500, _BROKEN), (503, _BUSY)])
                 return self._answer(status, {}, text)

@@ -4,10 +4,10 @@
 
 The server is moto's, on the loopback address. Of `rate` of all requests two parts in five are refused
 with 500 or 503; one part each is done and answered 500, done and cut off in its answer, and held until the
-client gives up, done or not. And the store is down for a while three times a campaign. Each campaign ends
-with a look at every byte: committed files, copies of commits and the sealed store equal those of a local
-run that nothing befell, and the ledger has every execution once, with its end. Anything else is an
-AssertionError.
+client gives up, done or not. Of create-only puts three in ten are done and answered 500. The store is down
+for a while five times a campaign, twice right after it has taken a commit. Each campaign ends with a look
+at every byte: committed files, copies of commits and the sealed store equal those of a local run that
+nothing befell, and the ledger has every execution once, with its end. Anything else is an AssertionError.
 """
 
 from __future__ import annotations
@@ -31,10 +31,13 @@ def one(upstream: int, shards: int, seed: int, rate: float, folder: Path) -> Out
         error=2 * share,
         lost_answer=share,
         cut=share,
+        lost_creates=0.3,
         hold=share,
         hold_s=1.5 * TIMEOUT_S,
         seed=seed,
         down_after=[200, 70 * shards, 140 * shards],
+        down_for_s=1.75 * TIMEOUT_S,
+        down_at_commits=[shards // 3, 2 * shards // 3],
     )
     with faulty_proxy(upstream, faults) as port:
         os.environ.update(environment(port) | {"DATAGEN_STORE_TIMEOUT_S": str(TIMEOUT_S)})
@@ -48,18 +51,20 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rate", type=float, default=0.05)
     options = parser.parse_args()
-    kinds = ("error", "lost_answer", "cut", "hold_before", "hold_after", "down")
+    kinds = ("error", "lost_answer", "lost_commit", "cut", "hold_before", "hold_after", "down")
     heads = ("seed", "shards", "jobs", "executions", "requests", *kinds, "seconds")
     print("  ".join(f"{head:>11}" for head in heads))
-    with tempfile.TemporaryDirectory(prefix="s3-faults-") as folder:
-        with moto_server(Path(folder) / "moto.log") as upstream:
-            for seed in range(options.seeds):
-                below = Path(folder) / str(seed)
-                below.mkdir()
-                seen = one(upstream, options.shards, seed, options.rate, below)
-                counts = [seen.faults[kind] for kind in kinds]
-                row = (seed, seen.shards, seen.jobs, seen.executions, seen.requests, *counts)
-                print("  ".join(f"{value:>11,}" for value in row) + f"  {seen.seconds:>11.0f}", flush=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="s3-faults-") as folder,
+        moto_server(Path(folder) / "moto.log") as upstream,
+    ):
+        for seed in range(options.seeds):
+            below = Path(folder) / str(seed)
+            below.mkdir()
+            seen = one(upstream, options.shards, seed, options.rate, below)
+            counts = [seen.faults[kind] for kind in kinds]
+            row = (seed, seen.shards, seen.jobs, seen.executions, seen.requests, *counts)
+            print("  ".join(f"{value:>11,}" for value in row) + f"  {seen.seconds:>11.0f}", flush=True)
     print("nothing lost, nothing doubled, every execution in the ledger")
 
 

@@ -138,9 +138,28 @@ def test_a_worker_that_died_after_its_commit_has_committed() -> None:
     executor = SimulatedExecutor(clock, fate)
     summary = drive(range(4), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
     assert books.closed == {"committed": 3, "superseded": 1} and summary.tally.retries == 0
+    assert summary.end == "complete"
     entry = next(e for e in books.entries if e.attempt == name[1])
     assert entry.cost == books.commits[1].cost and entry.cause == ""
     assert summary.tally.labels == 2 * 10 + 77
+
+
+def test_a_worker_that_lost_the_answer_to_its_commit_has_committed() -> None:
+    books, clock = PaperBooks(), FakeClock()
+
+    def fate(order: Order, n: int) -> Fate:
+        if order.shard == 1:
+            books.commits[1] = commit_by(1, order.attempt)
+            return ("failed!", 1.0)
+        if order.shard == 2 and n == 1:
+            books.commits[2] = commit_by(2, "another")
+            return ("failed", 1.0)
+        return ("superseded" if order.shard == 2 else "committed", 1.0)
+
+    executor = SimulatedExecutor(clock, fate)
+    summary = drive(range(4), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
+    assert summary.end == "complete"
+    assert books.closed == {"committed": 3, "failed": 1, "superseded": 1}
 
 
 def commit_by(shard: int, attempt: str) -> Commit:

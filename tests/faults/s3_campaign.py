@@ -87,11 +87,14 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
         except InputError:
             faults.down = False
     seen = faults.seen.copy()
-    faults.error = faults.lost_answer = faults.hold = faults.cut = 0.0  # the rest is looking
-    faults.down, faults.down_after = False, []
+    # The rest is looking.
+    faults.error = faults.lost_answer = faults.lost_creates = faults.hold = faults.cut = 0.0
+    faults.down_after, faults.down_at_commits = [], []
     _hold_to_ledger(run, executions.read_text().split())
     _hold_to_an_undisturbed_run(run, shards, folder / "undisturbed")
-    counts = Counter({kind: count for kind, count in seen.items() if kind not in ("requests", "pass")})
+    counts = Counter(
+        {kind: count for kind, count in seen.items() if kind not in ("requests", "pass", "commits")}
+    )
     lines = len(executions.read_text().split())
     return Outcome(shards, jobs, lines, seen["requests"], counts, time.monotonic() - start_s)
 
