@@ -10,7 +10,6 @@ from __future__ import annotations
 from schemas.seal_contents import read_contents
 from schemas.seal_local import seal_folder, unseal_folder
 from schemas.seal_metadata import SEALED, SealedPart, SealedRoot, sealed_metadata, sealed_root
-from schemas.seal_remote import seal_prefix, unseal_prefix
 from schemas.storage import Storage
 
 __all__ = ["SEALED", "SealedPart", "SealedRoot", "seal", "sealed_metadata", "sealed_root", "unseal"]
@@ -28,6 +27,9 @@ def seal(place: Storage) -> str:
     if place.folder is not None:
         seal_folder(contents, place.folder, metadata)
     else:
+        # Loaded here: who works on a disk does not wait for the client of object stores.
+        from schemas.seal_remote import seal_prefix
+
         seal_prefix(contents, metadata)
     return f"{place.url}/{SEALED}"
 
@@ -37,4 +39,6 @@ def unseal(place: Storage) -> None:
     if place.folder is not None:
         unseal_folder(place.folder)
     else:
+        from schemas.seal_remote import unseal_prefix
+
         unseal_prefix(place)

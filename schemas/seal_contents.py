@@ -90,11 +90,8 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
         n, done = run.n, list[int]()
         below = f"{part_folder(run.manifest.spec_hash)}/" if len(runs) > 1 else ""
         expected = _files_of_a_shard(run)
-        for commit in run.commits():
-            if commit.shard >= run.layout.shards_for(n):
-                continue
-            if check:
-                run.check_files(commit)
+        planned = (commit for commit in run.commits() if commit.shard < run.layout.shards_for(n))
+        for commit in _checked(run, planned) if check else planned:
             _refuse_odd_files(run, commit, expected)
             done.append(commit.shard)
             shards.append(
@@ -112,6 +109,20 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
     scenes, samples = last.run.layout.rows_wanted(last.shards[-1], last.n)
     shards[-1] = SealedShard(shards[-1].folder, scenes, samples)
     return Contents(place, tuple(sealed), tuple(shards), tuple(digests), first.schema, first.layout)
+
+
+def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
+    """The commits, once their files are found to be there; several at a time on an object store."""
+
+    def check(commit: Commit) -> Commit:
+        run.check_files(commit)
+        return commit
+
+    if run.storage.folder is not None:
+        return map(check, commits)
+    from schemas.remote_objects import in_order
+
+    return in_order(check, commits)
 
 
 def _refuse_other_arrays(first: Run, run: Run) -> None:

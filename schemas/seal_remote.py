@@ -6,20 +6,14 @@ its consolidated metadata alone says how long the arrays are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
 
 from schemas.fields import Field
+from schemas.remote_objects import in_order
 from schemas.seal_contents import Contents
 from schemas.seal_metadata import ROOT, SEALED, sealed_root
 from schemas.shard_files import TABLES
 from schemas.storage import Storage
-
-_AT_ONCE = 16  # requests under way
-_WAITING = 4 * _AT_ONCE
-
-Item = TypeVar("Item")
 
 
 def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
@@ -63,23 +57,6 @@ def _copy_chunks(contents: Contents, field: Field, kept: int) -> None:
                 yield source, f"{folder}/{name}"
             there.discard(name)
 
-    _at_once(lambda pair: place.link_or_copy(*pair), missing())
+    for _ in in_order(lambda pair: place.link_or_copy(*pair), missing()):
+        pass
     place.delete([f"{folder}/{name}" for name in sorted(there)])
-
-
-def _at_once(do: Callable[[Item], object], items: Iterable[Item]) -> None:
-    """Do it to all items, several at a time and in no order; the first failure ends it and is raised."""
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        under_way: set[Future[object]] = set()
-        try:
-            for item in items:
-                if len(under_way) >= _WAITING:
-                    done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        future.result()
-                under_way.add(pool.submit(do, item))
-            for future in under_way:
-                future.result()
-        finally:
-            for future in under_way:
-                future.cancel()
