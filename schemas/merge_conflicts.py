@@ -28,8 +28,6 @@ def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int
     end = min(
         run.layout.scenes_per_shard * (shard + 1) for run, shard in ((one, shard_one), (other, shard_other))
     )
-    # Opened anew, so that their commits are not kept.
-    one, other = (Run(run.storage, run.manifest) for run in (one, other))
     scenes = range(first, end)
     for ours, theirs in zip(read_scenes(one, scenes), read_scenes(other, scenes), strict=True):
         found = _first_difference(one.schema, ours, theirs)

@@ -90,7 +90,7 @@ class Union:
 
     def commit_of(self, holding: Holding) -> Commit:
         """The source's commit of a holding, as the source has it."""
-        return _commit(self.runs[holding.source], holding.of)
+        return self.runs[holding.source].commit_of(holding.of)
 
     def cost_of(self, holding: Holding, commit: Commit) -> Cost:
         """A holding's cost, where its source's commit is this one."""
@@ -137,18 +137,12 @@ def plan_union(
 
 
 def _holdings(run: Run, source: int, cut: Cut) -> Iterator[Holding]:
-    for of in sorted(run.committed()):
-        commit = _commit(run, of)
+    for commit in run.commits():
         files = digest_of(sorted((entry.path, entry.sha256) for entry in commit.files))
         record = digest_of(commit.model_dump(mode="json"))
-        for shard in cut.shards(of):
+        for shard in cut.shards(commit.shard):
             name = cut.name(commit.attempt, shard)
-            yield Holding(source, of, commit.attempt, name, shard, files, record)
-
-
-def _commit(run: Run, shard: int) -> Commit:
-    # A run keeps the commits that it has read; here each is wanted twice, and there may be 100,000.
-    return Run(run.storage, run.manifest).commit_of(shard)
+            yield Holding(source, commit.shard, commit.attempt, name, shard, files, record)
 
 
 def _preference(holding: Holding, out: int | None, runs: Sequence[Run], layout: Layout) -> tuple[object, ...]:

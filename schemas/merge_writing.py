@@ -5,7 +5,9 @@ Every step skips what is there, so that a merge that was killed is finished by d
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Container, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -23,6 +25,7 @@ from schemas.shard_files import encode_shard
 from schemas.storage import Storage
 
 Tick = Callable[[], None]
+_AT_ONCE = 16  # files asked of a server at one time
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +99,17 @@ def _link(union: Union, run: Run, holding: Holding) -> bool:
     source, commit = union.runs[holding.source], union.commit_of(holding)
     source.check_files(commit)
     folder = shard_folder(holding.shard, holding.attempt)
-    for entry in commit.files:
-        key = f"{folder}/{entry.path}"
-        run.storage.adopt(source.storage, key, key, limit_bytes=entry.size)
-    run.storage.sync(f"{folder}/{entry.path}" for entry in commit.files)
+    sizes = {f"{folder}/{entry.path}": entry.size for entry in commit.files}
+
+    def adopt(key: str) -> None:
+        run.storage.adopt(source.storage, key, key, limit_bytes=sizes[key])
+
+    if run.storage.folder is None or source.storage.folder is None:
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            deque(pool.map(adopt, sizes), maxlen=0)
+    else:
+        deque(map(adopt, sizes), maxlen=0)
+    run.storage.sync(sizes)
     return run.commit(commit)
 
 
@@ -107,7 +117,7 @@ def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
     """Write pieces of one shard of a source as shards of their own; whether each became the union's."""
     source = union.runs[holdings[0].source]
     whole = union.commit_of(holdings[0])
-    arrays = read_shard(Run(source.storage, source.manifest), holdings[0].of)
+    arrays = read_shard(source, holdings[0].of)
     schema, layout = source.schema, union.layout
     won: list[bool] = []
     for holding in holdings:
@@ -137,7 +147,7 @@ def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
 
 def _is_lost(run: Run, holding: Holding) -> bool:
     """Whether the place has this shard from another attempt than was planned."""
-    return Run(run.storage, run.manifest).commit_of(holding.shard).attempt != holding.name
+    return run.commit_of(holding.shard).attempt != holding.name
 
 
 def _without(union: Union, lost: Iterable[Holding]) -> Union:

@@ -131,10 +131,15 @@ def _identity(storage: Storage) -> str:
     return storage.url if storage.folder is None else str(storage.folder.resolve())
 
 
+def _address(place: str) -> str:
+    if place.startswith("s3://"):
+        return place.rstrip("/")
+    return str(Path(place.removeprefix("file://")).expanduser().resolve())
+
+
 def _refuse_nested(places: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
     """Sources are never written to: the result cannot lie in one, nor one in the result."""
-    here = out.rstrip("/") if "://" in out else str(Path(out).expanduser().resolve())
-    roots = {_identity(open_storage(place, probe=False, create=False)) for place in places}
+    here, roots = _address(out), {_address(place) for place in places}
     known = {here, *(_identity(run.storage) for run in existing)}
     for other in sorted({*roots, *(_identity(run.storage) for run in sources)} - known):
         if here.startswith(f"{other}/") or other.startswith(f"{here}/"):

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from datagen.accounts import Books, account_for
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
+from schemas.fields import SCHEMAS
 from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
 from schemas.run import Run, shard_folder
@@ -27,6 +28,7 @@ from schemas.run_records import Cost, LedgerEntry, QuarantineRecord
 from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
+from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import commit_of, files_of, make_run, rows_of, small_spec, write
 
 PER_SCENE = 3
@@ -34,12 +36,29 @@ SCENES = 12  # of every run; its shards of 1 to 6 scenes divide them
 # Every example writes whole runs durably: few examples, short runs.
 # Shrinking one that fails would take an hour, so it is shown as it was found.
 few = settings(
-    max_examples=6,
+    max_examples=10,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
 )
 IN_MEMORY = Path("/dev/shm")  # where there is one: what is durable is for other tests
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_arrays() -> Iterator[None]:
+    """A merge of fifty arrays a shard takes the paths of one of few."""
+    with pytest.MonkeyPatch.context() as patch:
+        fields = (
+            "scene_index",
+            "house_id",
+            "redraws",
+            "retry",
+            "points_m",
+            "sample_id",
+            "sample_scene_index",
+        )
+        patch.setitem(SCHEMAS, "heuristic", small_schema((*fields, "candidate_index", "label", "distance_m")))
+        yield
 
 
 @dataclass(frozen=True)
