@@ -274,6 +274,9 @@ class _Driver(Generic[T]):
         self._tally.elsewhere += dropped
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
+        if not dropped:
+            self._look_s = float("inf")  # nobody, or nobody near: the next sign will tell
+            return
         # Listing a large run takes time: at most a small share of the driver's.
         self._look_s = self._looked_s + max(self._policy.look_s, self._policy.look_factor * took_s)
 

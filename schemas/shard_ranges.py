@@ -21,14 +21,14 @@ class ShardRanges(Sequence[int]):
         self._ends = np.cumsum(bounds[:, 1] - bounds[:, 0])  # shards up to the end of each range
 
     @classmethod
-    def of(cls, shards: Iterable[int]) -> ShardRanges:
+    def of(cls, shards: Iterable[int] | Bounds) -> ShardRanges:
         """The set of the given shards, in any order."""
         if isinstance(shards, ShardRanges):
             return shards
         if isinstance(shards, range) and shards.step == 1:
             bounds = [(shards.start, shards.stop)] if shards else []
             return cls(np.array(bounds, np.int64).reshape(-1, 2))
-        numbers = np.unique(np.fromiter(shards, np.int64))
+        numbers = np.unique(shards if isinstance(shards, np.ndarray) else np.fromiter(shards, np.int64))
         if not len(numbers):
             return cls(np.empty((0, 2), np.int64))
         breaks = np.flatnonzero(np.diff(numbers) > 1)
