@@ -96,14 +96,14 @@ def _deep(
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
     from datagen.deep import deep_findings
-    from datagen.remaking import open_origin
+    from datagen.replaying import origin_to_check
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))
     shares[: count % len(runs)] += 1
     mend = "Trust neither it nor its neighbours: find out what made it"
     for run, share in zip(runs, shares.tolist(), strict=True):
-        origin = open_origin(run, *sources)
+        origin = origin_to_check(run, *sources)
         folder = run.storage.url.removeprefix(place.url).strip("/")
         for where, shard, problem in deep_findings(run, share, origin, rng):
             key = where.removeprefix(f"{run.storage.url}/")

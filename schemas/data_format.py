@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from schemas.fields import OUTCOMES, REDRAW_CAUSES, SCHEMAS, Field, RecordSchema
+from schemas.fields import OUTCOMES, REDRAW_CAUSES, SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
 from schemas.run_records import FORMAT_VERSION
 from schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
 
@@ -49,6 +49,14 @@ import xarray, zarr
 zarr.open("RUN/data.zarr", mode="r")["label"][:]
 xarray.open_zarr("RUN/data.zarr")
 ```
+
+## Versions
+
+Schema version {SCHEMA_VERSION}; a run keeps the one it was begun with, and goes on in it under newer
+programs. A new array raises the version (`Field.since`); nothing that is stored is renamed, retyped,
+re-ranged or taken out. The versions of what makes scenes and labels are in the specification's `engines`,
+and so in its hash: code that gives the same input another sample needs a new `VERSION`, everything else
+does not ([what needs what](relabel-and-replay.md)).
 """
 
 _OUTCOME_HEAD = (
