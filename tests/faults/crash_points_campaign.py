@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import gc
 import json
 import os
 import random
@@ -22,10 +23,23 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy.random  # noqa: F401 - loaded once, not in every child
+from zarr.core.sync import cleanup_resources
+
 from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from tests.faults.crash_points_operations import OPERATIONS, Operation, Units, damage, small_schema, units
+from schemas.fields import SCHEMAS, sized_schema
+from schemas.shard_files import group_metadata
+from tests.faults.crash_points_operations import (
+    LAYOUT,
+    OPERATIONS,
+    Operation,
+    Units,
+    damage,
+    small_schema,
+    units,
+)
 from tests.faults.crash_points_shim import Call, Mode, Shim, read_log
+from tests.made_runs import small_spec
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 _REFUSED, _DEFECT = 3, 4
@@ -71,7 +85,7 @@ def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: in
     """Try the operations at all their points, or at so many of each kind of end."""
     findings: list[Finding] = []
     for operation in operations:
-        SCHEMAS["heuristic"] = small_schema(operation.fields)
+        _warm_up(operation)
         known = _reference(shim, work, operation)
         finding = Finding(operation.name, len(known.calls))
         for point in points(known.calls, sample):
@@ -79,6 +93,17 @@ def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: in
         shutil.rmtree(work / operation.name)
         findings.append(finding)
     return findings
+
+
+def _warm_up(operation: Operation) -> None:
+    """Set the operation's schema, and do what every child would begin with; no thread is left."""
+    SCHEMAS["heuristic"] = small_schema(operation.fields)
+    for seed in (0, 1):
+        spec = small_spec(seed)
+        group_metadata(sized_schema("heuristic", spec), LAYOUT, spec.hash())
+    cleanup_resources()
+    gc.collect()
+    gc.freeze()  # or a child's first collection would copy every page
 
 
 def points(calls: list[Call], sample: int | None) -> list[Point]:
@@ -100,7 +125,7 @@ def trace(shim: Shim, work: Path, operations: Iterable[Operation], log: Path) ->
     """Run the operations once each, and log their calls. Who traces finds them by the names looked for."""
     with log.open("wb") as f:
         for operation in operations:
-            SCHEMAS["heuristic"] = small_schema(operation.fields)
+            _warm_up(operation)
             _trace_one(shim, work / operation.name.replace(" ", "_"), operation, f)
 
 

@@ -36,6 +36,7 @@ _KEPT_TO_RELABEL = (
     *("sample_id", "sample_scene_index", "candidate_index", "label", "scene_index", "redraws"),
 )
 
+LAYOUT = Layout(scenes_per_shard=2, candidates_per_scene=5)  # that of `make_run`
 Units = dict[str, str]
 _HEURISTIC = SCHEMAS["heuristic"]
 
@@ -143,8 +144,7 @@ def _sealed(folder: Path) -> str:
 
 
 def _create(folder: Path) -> None:
-    layout = Layout(scenes_per_shard=2, candidates_per_scene=5)
-    manifest = manifest_of(small_spec(), layout).model_copy(update={"created": "2026-01-01"})
+    manifest = manifest_of(small_spec(), LAYOUT).model_copy(update={"created": "2026-01-01"})
     Run.create_or_open(open_storage(folder), manifest, 20)
 
 
@@ -290,11 +290,11 @@ OPERATIONS = (
     Operation("seal merged", _merged, _seal),
     Operation("unseal", _sealed_and_grown, lambda folder: unseal(open_storage(folder, probe=False))),
     Operation("index", lambda folder: _run(folder, 40, None), lambda folder: refresh_index(Run.open(folder))),
-    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("a", "b", "out")),
-    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("a", "b", "out")),
+    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("out",)),
+    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",)),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
     Operation("repair files", _damaged_files, _repair),
     Operation("gc", _littered, _collect, exact=True),
-    Operation("relabel", _relabelled, _relabel, places=("a", "out"), fields=_KEPT_TO_RELABEL),
+    Operation("relabel", _relabelled, _relabel, places=("out",), fields=_KEPT_TO_RELABEL),
 )
