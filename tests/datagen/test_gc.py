@@ -14,15 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
+from datagen.accounts import account_for
 from schemas.errors import InputError
 from schemas.garbage import find_garbage, sweep
 from schemas.index import index_files, refresh
 from schemas.jobs import JobRecord, Jobs, new_job_id
+from schemas.merged import open_runs
 from schemas.record_files import now
 from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
 from schemas.seal import seal
 from schemas.storage import Storage, StoredFile, open_storage
-from tests.made_runs import attempt, files_of, make_run, write
+from tests.made_runs import attempt, files_of, make_run, small_spec, write
 from tests.refusals import refused
 from tests.small_runs import json_of
 
@@ -161,6 +163,50 @@ def test_an_index_is_mended_on_the_way(tmp_path: Path, capsys: pytest.CaptureFix
     run = make_run(tmp_path, n=50)
     assert json_of(capsys, ["gc", str(tmp_path)])["found"]["index"]["pieces"] == 0
     assert len(index_files(run)) == 2
+
+
+def test_a_run_in_a_bucket_is_swept_as_on_a_disk(bucket: str, capsys: pytest.CaptureFixture[str]) -> None:
+    place = f"{bucket}/run"
+    run = make_run(place, n=50, shards=[0, 1, 2])  # type: ignore[arg-type]
+    attempt(run, 1, "late")
+    write(run, 3, "never-committed")
+    run.storage.put(f"{shard_folder(2, 'a-2')}/{REMOVING}", b"")
+    run.storage.put(f".probe-{'c' * 16}", b"first")
+    refresh(run)
+    before = sorted(f.key for f in run.storage.list("") if "late/" not in f.key and "never" not in f.key)
+    assert json_of(capsys, ["gc", place])["removed"]["files"] == 0
+    time.sleep(1.0)  # times in a bucket are whole seconds
+    done = json_of(capsys, ["gc", place, "--older-than", "0s"])
+    assert {kind: found["pieces"] for kind, found in done["found"].items()} == {
+        "attempts": 2, "drafts": 1, "probes": 1, "index": 0,
+    }  # fmt: skip
+    kept = {f.key for f in run.storage.list("")}
+    assert {key for key in before if REMOVING not in key and ".probe-" not in key} == kept
+    books = account_for([run])
+    run.storage.delete(index_files(run))
+    assert account_for([run]) == books and books.useful.attempts == 3
+    for shard in range(3):
+        run.check_digests(run.commit_of(shard))
+
+
+def test_a_merged_place_is_swept_with_its_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed in (0, 1):
+        run = make_run(tmp_path / f"run-{seed}", n=20, spec=small_spec(seed=seed))
+        attempt(run, 1, "late")
+    merged = tmp_path / "merged"
+    assert cli.run(["merge", *(str(tmp_path / f"run-{seed}") for seed in (0, 1)), "--out", str(merged)]) == 0
+    parts = open_runs(merged)
+    write(parts[0], 0, "other")
+    (merged / f".probe-{'c' * 16}").touch()
+    before = files_of(merged)
+    done = json_of(capsys, ["gc", str(merged), "--older-than", "0s"])
+    assert (done["found"]["attempts"]["pieces"], done["found"]["probes"]["pieces"]) == (1, 1)
+    after = files_of(merged)
+    gone = {key for key in before if key not in after}
+    assert all("/other/" in key or ".probe-" in key for key in gone) and len(gone) > 2
+    assert {key: before[key] for key in after if key in before} == {
+        k: v for k, v in after.items() if k in before
+    }
 
 
 class Turns:
