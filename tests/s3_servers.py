@@ -73,7 +73,7 @@ class Faults:
     lost_answer: float = 0.0  # done, and yet answered 500
     hold: float = 0.0  # no answer for `hold_s`; done or not, one time in two each
     cut: float = 0.0  # done; the answer breaks off in the middle of its body
-    lost_creates: float = 0.0  # of create-only puts, in place of the above: done, and yet answered 500
+    lost_creates: int = 0  # every so many-th create-only put, of commits and of others: done, answered 500
     hold_s: float = 0.0
     seed: int = 0
     down_after: list[int] = field(default_factory=list[int])  # counts of requests after which all fails
@@ -95,9 +95,10 @@ class Faults:
             self.seen["requests"] += 1
             if time.monotonic() >= self._up_s:
                 self.down, self._up_s = False, float("inf")
-            if creates and "/commits/" in path and not self.down:
-                self.seen["commits"] += 1
-                if self.down_at_commits and self.seen["commits"] > self.down_at_commits[0]:
+            what = "commits" if "/commits/" in path else "creates"
+            if creates and not self.down:
+                self.seen[what] += 1
+                if what == "commits" and self.down_at_commits and self.seen[what] > self.down_at_commits[0]:
                     self.down_at_commits.pop(0)
                     self.down, self._up_s = True, time.monotonic() + self.down_for_s
                     self.seen["lost_commit"] += 1
@@ -109,7 +110,7 @@ class Faults:
                 kind = "down"
             elif self.script:
                 kind = self.script.pop(0)
-            elif creates and self._random.random() < self.lost_creates:
+            elif creates and self.lost_creates and self.seen[what] % self.lost_creates == 0:
                 kind = "lost_answer"
             else:
                 kind = self._drawn()

@@ -4,7 +4,7 @@
 
 The server is moto's, on the loopback address. Of `rate` of all requests two parts in five are refused
 with 500 or 503; one part each is done and answered 500, done and cut off in its answer, and held until the
-client gives up, done or not. Of create-only puts three in ten are done and answered 500. The store is down
+client gives up, done or not. Every third create-only put is done and answered 500. The store is down
 for a while five times a campaign, twice right after it has taken a commit. Each campaign ends with a look
 at every byte: committed files, copies of commits and the sealed store equal those of a local run that
 nothing befell, and the ledger has every execution once, with its end. Anything else is an AssertionError.
@@ -31,7 +31,7 @@ def one(upstream: int, shards: int, seed: int, rate: float, folder: Path) -> Out
         error=2 * share,
         lost_answer=share,
         cut=share,
-        lost_creates=0.3,
+        lost_creates=3,
         hold=share,
         hold_s=1.5 * TIMEOUT_S,
         seed=seed,

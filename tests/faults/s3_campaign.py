@@ -28,6 +28,7 @@ from tests.cluster.simulated import Heard
 from tests.made_runs import make_run, manifest_of, small_spec, write
 from tests.s3_servers import Faults
 
+_COUNTS = ("requests", "pass", "commits", "creates")
 LAYOUT = Layout(scenes_per_shard=2, candidates_per_scene=5)
 
 
@@ -88,13 +89,11 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
             faults.down = False
     seen = faults.seen.copy()
     # The rest is looking.
-    faults.error = faults.lost_answer = faults.lost_creates = faults.hold = faults.cut = 0.0
-    faults.down_after, faults.down_at_commits = [], []
+    faults.error = faults.lost_answer = faults.hold = faults.cut = 0.0
+    faults.lost_creates, faults.down_after, faults.down_at_commits = 0, [], []
     _hold_to_ledger(run, executions.read_text().split())
     _hold_to_an_undisturbed_run(run, shards, folder / "undisturbed")
-    counts = Counter(
-        {kind: count for kind, count in seen.items() if kind not in ("requests", "pass", "commits")}
-    )
+    counts = Counter({kind: count for kind, count in seen.items() if kind not in _COUNTS})
     lines = len(executions.read_text().split())
     return Outcome(shards, jobs, lines, seen["requests"], counts, time.monotonic() - start_s)
 

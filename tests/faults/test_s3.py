@@ -16,7 +16,7 @@ def test_a_job_on_a_failing_store_is_resumed_until_it_is_done(
     faults = Faults(
         error=0.03,
         lost_answer=0.02,
-        lost_creates=0.3,
+        lost_creates=3,
         cut=0.02,
         hold=0.003,
         hold_s=3.0,
