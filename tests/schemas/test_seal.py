@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
+import threading
 import warnings
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 import xarray
 import zarr
 
-from schemas import shard_files
+from schemas import seal_local, shard_files
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.seal import SEALED, seal
@@ -174,3 +177,77 @@ def test_two_jobs_that_seal_at_the_same_time_leave_one_whole_store(tmp_path: Pat
     assert renames
     assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(run, [0, 1], 4, 20))
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(SEALED)] == [SEALED]
+
+
+def test_readers_find_a_whole_store_while_it_is_sealed_again_and_again(tmp_path: Path):
+    """One exchange of names: there is no moment without a store."""
+    run = make_run(tmp_path, n=20)
+    seal(run.storage)
+    done, failures, opened = threading.Event(), list[BaseException](), 0
+
+    def reader() -> None:
+        nonlocal opened
+        while not done.is_set():
+            try:
+                root = (tmp_path / SEALED / "zarr.json").read_bytes()
+                assert b"consolidated_metadata" in root
+                opened += 1
+            except (OSError, AssertionError) as e:
+                failures.append(e)
+                return
+
+    thread = threading.Thread(target=reader)
+    thread.start()
+    try:
+        for _ in range(10):
+            seal(run.storage)
+    finally:
+        done.set()
+        thread.join()
+    assert failures == [] and opened > 10
+
+
+def test_where_names_cannot_be_exchanged_two_renames_do(tmp_path: Path):
+    run = make_run(tmp_path, n=13)
+    seal(run.storage)
+    grown = make_run(tmp_path, n=37)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(seal_local, "_exchange", lambda one, other: False)
+        seal(grown.storage)
+        assert_equal(zarr.open_group(tmp_path / SEALED, mode="r"), expected(grown, [0, 1, 2, 3], 8, 37))
+        before = files_of(tmp_path)
+        refuse_renames_onto(tmp_path / SEALED, patch)
+        with pytest.raises(InputError, match="Input/output error"):
+            seal(grown.storage)
+    assert files_of(tmp_path) == before  # the old store got its name back
+
+
+def refuse_renames_onto(target: Path, patch: pytest.MonkeyPatch) -> None:
+    """Let the renaming of a finished store onto a free name fail."""
+    plain, refused = Path.rename, list[Path]()
+
+    def rename(path: Path, onto: Path) -> Path:
+        if onto == target and not target.exists() and not refused:
+            refused.append(path)
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return plain(path, onto)
+
+    patch.setattr(Path, "rename", rename)
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "empty folder"])
+def test_whatever_has_the_name_makes_way(tmp_path: Path, kind: str):
+    run = make_run(tmp_path / "run", n=20)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "kept").write_text("")
+    sealed = tmp_path / "run" / SEALED
+    if kind == "file":
+        sealed.write_text("no store")
+    elif kind == "link":
+        sealed.symlink_to(elsewhere)
+    else:
+        sealed.mkdir()
+    assert_equal(zarr.open_group(seal(run.storage), mode="r"), expected(run, [0, 1], 4, 20))
+    assert [p.name for p in sealed.parent.iterdir() if p.name.startswith(SEALED)] == [SEALED]
+    assert (elsewhere / "kept").exists()
