@@ -271,3 +271,21 @@ def test_labels_of_trials_do_not_follow_from_the_rule(
     assert cli.run(["submit", "plan", "--n", "8", "--out", str(plan), *more]) == 0
     arguments = ["relabel", str(plan), "--out", str(tmp_path / "run"), *RULE]
     refused(arguments, capsys, "label_source", "plan labels do not follow", "submit heuristic --scenes-from")
+
+
+def test_runs_on_s3_are_relabelled_and_replayed_there(
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = make_small_run(tmp_path / "run", 2 * PER_SCENE)
+    assert cli.run(["relabel", str(source), "--out", str(tmp_path / "here"), *RULE]) == 0
+    here = Run.open(tmp_path / "here")
+    first, second = f"{bucket}/first", f"{bucket}/second"
+    assert cli.run(["relabel", str(source), "--out", first, "--tau", "0.5"]) == 0
+    assert cli.run(["relabel", first, "--out", second, *RULE, "--tau", "0.4546"]) == 0
+    there = Run.open(second)
+    assert there.manifest.spec == here.manifest.spec
+    for mine, other in zip(there.commits(), here.commits(), strict=True):
+        assert mine.files == other.files
+        there.check_digests(mine)
+    told = json_of(capsys, ["replay", second, arrays_of(tmp_path / "here")["sample_id"][11].tobytes().hex()])
+    assert told["equal"] and told["drawn_again"] and told["sample"]["candidate"] == 3
