@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from datagen.accounts import account_for
+from datagen.cli import EXIT_INTERRUPTED
 from datagen.console import print_json, print_rows, seconds
 from datagen.steps import steps
-from schemas.errors import InputError
 from schemas.lineage import lineage_summary
 from schemas.merge_writing import Written
 from schemas.merged import open_runs, wanted
@@ -30,13 +31,17 @@ def merge(
     refused, and so are runs that hold other rows of one scene. Files are linked, not copied, wherever shards
     are of one size. Sources stay as they are. The same command again finishes a merge that was cut short.
     """
-    if not runs:
-        raise InputError("datagen merge", "RUN", "no run is named", "Name the runs to merge")
     commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
-    with steps("commits read", commits, True if json else None) as step:
-        planned = plan_merge(runs, out, step)
-    with steps("records written", planned.records, True if json else None) as step:
-        result = carry_out(planned, step)
+    try:
+        with steps("commits read", commits, True if json else None) as step:
+            planned = plan_merge(runs, out, step)
+        with steps("records written", planned.records, True if json else None) as step:
+            result = carry_out(planned, step)
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            f"interrupted. Go on with:\n  {shlex.join(['datagen', 'merge', *runs, '--out', out])}\n"
+        )
+        return EXIT_INTERRUPTED
     report = merge_report(planned, result)
     if json:
         print_json(report)
@@ -85,7 +90,7 @@ def _part(run: Run, written: Written | None) -> dict[str, Any]:
 
 def _print(report: dict[str, Any]) -> None:
     missing = sum(part["missing_shards"] for part in report["runs"])
-    state = f"; {missing} shards are missing" if missing else ""
+    state = f"; missing shards: {missing}" if missing else ""
     out = report["out"]
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
