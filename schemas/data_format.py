@@ -26,6 +26,8 @@ RUN/
   ledger/<attempt>.start.json    an attempt began
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a shard given up: seeds, causes, stacks
+  quarantine/<shard>.lifted-<k>.json  one that was given up, and then tried again
+  jobs/<job>.json                a driver that began; .state.json says how it is, .stop.json asks it to stop
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
 ```
 

@@ -179,7 +179,7 @@ class Run:
             data = self.storage.get(key, MAX_RECORD_BYTES)
             if data is None:
                 place = f"{self.storage.url}/{key}"
-                raise InputError(place, "", "no such commit", "Submit the run again to make the shard")
+                raise InputError(place, "", "no such commit", "Make it with `datagen resume`")
             while len(self._commits) >= _COMMITS_KEPT:
                 del self._commits[next(iter(self._commits))]
             self._commits[shard] = self.decode_commit(shard, data)
@@ -262,7 +262,7 @@ class Run:
         sizes = {f.key: f.size for f in self.storage.list(folder)}
         if committing and (mark := f"{folder}/{REMOVING}") in sizes:
             place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
-            return InputError(place, "", problem, "Submit the run again")
+            return InputError(place, "", problem, "Make it again with `datagen resume`")
         for entry in commit.files:
             size = sizes.get(f"{folder}/{entry.path}")
             if size != entry.size:
@@ -270,7 +270,7 @@ class Run:
                     f"{self.storage.url}/{folder}/{entry.path}",
                     "",
                     "missing" if size is None else f"{size} bytes, where the commit has {entry.size}",
-                    f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
+                    "Restore the file from a copy, or mend the run with `datagen repair`",
                 )
         return None
 
@@ -286,7 +286,7 @@ class Run:
                     f"{self.storage.url}/{key}",
                     "sha256",
                     "the file is damaged",
-                    f"Restore the file, or remove {commit_key(commit.shard)} and submit again",
+                    "Restore the file from a copy, or mend the run with `datagen repair`",
                 )
 
     # Quarantine.

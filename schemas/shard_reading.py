@@ -28,7 +28,7 @@ Array = npt.NDArray[Any]
 
 MAX_META_BYTES = 2**20
 MAX_DECODED_BYTES = 2**30  # no chunk of ours comes near; a larger one is hostile
-_MEND = "Restore the file from a copy, or remove the shard's commit and submit the run again"
+_MEND = "Restore the file from a copy, or mend the run with `datagen repair`"
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,10 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
         if array.is_text:
             if _content_bytes(packed) > min(4 + count * (4 + MAX_TEXT_BYTES), MAX_DECODED_BYTES):
                 raise ValueError("more text than names can have")
-            return VLenUTF8().decode(Zstd().decode(packed)).reshape(shape)
+            raw = Zstd().decode(packed)
+            if int.from_bytes(raw[:4], "little") != count:  # before that many places are set aside
+                raise ValueError("another number of names")
+            return VLenUTF8().decode(raw).reshape(shape)
         out = np.empty(shape, np.dtype(array.dtype).newbyteorder("<"))
         if _content_bytes(packed) != out.nbytes:
             raise ValueError(f"{_content_bytes(packed)} bytes")

@@ -11,8 +11,8 @@ from pathlib import Path
 from schemas.errors import InputError
 
 _MENDS = {
-    errno.ENOSPC: "Free disk space or write to another disk, then submit again: the run resumes",
-    errno.EDQUOT: "Free disk space or raise the quota, then submit again: the run resumes",
+    errno.ENOSPC: "Free disk space or write to another disk, then go on with `datagen resume`",
+    errno.EDQUOT: "Free disk space or raise the quota, then go on with `datagen resume`",
     errno.EACCES: "Give yourself read and write permission there, or choose another folder",
     errno.EPERM: "Choose a folder on a file system that allows this (hard links, permissions)",
     errno.EROFS: "Choose a folder that can be written",
@@ -24,7 +24,7 @@ _MENDS = {
 }
 _OTHER_MEND = "Check that the place exists, is reachable and can be written"
 
-_RESUME = "then submit again: the run resumes"
+_RESUME = "then go on with `datagen resume`"
 _KEYS_MEND = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
 _ENDPOINT_MEND = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"

@@ -42,9 +42,9 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Committ
         return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
         return CommittedShard(shard, None, ())  # there is nothing that it could have committed
-    mend = "Restore the file from a backup; or remove it, and submit again: the shard is made anew"
+    mend = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard anew"
     if ours.data is None and ours.problem == "missing":
-        mend = "Submit the run again: the shard is open, and is made anew"
+        mend = "Make it anew with `datagen resume`: the shard is open"
     problem = f"{ours.problem}, and {'no copy of it' if not copies else 'several attempts left copies'}"
     return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, mend, shard),))
 

@@ -132,7 +132,7 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
             if name.isascii() and name.isdigit() and len(name) < 10 and f"{folder}/{name}.json" == file.key:
                 numbers.add(int(name))
     n = 0
-    mend = "Restore the file from a backup, or submit again with the n that was wanted"
+    mend = "Restore the file from a backup, or say with `datagen extend` what was wanted"
     if max(numbers) > 10 * len(numbers) + 1000:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
         return 0, [Finding("plans", "record", problem, "Move it away")]

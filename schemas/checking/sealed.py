@@ -159,7 +159,7 @@ def check_store(
         yield curable(SEALED, "sealed", problem, Reseal())
     if tally.lost:  # their rows are whole here: nothing is sealed over them
         problem = f"holds {tally.lost} shards whose commits are lost: it cannot be checked"
-        mend = "Submit the run again: the shards are made again, and sealed with the others"
+        mend = "Make the shards again with `datagen resume`, which seals them with the others"
         yield Finding(SEALED, "sealed", problem, mend)
     if tally.unknown or tally.lost:
         return

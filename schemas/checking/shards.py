@@ -28,7 +28,7 @@ from schemas.shard_files import (
 from schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from schemas.storage import StoredFile
 
-_WRITTEN_SO = "It was written so: remove the commit and its copy, and submit again"
+_WRITTEN_SO = "It was written so: remove the commit and its copy, and `datagen resume` makes it anew"
 # What the checks of a shard's rows need together; every other array is looked at by itself.
 _KEYS = ("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
 
