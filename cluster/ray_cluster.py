@@ -59,8 +59,11 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         options = {}
     with _environment(wanted):  # workers inherit it; the caller's own stays as it was
         import ray
+        from ray._private import ray_constants
         from ray.exceptions import AuthenticationError
 
+        # As in the environment, for a process that imported Ray before.
+        ray_constants.ENABLE_RAY_CLUSTER = False  # pyright: ignore[reportPrivateImportUsage]
         forget_former_token()
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)

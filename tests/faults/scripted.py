@@ -5,13 +5,19 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import resource
 import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from cluster.guard import Meter
 from cluster.task import JobCannotGoOn, Product
+from schemas.fields import sized_schema
+from schemas.run_records import Layout
+from tests.made_runs import small_spec, tables_of
 
 
 @dataclass(frozen=True)
@@ -62,10 +68,31 @@ def misbehave(word: str) -> None:
         raise ValueError("a scene\nof two lines")
     elif word == "memory":
         raise MemoryError
+    elif word == "memory_limit":
+        resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+        GROWN.append(bytearray(16 << 30))
+    elif word == "fill_memory":
+        GROWN.append(bytearray(b"\1") * FILL_BYTES)
+        time.sleep(600)
+    elif word in ("not_finite", "one_row_less"):
+        hand_over_bad_rows(word)
     elif word == "disk":
         raise JobCannotGoOn(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
     elif word == "grow":
         GROWN.append(bytearray(os.urandom(1) * (300 << 20)))
 
 
+def hand_over_bad_rows(word: str) -> None:
+    """Let the check that every shard passes see rows that it must refuse."""
+    spec = small_spec()
+    schema = sized_schema("heuristic", spec)
+    _, rows = tables_of(schema, Layout(scenes_per_shard=2, candidates_per_scene=5), seed=0, shard=0)
+    if word == "not_finite":
+        rows["visibility"][3] = np.nan
+    else:
+        rows["visibility"] = rows["visibility"][:-1]
+    schema.check("sample", 10, rows)
+
+
 GROWN: list[bytearray] = []
+FILL_BYTES = 4 << 30

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,21 +79,56 @@ def play(
     return Played(summary, books, folder)
 
 
-def test_crashes_exits_kills_and_exceptions_are_told_apart_and_others_complete(
+@dataclass(frozen=True)
+class Fate:
+    """How an attempt that does `words[0]` first must stand in the ledger, and how the shard ends."""
+
+    words: tuple[str, ...]
+    outcomes: list[str]
+    cause: str  # a pattern for the first attempt's cause
+    stack: str = ""  # what the first attempt's stack names; "" where there can be none
+    given_up: bool = False
+
+
+DIED = "the worker process died"
+FATES = {
+    # Killed from within or without: where native code fails, its stack is there.
+    "segfault": Fate(("segfault",), ["crashed", "committed"], "Fatal Python error: Segm", "misbehave"),
+    "abort": Fate(("abort",), ["crashed", "committed"], "Fatal Python error: Aborted", "misbehave"),
+    "kill": Fate(("kill",), ["crashed", "committed"], DIED),
+    # Ends without a word, be its status good or bad.
+    "silent exit": Fate(("silent_exit",), ["crashed", "committed"], DIED),
+    "exit": Fate(("exit",), ["crashed", "committed"], DIED),
+    "SystemExit": Fate(("system_exit",), ["crashed", "committed"], DIED),
+    # Fails and says so.
+    "exception": Fate(("raise",), ["failed", "committed"], "ValueError: a scene of two lines", "misbehave"),
+    "NaN": Fate(("not_finite",), ["failed", "committed"], "InputError: .*visibility: NaN", "hand_over_bad"),
+    "shape": Fate(("one_row_less",), ["failed", "committed"], r"InputError: .*shape \(9,\)", "hand_over_bad"),
+    # Memory.
+    "MemoryError": Fate(("memory",), ["out_of_memory", "committed"], "MemoryError", "misbehave"),
+    "limit": Fate(("memory_limit",), ["out_of_memory", "committed"], "MemoryError", "misbehave"),
+    # Each has a budget of its own: three failures of any kind, two out of memory, and they do not add up.
+    "failures": Fate(("segfault", "raise", "kill"), ["crashed", "failed", "crashed"], "Fatal", given_up=True),
+    "memory twice": Fate(("memory",) * 2, ["out_of_memory"] * 2, "MemoryError", given_up=True),
+    "mixed": Fate(
+        ("raise", "memory", "kill"), ["failed", "out_of_memory", "crashed", "committed"], "ValueError"
+    ),
+}
+
+
+def test_every_way_to_die_has_its_outcome_its_cause_its_stack_and_its_budget(
     ray: Any, tmp_path: Path
 ) -> None:
-    words = {0: ("segfault",), 1: ("exit",), 2: ("kill",), 3: ("raise",), 4: ("system_exit",), 5: ("memory",)}
-    played = play(ray, tmp_path, words, shards=12)
-    assert played.summary.end == "complete" and played.summary.tally.committed == 12
-    for shard in (0, 1, 2, 4):
-        assert played.ends(shard) == ["crashed", "committed"]
-    assert played.ends(3) == ["failed", "committed"]
-    assert played.ends(5) == ["out_of_memory", "committed"]
-    segfault = next(e for e in played.books.entries if e.shard == 0)
-    assert segfault.cause == "Fatal Python error: Segmentation fault" and "misbehave" in segfault.stack
-    failed = played.entry("failed")
-    assert failed.cause == "ValueError: a scene of two lines" and "misbehave" in failed.stack
-    assert failed.cost.wall_s > 0 and failed.host.pid > 0
+    words = {shard: fate.words for shard, fate in enumerate(FATES.values())}
+    played = play(ray, tmp_path, words, shards=len(FATES) + 4)
+    assert played.summary.tally.committed == 4 + sum(not fate.given_up for fate in FATES.values())
+    for shard, (name, fate) in enumerate(FATES.items()):
+        first = next(e for e in played.books.entries if e.shard == shard)
+        assert played.ends(shard) == fate.outcomes, name
+        assert re.match(fate.cause, first.cause), f"{name}: {first.cause}"
+        assert fate.stack in first.stack and bool(first.stack) >= bool(fate.stack), name
+        assert first.host is not None and first.host.pid > 0 and first.cost.wall_s >= 0, name
+        assert (shard in played.books.given_up) == fate.given_up, name
     committed = played.entry("committed")
     assert committed.cost.peak_rss_bytes > 10 << 20 and committed.started <= committed.ended
 

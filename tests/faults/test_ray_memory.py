@@ -1,0 +1,53 @@
+"""A worker that fills the machine's memory is ended by Ray, and its shard tried again with twice as much."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import psutil
+import pytest
+
+from cluster.driver import Order, drive
+from cluster.guard import notes_of_a_job
+from cluster.policy import Policy
+from cluster.ray_cluster import RaySettings, ray_cluster
+from cluster.ray_executor import RayExecutor
+from cluster.stop import StopRequest
+from tests.cluster.simulated import Heard, PaperBooks
+from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
+
+
+def test_who_fills_the_memory_is_ended_and_tried_again_with_twice_as_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray._private.utils import get_system_memory, get_used_memory
+
+    total = get_system_memory()
+    # Ray counts by the limits of a container where there are some, or else as the system does.
+    used = max(get_used_memory(), total - psutil.virtual_memory().available)
+    if total - used < 2 * FILL_BYTES:
+        pytest.skip("too little free memory to fill some of it")
+    # As if the machine ended at half of what will be filled.
+    threshold = (used + FILL_BYTES / 2) / total
+    monkeypatch.setenv("RAY_memory_usage_threshold", f"{threshold:.4f}")
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    (tmp_path / "tries").mkdir()
+    settings, books = RaySettings(workers=1, memory_bytes=100 << 20), PaperBooks()
+    factors: list[float] = []
+    with notes_of_a_job() as notes, ray_cluster(settings) as ray:
+
+        def make_task(order: Order) -> ScriptedTask:
+            factors.append(order.memory_factor)
+            tries = str(tmp_path / "tries")
+            return ScriptedTask(0, order.attempt, 60, notes, ("fill_memory",), order.memory_factor, tries)
+
+        policy = Policy(max_quarantined_share=1.0, backoff_s=0.05)
+        summary = drive(
+            [0], make_task, RayExecutor(perform, settings, ray), books, policy, Heard(), StopRequest()
+        )
+    assert summary.tally.committed == 1 and factors == [1.0, 2.0]
+    ended, committed = books.entries
+    assert (ended.outcome, committed.outcome) == ("out_of_memory", "committed")
+    assert "memory" in ended.cause and ended.host is not None and ended.host.pid != os.getpid()
+    assert ended.cost is not None and ended.cost.wall_s > 0
