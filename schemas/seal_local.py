@@ -57,10 +57,11 @@ def unseal_folder(folder: Path) -> None:
         (folder / SEALED).rename(draft)
         _sync_folder(folder)
     except FileNotFoundError:
-        return  # another process was first
+        pass  # there is none, or another process was first
     except OSError as e:
         raise storage_error(folder / SEALED, e) from e
-    remove_tree(draft)
+    finally:
+        remove_tree(draft)
 
 
 def draft_of(folder: Path) -> Path:
