@@ -22,13 +22,23 @@ RUN/
   plans/<k>.json                 samples wanted; the highest k counts, a run only grows
   shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
   commits/<shard>.json           written last, create-only: the attempt, every file's size and sha256, cost
-  copies/...                     second copies of manifest and plans; a commit's is in its attempt's folder
+  copies/...                     second copies of the root's records; a commit's is in its attempt's folder
   ledger/<attempt>.start.json    an attempt began
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a shard given up: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  one that was given up, and then tried again
   jobs/<job>.json                a driver that began; .state.json says how it is, .stop.json asks it to stop
+  lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
+```
+
+Runs of several specifications that were merged ([merging](merging.md)) lie in one place:
+
+```
+PLACE/
+  merged.json                    the specification hashes of its parts, ascending: the order of their rows
+  parts/<hash>/                  each part a whole run as above, named by 16 digits of its hash
+  data.zarr/                     one store over all parts; its `parts` attribute says what is of whom
 ```
 
 Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are all

@@ -58,7 +58,8 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     """
     if not places:
         raise InputError("datagen merge", "RUN", "no run is named", "Name the runs to merge")
-    existing = _existing(out)
+    place = _place(out)
+    existing = open_runs(place) if place is not None and _holds_runs(place) else []
     sources = _distinct([run for place in places for run in open_runs(place)])
     refuse_incompatible(sources)
     if existing:
@@ -72,6 +73,9 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     layout = common_layout(run.layout for group in groups.values() for run in group)
     hashes = tuple(sorted(groups))
     _refuse_other_place(existing, hashes, layout)
+    if place is not None and not existing:
+        # A merge that was cut short at once may have left parts that nothing names yet.
+        refuse_foreign(place, *(("parts/",) if len(hashes) > 1 else ()))
     here = {run.manifest.spec_hash for run in existing}
     unions = tuple(
         plan_union(groups[spec_hash], 0 if spec_hash in here else None, layout, tick)
@@ -87,8 +91,6 @@ def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
     Doing it again finishes what was cut short, and changes nothing where it is done.
     """
     place = open_storage(merge.out)
-    if not merge.existing:
-        refuse_foreign(place, *(() if merge.is_ordinary else ("parts/",)))
     runs: list[Run] = []
     for union in merge.unions:
         spec_hash = union.manifest.spec_hash
@@ -110,17 +112,18 @@ def _seal(place: Storage) -> str:
     return seal(place)
 
 
-def _existing(out: str) -> list[Run]:
-    """What stands at the place of the result; nothing where it is new."""
+def _place(out: str) -> Storage | None:
+    """The place of the result as it is now; None where the folder is still to be made."""
     try:
-        storage = open_storage(out, probe=False, create=False)
+        return open_storage(out, probe=False, create=False)
     except InputError as e:
         if e.problem == "no such folder":
-            return []
+            return None
         raise
-    if not storage.exists("manifest.json") and not storage.exists(MERGED):
-        return []
-    return open_runs(storage)
+
+
+def _holds_runs(place: Storage) -> bool:
+    return place.exists("manifest.json") or place.exists(MERGED)
 
 
 def _distinct(runs: Sequence[Run]) -> list[Run]:
