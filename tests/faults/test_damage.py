@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from schemas.fields import SCHEMAS
+from tests.faults.crash_points_operations import small_schema
 from tests.faults.damage_campaign import (
     Campaign,
     Damage,
@@ -18,6 +21,16 @@ from tests.faults.damage_campaign import (
     make_place,
     try_all,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fewer_arrays() -> Iterator[None]:
+    """Runs of fewer files, of every sort."""
+    names = ("scene_index", "redraws", "house_id", "points_m")
+    samples = ("sample_id", "sample_scene_index", "candidate_index", "label")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SCHEMAS, "heuristic", small_schema((*names, *samples)))
+        yield
 
 
 @pytest.fixture(scope="module")
