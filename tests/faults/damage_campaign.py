@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,11 +15,13 @@ import numpy as np
 from schemas.checking.finding import Finding
 from schemas.checking.mending import Mended, mend_place
 from schemas.checking.place import Checked, check_place
+from schemas.fields import SCHEMAS
 from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from schemas.seal import seal
 from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
+from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import make_run, now, rows_of
 
 # What has no second source: its loss is found, and cannot be undone bit for bit.
@@ -52,6 +55,19 @@ class Campaign:
                 for bad in (self.missed, self.not_restored, self.not_clean)
             ]
             yield kind, self.tried[kind], counts[0], self.mended[kind], counts[1], counts[2]
+
+
+@contextmanager
+def fewer_arrays() -> Generator[None]:
+    """Runs of fewer files meanwhile, of every sort: what is damaged is looked at a thousand times."""
+    names = ("scene_index", "redraws", "house_id", "points_m")
+    samples = ("sample_id", "sample_scene_index", "candidate_index", "label")
+    before = SCHEMAS["heuristic"]
+    SCHEMAS["heuristic"] = small_schema((*names, *samples))
+    try:
+        yield
+    finally:
+        SCHEMAS["heuristic"] = before
 
 
 def make_place(

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.fields import SCHEMAS
-from tests.faults.crash_points_operations import small_schema
 from tests.faults.damage_campaign import (
     Campaign,
     Damage,
     cuts,
+    fewer_arrays,
     findings_at,
     flips,
     keys_of,
@@ -24,12 +23,9 @@ from tests.faults.damage_campaign import (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def fewer_arrays() -> Iterator[None]:
-    """Runs of fewer files, of every sort."""
-    names = ("scene_index", "redraws", "house_id", "points_m")
-    samples = ("sample_id", "sample_scene_index", "candidate_index", "label")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(SCHEMAS, "heuristic", small_schema((*names, *samples)))
+def quick() -> Iterator[None]:
+    """Runs of few files."""
+    with fewer_arrays():
         yield
 
 
