@@ -19,12 +19,25 @@ from schemas.run_records import FORMAT_VERSION, Commit, Cost, Digest, Host, Ledg
 
 _STAGES = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s")
 _COST_FIELDS = set(Cost.model_fields)
+_COSTS = ("cpu_s", "peak_rss_bytes", "written_bytes")  # a number in each row that has wall_s
 _OUTCOMES: frozenset[str] = frozenset(get_args(Outcome))
 # Longer causes and larger numbers stay in their records alone: a table keeps floats.
 _MAX_CAUSE_CHARS = 1000
 _MAX_INTEGER = 2**53
 # What one table file may unpack to. A file of our own stays far below.
 _MAX_TABLE_BYTES = 128 * 2**20
+
+
+class LateCost:
+    """The cost in a row of a table, made when it is asked for: most who look at heads do not."""
+
+    __slots__ = ("_row", "_table")
+
+    def __init__(self, table: HeadTable, row: int) -> None:
+        self._table, self._row = table, row
+
+    def read(self) -> Cost:
+        return self._table.cost(self._row)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +50,12 @@ class CommitHead:
     samples: int
     positives: int
     redraws: Mapping[str, int]
-    cost: Cost
+    paid: Cost | LateCost
     host: Host
+
+    @property
+    def cost(self) -> Cost:
+        return self.paid.read() if isinstance(self.paid, LateCost) else self.paid
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +66,12 @@ class EndHead:
     shard: int
     outcome: Outcome
     cause: str
-    cost: Cost | None
+    paid: Cost | LateCost | None
+
+    @property
+    def cost(self) -> Cost | None:
+        """None where the attempt left no account of itself."""
+        return self.paid.read() if isinstance(self.paid, LateCost) else self.paid
 
 
 Kind = Literal["commits", "ends"]
@@ -120,14 +142,15 @@ class HeadTable:
 
     def head(self, row: int) -> CommitHead | EndHead:
         """The head in a row. ValueError, KeyError or TypeError where the columns do not make one."""
-        cost = self._cost(row)
+        wall_s = self.numbers.get("wall_s")
+        paid = LateCost(self, row) if wall_s is not None and wall_s[row] is not None else None
         attempt, shard = self.texts["attempt"][row], self._integer("shard", row)
         if self.kind == "ends":
             outcome = self.texts["outcome"][row]
             if outcome not in _OUTCOMES:
                 raise ValueError(outcome)
-            return EndHead(attempt, shard, outcome, self.texts["cause"][row], cost)  # type: ignore[arg-type]
-        if cost is None:
+            return EndHead(attempt, shard, outcome, self.texts["cause"][row], paid)  # type: ignore[arg-type]
+        if paid is None:
             raise ValueError("a commit without its cost")
         return CommitHead(
             shard,
@@ -136,21 +159,17 @@ class HeadTable:
             self._integer("samples", row),
             self._integer("positives", row),
             {name: int(count) for name, count in self._part("redraws", row).items()},
-            cost,
+            paid,
             _host(self.texts["host"][row]),
         )
 
-    def _cost(self, row: int) -> Cost | None:
-        wall_s = self.numbers.get("wall_s")
-        if wall_s is None or (seconds := wall_s[row]) is None:
-            return None
-        cpu_s = self.numbers["cpu_s"][row]
-        if cpu_s is None:
-            raise ValueError("a cost without CPU seconds")
+    def cost(self, row: int) -> Cost:
+        """The cost in a row that has one."""
+        numbers = self.numbers
         return Cost.model_construct(  # validated when its record was read
             _COST_FIELDS,
-            wall_s=seconds,
-            cpu_s=cpu_s,
+            wall_s=numbers["wall_s"][row],
+            cpu_s=numbers["cpu_s"][row],
             stage_wall_s=self._part("stage_wall_s", row),
             stage_cpu_s=self._part("stage_cpu_s", row),
             stage_gpu_s=self._part("stage_gpu_s", row),
@@ -274,6 +293,10 @@ def decode_table(place: str, data: bytes, spec_hash: str) -> HeadTable:
     columns = (record.stamps, *texts.values(), *record.numbers.values())
     if any(len(column) != len(record.names) for column in columns):
         raise ValueError("columns of different lengths")
+    walls = [seconds is None for seconds in record.numbers.get("wall_s", ())]
+    for name in _COSTS if walls else ():
+        if [number is None for number in record.numbers.get(name, ())] != walls:
+            raise ValueError("parts of a cost")
     return HeadTable(record.kind, record.names, record.stamps, texts, record.numbers)
 
 
