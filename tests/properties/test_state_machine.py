@@ -1,0 +1,429 @@
+"""Any history of commits, crashes, resumes, merges and mends leaves what a plain dictionary says.
+
+The model knows for each place which scenes of which specification are committed, how many samples are
+wanted, what is in quarantine and what is sealed. After every step the place says the same.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from cluster.books import close_lost_attempts
+from datagen.relabel import relabel_all, relabelled_specification
+from schemas.checking.mending import mend_place
+from schemas.checking.place import Checked, check_place
+from schemas.errors import InputError
+from schemas.fields import SCHEMAS, sized_schema
+from schemas.garbage import find_garbage, sweep
+from schemas.identity import sample_ids
+from schemas.merged import open_runs
+from schemas.merging import carry_out, plan_merge
+from schemas.quarantine import lift_quarantine
+from schemas.record_files import now
+from schemas.run import Run, commit_key, shard_folder
+from schemas.run_records import Layout, QuarantineRecord
+from schemas.seal import SEALED, seal, unseal
+from schemas.shard_files import encode_shard
+from schemas.specification import HeuristicParams, Specification
+from schemas.storage import open_storage
+from tests.made_runs import attempt, manifest_of, small_spec, tables_of, write
+from workers.labels import heuristic, load_label_source
+
+LAYOUT = Layout(scenes_per_shard=1, candidates_per_scene=2)
+PER_SHARD = LAYOUT.samples_per_shard
+SHARDS_AT_MOST = 5
+PLACES_AT_MOST = 5
+RULES = {"": HeuristicParams(), "near": HeuristicParams(mu=0.3), "far": HeuristicParams(mu=0.9, tau=0.2)}
+EXAMPLES, STEPS = 200, 50
+
+# Every column would cost four times the time and show nothing more of the protocol.
+_KEPT = {
+    "scene_index", "redraws", "house_id", "points_m",
+    "sample_id", "sample_scene_index", "candidate_index", "arm_reach_m", "distance_m", "mount_distance_m",
+    "visibility", "heuristic_score", "label", "label_version",
+}  # fmt: skip
+SMALL = replace(
+    SCHEMAS["heuristic"],
+    scene_fields=tuple(f for f in SCHEMAS["heuristic"].scene_fields if f.name in _KEPT),
+    sample_fields=tuple(f for f in SCHEMAS["heuristic"].sample_fields if f.name in _KEPT),
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the model knows of one run: its specification is named by a seed and a rule."""
+
+    n: int
+    committed: frozenset[int] = frozenset()
+    quarantined: frozenset[int] = frozenset()
+
+    @property
+    def planned(self) -> range:
+        return range(-(-self.n // PER_SHARD))
+
+    @property
+    def missing(self) -> list[int]:
+        return sorted(set(self.planned) - self.committed - self.quarantined)
+
+
+@dataclass
+class Place:
+    """A folder, and what it must hold. `sealed` is what the store was laid over."""
+
+    folder: Path
+    parts: dict[tuple[int, str], Part]
+    sealed: dict[tuple[int, str], Part] | None = None
+
+    @property
+    def rule(self) -> str:
+        return next(iter(self.parts))[1]
+
+
+# Specifications by seed and rule; those of relabelled runs come from the program.
+SPECS: dict[tuple[int, str], Specification] = {}
+
+
+def specification(seed: int, rule_name: str) -> Specification:
+    """The drawn run of a seed, or that run relabelled by another rule."""
+    if not rule_name and (seed, "") not in SPECS:
+        SPECS[seed, ""] = small_spec(seed, engines={"labels": str(load_label_source("heuristic").version)})
+    return SPECS[seed, rule_name]
+
+
+def united(one: Part, other: Part) -> Part:
+    """What a merge of two runs of one specification holds."""
+    committed = one.committed | other.committed
+    return Part(max(one.n, other.n), committed, (one.quarantined | other.quarantined) - committed)
+
+
+def changed_fields(params: HeuristicParams) -> dict[str, Any]:
+    return params.model_dump(exclude_defaults=True)
+
+
+def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
+    """(ids, labels) that a store over these parts must hold, from the drawn rows alone."""
+    ids, labels = [], []
+    order = sorted(sealed, key=lambda key: specification(*key).hash())
+    for key in order:
+        spec, part = specification(*key), sealed[key]
+        for shard in sorted(part.committed & set(part.planned)):
+            rows = drawn_rows(key[0], shard)
+            label = rows["label"]
+            if key[1]:
+                d, mount, reach, rho = (
+                    rows[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")
+                )
+                _, label = heuristic.heuristic(d, mount, reach, rho, RULES[key[1]])
+            # Only a run alone, or the last of several, is cut to what is wanted.
+            kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == order[-1] else PER_SHARD
+            ids.append(sample_ids(spec.hash(), shard, np.arange(PER_SHARD))[:kept])
+            labels.append(label[:kept])
+    return np.concatenate(ids), np.concatenate(labels)
+
+
+@cache
+def drawn_rows(seed: int, shard: int) -> Any:
+    spec = specification(seed, "")
+    return tables_of(sized_schema("heuristic", spec), LAYOUT, seed, shard, spec.hash())[1]
+
+
+def files_of_shard(run: Run, shard: int) -> dict[str, bytes]:
+    """The files of a shard as its attempt wrote them, made from the seed and the rule again."""
+    spec = run.manifest.spec
+    scenes, samples = tables_of(run.schema, LAYOUT, spec.seed, shard, run.manifest.spec_hash)
+    if spec.scenes_from is not None:
+        distances = (samples[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility"))
+        samples["heuristic_score"], samples["label"] = heuristic.heuristic(*distances, spec.heuristic)
+        samples["label_version"][:] = heuristic.VERSION
+    return encode_shard(run.schema, LAYOUT, run.manifest.spec_hash, scenes, samples)
+
+
+def findings(place: Place) -> list[Any]:
+    """What `verify` calls damage."""
+    storage = open_storage(place.folder, probe=False)
+    return [finding for finding in check_place(storage, Checked()) if finding.is_damage]
+
+
+def close_all(place: Place) -> None:
+    for run in open_runs(place.folder):
+        close_lost_attempts(run)
+
+
+class AnyHistory(RuleBasedStateMachine):
+    """Places that are made, broken off, joined and mended in any order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.schema = mock.patch.dict(SCHEMAS, heuristic=SMALL)
+        self.schema.start()
+        memory = Path("/dev/shm")
+        self.root = Path(tempfile.mkdtemp(dir=memory if memory.is_dir() else None))
+        self.places: list[Place] = []
+        self.touched: Place | None = None
+        self.numbered = 0
+
+    def teardown(self) -> None:
+        try:
+            for place in self.places:
+                close_all(place)
+                assert findings(place) == []
+        finally:
+            self.schema.stop()
+            shutil.rmtree(self.root, ignore_errors=True)
+
+    # Steps ---------------------------------------------------------------------------------
+
+    @initialize(seed=st.integers(0, 2))
+    def first(self, seed: int) -> None:
+        self.create(seed, 3)
+
+    @precondition(lambda self: len(self.places) < PLACES_AT_MOST)
+    @rule(seed=st.integers(0, 2), shards=st.integers(1, SHARDS_AT_MOST))
+    def create(self, seed: int, shards: int) -> None:
+        folder = self.new_folder()
+        n = shards * PER_SHARD - seed % 2  # the last shard is sometimes cut
+        Run.create_or_open(open_storage(folder), manifest_of(specification(seed, ""), LAYOUT), n)
+        self.touched = Place(folder, {(seed, ""): Part(n)})
+        self.places.append(self.touched)
+
+    @rule(data=st.data())
+    def commit(self, data: st.DataObject) -> None:
+        """One shard that is wanted, by an attempt that may come too late."""
+        place, key, run = self.draw_part(data)
+        part = place.parts[key]
+        shards = sorted(set(part.planned) - part.quarantined)
+        if not shards:
+            return
+        shard = data.draw(st.sampled_from(shards))
+        if key[1]:
+            return  # its rows come from its source: see relabel
+        assert attempt(run, shard, self.attempt_name()) == (shard not in part.committed)
+        place.parts[key] = replace(part, committed=part.committed | {shard})
+
+    @rule(data=st.data(), how=st.sampled_from(["begun", "half written", "written", "committed", "draft"]))
+    def crash(self, data: st.DataObject, how: str) -> None:
+        """An attempt whose process dies; only its commit would count."""
+        place, key, run = self.draw_part(data)
+        part = place.parts[key]
+        if key[1] or not part.missing:
+            return
+        shard, name = data.draw(st.sampled_from(part.missing)), self.attempt_name()
+        run.ledger.start(name, shard)
+        if how == "half written":
+            run.storage.put(f"{shard_folder(shard, name)}/label/zarr.json", b"{")
+        elif how == "draft":
+            run.storage.put(f"{commit_key(shard)}.0123456789abcdef.part", b"{")
+        elif how in ("written", "committed"):
+            made = write(run, shard, name)
+            if how == "committed":
+                assert run.commit(made)
+                place.parts[key] = replace(part, committed=part.committed | {shard})
+
+    @rule(data=st.data())
+    def resume(self, data: st.DataObject) -> None:
+        """Everything that is missing is made, and what was left open is closed."""
+        place = self.draw_place(data)
+        for key, run in self.runs(place).items():
+            part = place.parts[key]
+            if not key[1]:
+                for shard in part.missing:
+                    assert attempt(run, shard, self.attempt_name())
+                place.parts[key] = replace(part, committed=part.committed | set(part.missing))
+            close_lost_attempts(run)
+
+    @rule(data=st.data(), shards=st.integers(1, SHARDS_AT_MOST))
+    def extend(self, data: st.DataObject, shards: int) -> None:
+        """A larger n is wanted; a smaller one changes nothing."""
+        place, key, run = self.draw_part(data)
+        run.grow(shards * PER_SHARD)
+        place.parts[key] = replace(place.parts[key], n=max(place.parts[key].n, shards * PER_SHARD))
+
+    @rule(data=st.data())
+    def quarantine(self, data: st.DataObject) -> None:
+        place, key, run = self.draw_part(data)
+        part = place.parts[key]
+        if not part.missing:
+            return
+        shard = data.draw(st.sampled_from(part.missing))
+        assert run.quarantine(
+            QuarantineRecord(
+                shard=shard, seed=key[0], first_scene=shard, scenes=1,
+                attempts=(), causes=("failed: a test",), stacks=("",), created=now(),
+            )
+        )  # fmt: skip
+        place.parts[key] = replace(part, quarantined=part.quarantined | {shard})
+
+    @rule(data=st.data())
+    def lift(self, data: st.DataObject) -> None:
+        place, key, run = self.draw_part(data)
+        assert set(lift_quarantine(run)) == place.parts[key].quarantined
+        place.parts[key] = replace(place.parts[key], quarantined=frozenset())
+
+    @rule(data=st.data())
+    def seal(self, data: st.DataObject) -> None:
+        place = self.draw_place(data)
+        storage = open_storage(place.folder, probe=False)
+        if any(part.committed & set(part.planned) for part in place.parts.values()):
+            seal(storage)
+            place.sealed = dict(place.parts)
+        else:
+            with pytest.raises(InputError, match="no shard is committed"):
+                seal(storage)
+
+    @rule(data=st.data())
+    def unseal(self, data: st.DataObject) -> None:
+        place = self.draw_place(data)
+        if place.sealed is not None:
+            unseal(open_storage(place.folder, probe=False))
+            place.sealed = None
+
+    @rule(data=st.data())
+    def collect_garbage(self, data: st.DataObject) -> None:
+        """What nobody committed goes, whatever its age; what counts stays."""
+        place = self.draw_place(data)
+        for garbage in find_garbage(open_storage(place.folder, probe=False), 0.0, time.time() + 60):
+            sweep(garbage)
+        for key, run in self.runs(place).items():
+            folders = {"/".join(f.key.split("/")[:3]) for f in run.storage.list("shards")}
+            assert len(folders) == len(place.parts[key].committed)
+
+    @precondition(lambda self: len(self.places) < PLACES_AT_MOST)
+    @rule(data=st.data())
+    def merge(self, data: st.DataObject) -> None:
+        """Two or three places become one; those of different rules are refused."""
+        chosen = data.draw(st.lists(st.sampled_from(range(len(self.places))), min_size=1, max_size=3))
+        places = [self.places[i] for i in chosen]
+        folder = self.new_folder()
+        named = [str(place.folder) for place in places]
+        if len({place.rule for place in places}) > 1:
+            with pytest.raises(InputError):
+                carry_out(plan_merge(named, str(folder)))
+            assert not folder.exists() or not any(folder.iterdir())
+            return
+        carry_out(plan_merge(named, str(folder)))
+        parts: dict[tuple[int, str], Part] = {}
+        for place in places:
+            for key, part in place.parts.items():
+                parts[key] = united(parts[key], part) if key in parts else part
+        merged = Place(folder, parts)
+        if any(part.committed & set(part.planned) for part in parts.values()):
+            merged.sealed = dict(parts)
+        self.places.append(merged)
+        self.touched = merged
+
+    @precondition(lambda self: len(self.places) < PLACES_AT_MOST)
+    @rule(data=st.data(), rule_name=st.sampled_from(["near", "far"]))
+    def relabel(self, data: st.DataObject, rule_name: str) -> None:
+        """The stored scenes by another rule, in a place of their own."""
+        place = self.draw_place(data)
+        if place.rule or not all(part.committed for part in place.parts.values()):
+            return
+        folder = self.new_folder()
+        runs = open_runs(place.folder)
+        options = {f"heuristic.{k}": v for k, v in changed_fields(RULES[rule_name]).items()}
+        specs = [relabelled_specification(run, options) for run in runs]
+        for run, spec in zip(runs, specs, strict=True):
+            SPECS[run.manifest.spec.seed, rule_name] = spec
+        relabel_all(open_storage(folder), runs, specs)
+        parts = {
+            (seed, rule_name): Part(part.n, part.committed & set(part.planned))
+            for (seed, _), part in place.parts.items()
+        }
+        made = Place(folder, parts)
+        if any(part.committed for part in parts.values()):
+            made.sealed = dict(parts)
+        self.places.append(made)
+        self.touched = made
+
+    @rule(data=st.data())
+    def damage_and_repair(self, data: st.DataObject) -> None:
+        """One bit of one committed file flips: it is found, and its bytes come back."""
+        place, key, run = self.draw_part(data)
+        if not place.parts[key].committed:
+            return
+        shard = data.draw(st.sampled_from(sorted(place.parts[key].committed)))
+        commit = run.commit_of(shard)
+        entry = data.draw(st.sampled_from(commit.files))
+        file = f"{shard_folder(shard, commit.attempt)}/{entry.path}"
+        before = run.storage.get(file, entry.size)
+        assert before is not None
+        bit = data.draw(st.integers(0, 8 * len(before) - 1))
+        broken = bytearray(before)
+        broken[bit // 8] ^= 1 << bit % 8
+        run.storage.put(file, bytes(broken))  # a new file: what is linked elsewhere stays whole
+        assert any(finding.key.endswith(entry.path) for finding in findings(place))
+        mended = mend_place(open_storage(place.folder, probe=False), files_of_shard)
+        assert not [f for f in mended.left if f.is_damage]
+        if mended.resealed:  # anew, over what is committed now
+            place.sealed = dict(place.parts)
+        assert run.storage.get(file, entry.size) == before
+        close_all(place)
+
+    # What must hold ------------------------------------------------------------------------
+
+    @invariant()
+    def the_place_says_what_the_model_says(self) -> None:
+        place, self.touched = self.touched, None
+        if place is None:
+            return
+        for key, run in self.runs(place).items():
+            part = place.parts[key]
+            assert (run.n, run.committed(), run.quarantined()) == (part.n, part.committed, part.quarantined)
+            assert list(run.missing()) == part.missing
+        folder = place.folder / SEALED
+        assert folder.is_dir() == (place.sealed is not None)
+        if place.sealed is not None:
+            group = zarr.open_group(folder, mode="r")
+            ids, labels = expected_rows(place.sealed)
+            np.testing.assert_array_equal(np.asarray(group["sample_id"][...]), ids)  # type: ignore[index]
+            np.testing.assert_array_equal(np.asarray(group["label"][...]), labels)  # type: ignore[index]
+
+    # Help ----------------------------------------------------------------------------------
+
+    def new_folder(self) -> Path:
+        self.numbered += 1
+        return self.root / f"place-{self.numbered}"
+
+    def attempt_name(self) -> str:
+        self.numbered += 1
+        return f"t{self.numbered:05d}"
+
+    def draw_place(self, data: st.DataObject) -> Place:
+        self.touched = data.draw(st.sampled_from(self.places))
+        return self.touched
+
+    def draw_part(self, data: st.DataObject) -> tuple[Place, tuple[int, str], Run]:
+        place = self.draw_place(data)
+        runs = self.runs(place)
+        key = data.draw(st.sampled_from(sorted(runs)))
+        return place, key, runs[key]
+
+    def runs(self, place: Place) -> dict[tuple[int, str], Run]:
+        """The runs of a place by seed and rule; these are those of the model."""
+        names = {specification(*key).hash(): key for key in place.parts}
+        found = {names[run.manifest.spec_hash]: run for run in open_runs(place.folder)}
+        assert found.keys() == place.parts.keys()
+        return found
+
+
+TestAnyHistory = AnyHistory.TestCase
+TestAnyHistory.settings = settings(
+    max_examples=EXAMPLES,
+    stateful_step_count=STEPS,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
