@@ -6,15 +6,20 @@ them, each piece with its share of the cost; those that made nothing stay whole,
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
+from schemas.ledger import end_key, start_key
 from schemas.merge_plan import Holding, Union
-from schemas.record_files import encode_record
-from schemas.run_records import AttemptStart, LedgerEntry
+from schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
+from schemas.run import commit_key
+from schemas.run_records import AttemptStart, Commit, LedgerEntry
+from schemas.storage import Storage
 
 SPARE_CAUSE = "merged: this shard is held from another attempt"
 LOST_CAUSE = "merged: it left no end, and its shard was decided without it"
+_AT_ONCE = 256  # attempts whose records are held
 
 
 @dataclass(frozen=True)
@@ -36,22 +41,24 @@ class _Place:
 
 
 def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[UnitedAttempt]:
-    """Every attempt of the union in order of names; records are read as they are asked for.
+    """Every attempt of the union in order of names; records are read some hundreds at a time.
 
     One that left no end is lost, at a cost that nobody knows, where its shard is kept or `given_up`.
     """
-    held = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
+    spare = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
     kept = {holding.name: holding for holding in union.kept.values()}
     places = _places(union)
-    for name in sorted(places):
-        starts = [start for place in places[name] if (start := _start(union, name, place)) is not None]
-        start = min(starts, key=encode_record) if starts else None
-        ends = [end for place in places[name] if (end := _end(union, name, place)) is not None]
-        if name in kept:
-            yield UnitedAttempt(name, start, _end_of_held(union, kept[name], start, ends, is_kept=True))
-        elif name in held:
-            yield UnitedAttempt(name, start, _end_of_held(union, held[name], start, ends, is_kept=False))
-        else:
+    names = iter(sorted(places))
+    while some := list(islice(names, _AT_ONCE)):
+        held = {name: kept.get(name) or spare.get(name) for name in some}
+        records = _Records(union, [place for name in some for place in places[name]], held.values())
+        for name in some:
+            starts, ends = records.starts(name, places[name]), records.ends(name, places[name])
+            start = min(starts, key=encode_record) if starts else None
+            if (holding := held[name]) is not None:
+                end = _end_of_held(union, holding, records.commit_of(holding), start, ends, name in kept)
+                yield UnitedAttempt(name, start, end)
+                continue
             if start is not None and not ends and (start.shard in union.kept or start.shard in given_up):
                 ends.append(_lost(start))
             yield UnitedAttempt(name, start, min(ends, key=_account_first) if ends else None)
@@ -77,30 +84,78 @@ def _places(union: Union) -> dict[str, list[_Place]]:
     return found
 
 
-def _start(union: Union, name: str, place: _Place) -> AttemptStart | None:
-    start = union.runs[place.source].ledger.start_of(place.attempt)
-    if start is None:
-        return None
-    shard = union.cut(place.source).first(start.shard) if place.piece is None else place.piece
-    return start.model_copy(update={"attempt": name, "shard": shard})
+class _Records:
+    """What the sources say of some attempts, and the commits of what these made."""
+
+    def __init__(self, union: Union, places: Iterable[_Place], holdings: Iterable[Holding | None]) -> None:
+        self._union = union
+        self._starts: dict[tuple[int, str], AttemptStart] = {}
+        self._ends: dict[tuple[int, str], LedgerEntry] = {}
+        self._commits: dict[tuple[int, int], Commit] = {}
+        named, made = sorted({(p.source, p.attempt) for p in places}), {h for h in holdings if h is not None}
+        for source, run in enumerate(union.runs):
+            attempts = [attempt for of, attempt in named if of == source]
+            for attempt, start in _read(run.storage, attempts, start_key, AttemptStart):
+                self._starts[source, attempt] = start
+            for attempt, end in _read(run.storage, attempts, end_key, LedgerEntry):
+                self._ends[source, attempt] = end
+            shards = sorted({holding.of for holding in made if holding.source == source})
+            found = run.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES)
+            for shard, (_, data) in zip(shards, found, strict=True):
+                if data is not None:
+                    self._commits[source, shard] = run.decode_commit(shard, data)
+
+    def commit_of(self, holding: Holding) -> Commit:
+        """The source's commit of a holding. InputError where it was withdrawn meanwhile."""
+        found = self._commits.get((holding.source, holding.of))
+        return self._union.commit_of(holding) if found is None else found
+
+    def starts(self, name: str, places: Iterable[_Place]) -> list[AttemptStart]:
+        """What the sources have of an attempt's begin, as the union names and numbers it."""
+        found: list[AttemptStart] = []
+        for place in places:
+            start = self._starts.get((place.source, place.attempt))
+            if start is not None:
+                shard = place.piece
+                if shard is None:
+                    shard = self._union.cut(place.source).first(start.shard)
+                found.append(start.model_copy(update={"attempt": name, "shard": shard}))
+        return found
+
+    def ends(self, name: str, places: Iterable[_Place]) -> list[LedgerEntry]:
+        """What the sources have of an attempt's end, as the union names and numbers it."""
+        found: list[LedgerEntry] = []
+        for place in places:
+            end = self._ends.get((place.source, place.attempt))
+            if end is None:
+                continue
+            cut, shard, cost = self._union.cut(place.source), place.piece, end.cost
+            if shard is None:
+                shard = cut.first(end.shard)
+            elif cost is not None:
+                cost = cut.cost(cost, shard)
+            found.append(end.model_copy(update={"attempt": name, "shard": shard, "cost": cost}))
+        return found
 
 
-def _end(union: Union, name: str, place: _Place) -> LedgerEntry | None:
-    end = union.runs[place.source].ledger.end_of(place.attempt)
-    if end is None:
-        return None
-    cut = union.cut(place.source)
-    if place.piece is None:
-        return end.model_copy(update={"attempt": name, "shard": cut.first(end.shard)})
-    cost = None if end.cost is None else cut.cost(end.cost, place.piece)
-    return end.model_copy(update={"attempt": name, "shard": place.piece, "cost": cost})
+def _read(
+    storage: Storage, attempts: Sequence[str], key_of: Callable[[str], str], model: type[Record]
+) -> Iterator[tuple[str, Record]]:
+    found = storage.get_many(map(key_of, attempts), MAX_RECORD_BYTES)
+    for attempt, (key, data) in zip(attempts, found, strict=True):
+        if data is not None:
+            yield attempt, decode_record(f"{storage.url}/{key}", data, model)
 
 
 def _end_of_held(
-    union: Union, holding: Holding, start: AttemptStart | None, ends: list[LedgerEntry], is_kept: bool
+    union: Union,
+    holding: Holding,
+    commit: Commit,
+    start: AttemptStart | None,
+    ends: list[LedgerEntry],
+    is_kept: bool,
 ) -> LedgerEntry:
     """How an attempt that made a shard ended, at its commit's cost, also where no ledger says so."""
-    commit = union.commit_of(holding)
     truth = {
         "outcome": "committed" if is_kept else "superseded",
         "cause": "" if is_kept else SPARE_CAUSE,

@@ -49,7 +49,7 @@ def _kind(run: Run) -> dict[str, object]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Holding:
     """A committed shard of a source, or a piece of it, that can be a shard of the union."""
 

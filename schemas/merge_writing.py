@@ -9,13 +9,13 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, islice
 
 from schemas.errors import InputError
 from schemas.fields import REDRAW_CAUSES
 from schemas.ledger import end_key, start_key
 from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
-from schemas.merge_ledger import united_attempts
+from schemas.merge_ledger import UnitedAttempt, united_attempts
 from schemas.merge_plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.run import Run, copy_key, publish, shard_folder
@@ -160,13 +160,18 @@ def _without(union: Union, lost: Iterable[Holding]) -> Union:
 
 def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) -> int:
     there = {file.key for file in run.storage.list("ledger")}
-    count = 0
-    for attempt in united_attempts(union, given_up):
+
+    def put(attempt: UnitedAttempt) -> None:
         for key, record in ((start_key(attempt.name), attempt.start), (end_key(attempt.name), attempt.end)):
             if record is not None:
                 _put(run.storage, key, encode_record(record), key in there)
-        count += 1
-        tick()
+
+    count, attempts = 0, united_attempts(union, given_up)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        while some := list(islice(attempts, 16 * _AT_ONCE)):
+            for _ in (map if run.storage.folder is not None else pool.map)(put, some):
+                count += 1
+                tick()
     return count
 
 
