@@ -6,12 +6,13 @@ JOBS ?= 2
 BIN := .venv/bin
 DEMO := build/demo
 
-.PHONY: help demo test lint format docs venv clean
+.PHONY: help demo test faults lint format docs venv clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
 	@echo "make test    format check, lint, types, layers, tests"
+	@echo "make faults  the full fault campaigns, as tables (about half an hour)"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
 	@echo "make docs    rewrite docs/data-format.md and docs/specification.md from the schemas"
@@ -34,6 +35,12 @@ demo: venv
 
 test: lint
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
+
+# Each ends with an error where a promise was broken.
+FAULTS := crash_points damage kills two_drivers s3 confinement listing
+faults: venv
+	@set -e; for name in $(FAULTS); do echo; echo "== $$name"; $(BIN)/python -m benchmarks.faults.$$name; done
+	@echo; echo "== driver"; $(BIN)/python -m benchmarks.driver
 
 lint: venv
 	$(BIN)/ruff format --check --quiet .
