@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import timedelta
-from functools import cache
+from functools import cache, cached_property
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -129,9 +129,8 @@ class RemoteObjects:
     def take(self, source: RemoteObjects, source_key: str, key: str, limit_bytes: int) -> None:
         """Copy an object of `source`: by the server within one bucket. FileNotFoundError if there is none."""
         if source.bucket == self.bucket:
-            whole = self._open("")
             from_, to = f"{source.prefix}/{source_key}".lstrip("/"), f"{self.prefix}/{key}".lstrip("/")
-            self._try(key, lambda: obstore.copy(whole, from_, to))
+            self._try(key, lambda: obstore.copy(self._bucket, from_, to))
             return
         data = source.get(source_key, limit_bytes)
         if data is None:
@@ -146,6 +145,10 @@ class RemoteObjects:
     def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
         """(key, bytes) of many objects in the order of the keys, read several at once."""
         return in_order(lambda key: (key, self.get(key, limit_bytes)), keys)
+
+    @cached_property
+    def _bucket(self) -> Any:
+        return self._open("")
 
     def _open(self, prefix: str) -> Any:
         timeout = timedelta(seconds=self._timeout_s)
