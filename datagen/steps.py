@@ -19,13 +19,15 @@ Step = Callable[[], None]
 
 
 @contextmanager
-def steps(what: str, total: int, as_json: bool | None = None) -> Generator[Step]:
+def steps(
+    what: str, total: int, as_json: bool | None = None, clock: Callable[[], float] = time.monotonic
+) -> Generator[Step]:
     """Give a function to call after each of `total` steps; standard error shows how far they are.
 
     `what` names them in the plural. `as_json` None chooses: a bar on a terminal, JSON lines otherwise.
     """
     if not sys.stderr.isatty() if as_json is None else as_json:
-        yield _lines(what, total)
+        yield _lines(what, total, clock)
         return
     columns = (TextColumn(f"[bold]{what}"), BarColumn(bar_width=None), MofNCompleteColumn(), _Pace())
     with Progress(*columns, console=Console(stderr=True), expand=True) as bar:
@@ -33,14 +35,14 @@ def steps(what: str, total: int, as_json: bool | None = None) -> Generator[Step]
         yield lambda: bar.advance(row)
 
 
-def _lines(what: str, total: int) -> Step:
-    done, started_s = 0, time.monotonic()
+def _lines(what: str, total: int, clock: Callable[[], float]) -> Step:
+    done, started_s = 0, clock()
     next_s = started_s + _EVERY_S
 
     def step() -> None:
         nonlocal done, next_s
         done += 1
-        now_s = time.monotonic()
+        now_s = clock()
         if now_s < next_s:
             return
         next_s = now_s + _EVERY_S
