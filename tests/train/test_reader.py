@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.seal import seal
-from tests.made_runs import make_run, rows_of, small_spec
+from schemas.shard_files import encode_shard
+from tests.made_runs import commit_of, make_run, rows_of, small_spec
 from train.reader import Batch, SampleReader
 
 ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
@@ -196,3 +198,21 @@ def test_a_run_may_be_named_like_a_store(tmp_path: Path) -> None:
     seal(run.storage)
     assert len(SampleReader([tmp_path / "run.zarr"])) == 50
     assert len(SampleReader([tmp_path / "run.zarr" / "data.zarr"])) == 50
+
+
+def test_merged_shards_may_word_their_arrays_otherwise_but_not_be_others(tmp_path: Path):
+    run = make_run(tmp_path, n=20, shards=[0])
+    scenes, samples = rows_of(run, 1)
+    files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
+    key = "distance_m/zarr.json"
+    said = json.loads(files[key])
+    said["attributes"]["long_name"] = "how far it is"
+    files[key] = json.dumps(said).encode()
+    assert run.commit(commit_of(run, 1, "x", run.write_shard(1, "x", files)))
+    assert len(ids(list(SampleReader([tmp_path]).shards()))) == 20
+    said["shape"] = said["chunk_grid"]["configuration"]["chunk_shape"] = [9]
+    files[key] = json.dumps(said).encode()
+    (tmp_path / "commits" / "000001.json").unlink()
+    assert run.commit(commit_of(run, 1, "y", run.write_shard(1, "y", files)))
+    with pytest.raises(InputError, match=r"000001/y/distance_m/zarr\.json: distance_m: differs"):
+        SampleReader([tmp_path])
