@@ -54,16 +54,13 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         address = "local"
     else:
         address = _resolved(settings.address)
-        # Without this part Ray takes 127.0.0.1 for this machine's outer address.
         wanted = head_environment("") | token_for(address)
         options = {}
     with _environment(wanted):  # workers inherit it; the caller's own stays as it was
         import ray
-        from ray._private import ray_constants
         from ray.exceptions import AuthenticationError
 
-        # As in the environment, for a process that imported Ray before.
-        ray_constants.ENABLE_RAY_CLUSTER = False  # pyright: ignore[reportPrivateImportUsage]
+        _keep_loopback()
         forget_former_token()
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -152,11 +149,11 @@ def _resolved(address: str) -> str:
         return address
     from ray._private.services import canonicalize_bootstrap_address_or_die
 
-    with _environment({"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}):
-        try:
-            return str(canonicalize_bootstrap_address_or_die("auto"))
-        except (ConnectionError, ValueError) as error:
-            raise InputError("--address", address, first_line(error), _START_MEND) from error
+    _keep_loopback()
+    try:
+        return str(canonicalize_bootstrap_address_or_die("auto"))
+    except (ConnectionError, ValueError) as error:
+        raise InputError("--address", address, first_line(error), _START_MEND) from error
 
 
 def _turns_away(address: str, token: str | None) -> bool:
@@ -175,6 +172,16 @@ def _turns_away(address: str, token: str | None) -> bool:
             problem = f"answers, but not as a Ray cluster does ({code.name.lower()})"
             raise InputError("--address", address, problem, _START_MEND) from None
     return False
+
+
+def _keep_loopback() -> None:
+    """Let Ray take 127.0.0.1 as it is, and not for this machine's outer address.
+
+    It reads that from the environment, but only once, when it is imported, which may have been before.
+    """
+    from ray._private import ray_constants
+
+    ray_constants.ENABLE_RAY_CLUSTER = False
 
 
 def forget_former_token() -> None:

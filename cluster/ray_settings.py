@@ -67,14 +67,15 @@ def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
         f"--dashboard-port={dashboard_port}",
         "--dashboard-agent-listen-port=0",
         # Fixed by default: two heads on one machine would share the port, and each other's clients.
-        f"--ray-client-server-port={_free_port()}",
+        f"--ray-client-server-port={free_port()}",
         f"--num-cpus={workers}",
         f"--object-store-memory={OBJECT_STORE_BYTES}",
         "--disable-usage-stats",
     ]
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of the loopback address that nobody listens at now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
