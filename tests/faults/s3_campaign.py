@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +63,6 @@ class Outcome:
     executions: int
     requests: int
     faults: Counter[str]
-    seconds: float
 
 
 def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome:
@@ -73,7 +71,6 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
     A job that ends with an InputError is begun again, and the store is up again by then. Raises
     AssertionError where the run then is not what an undisturbed one is.
     """
-    start_s = time.monotonic()
     executions = folder / "executions"
     executions.touch()
     jobs = 0
@@ -95,7 +92,7 @@ def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome
     _hold_to_an_undisturbed_run(run, shards, folder / "undisturbed")
     counts = Counter({kind: count for kind, count in seen.items() if kind not in _COUNTS})
     lines = len(executions.read_text().split())
-    return Outcome(shards, jobs, lines, seen["requests"], counts, time.monotonic() - start_s)
+    return Outcome(shards, jobs, lines, seen["requests"], counts)
 
 
 def _job(address: str, shards: int, executions: str) -> Run:
