@@ -107,7 +107,7 @@ def _warm_up(operation: Operation) -> None:
 
 
 def points(calls: list[Call], sample: int | None) -> list[Point]:
-    """Every end at every call, or of each kind of end a sample with the last calls in it."""
+    """Every end at every call, or of each kind of end a sample with the first and the last calls in it."""
     numbers = range(1, len(calls) + 1)
     kinds = [
         [Point(Mode.KILL, k) for k in numbers],
@@ -117,7 +117,9 @@ def points(calls: list[Call], sample: int | None) -> list[Point]:
     ]
     if sample is not None:
         draw = random.Random(len(calls))
-        kinds = [[*draw.sample(kind[:-3], min(sample, len(kind[:-3]))), *kind[-3:]] for kind in kinds]
+        # What counts is often done by the first or the last calls.
+        ends = [(kind[0], kind[1:-1], kind[-1]) for kind in kinds if kind]
+        kinds = [[first, *draw.sample(rest, min(sample, len(rest))), last] for first, rest, last in ends]
     return [point for kind in kinds for point in kind]
 
 
