@@ -11,6 +11,7 @@ import pytest
 
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
+from cluster.fitness import refuse_unfit_machines
 from cluster.guard import notes_of_a_job
 from cluster.policy import Policy
 from cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
@@ -18,11 +19,14 @@ from cluster.ray_executor import RayExecutor
 from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
 from cluster.stop import StopRequest
 from cluster.tally import Tally
+from cluster.task import ShardTask
+from schemas.errors import InputError
 from schemas.run import Run
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.job import RandomRows, make_rows
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import make_run
+from tests.small_runs import make_small_run
 
 POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 
@@ -84,7 +88,9 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
                 order.shard, order.attempt, 1.5, notes, script, order.memory_factor, str(tmp_path / "tries")
             )
 
-        policy = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=4, grace_s=0.5)
+        policy = Policy(
+            max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=4, grace_s=0.5, kill_s=60
+        )
         summary = drive(range(8), make_task, executor, books, policy, Heard(), StopRequest())
         left = [str(p) for p in machines.folder.rglob("*.stack")]
         executor.close()
@@ -103,6 +109,22 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
     assert "ended by the driver" in first[2].cause
     assert all(e.host is not None and e.host.pid > 0 and e.cost is not None for e in first.values())
     assert left == [] and list(machines.folder.rglob("datagen-notes-*")) == []
+
+
+def test_a_machine_that_does_not_see_the_run_is_named(
+    machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run.open(make_small_run(tmp_path / "run", 8))
+    # One name, which each machine takes for a folder of its own: the first has the run there.
+    (machines.folder / "first" / "home" / "run").symlink_to(tmp_path / "run")
+    task = ShardTask("~/run", run.manifest.spec, run.layout, 0, "probe", "builtin", "builtin", 0.0)
+    executor = RayExecutor(perform, machines.settings, machines.ray)
+    with pytest.raises(InputError) as told:
+        refuse_unfit_machines(executor.others.ask, run, task)
+    second = executor.others.alive()[machines.second.node_id]
+    assert str(told.value).startswith(f"machine {second}: ") and "no such folder" in str(told.value)
+    (machines.folder / "second" / "home" / "run").symlink_to(tmp_path / "run")
+    refuse_unfit_machines(executor.others.ask, run, task)
 
 
 def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path: Path) -> None:
