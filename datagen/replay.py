@@ -17,6 +17,7 @@ from datagen.remaking import Origin, open_origin
 from datagen.replaying import chosen_rows, open_replayer, origin_to_check, what_differs_here
 from datagen.replaying_shard import replay_shard
 from datagen.replaying_stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.steps import Step, steps
 from datagen.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 from schemas.fields import SceneRows
@@ -68,7 +69,9 @@ def replay(
         raise InputError(out, "--out", problem, "Give such a name")
     runs = open_runs(run)
     if sample is not None:
-        found, index, row = find_sample(runs, sample)
+        shards = sum(len(found.committed()) for found in runs)
+        with steps("shards searched", shards, True if json else None) as step:
+            found, index, row = find_sample(runs, sample, step)
     else:
         found, index, row = _only(run, runs, "--scene" if shard is None else "--shard"), scene, None
     refuse_missing_packages(found.manifest.spec.label_source)
@@ -81,11 +84,11 @@ def replay(
     return _compare(run, found, stored, row, origin_to_check(found, houses, objects, scenes_from), out, json)
 
 
-def find_sample(runs: list[Run], text: str) -> tuple[Run, int, int]:
+def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:
     """(run, scene, row in its scene) of the committed sample whose id begins with these digits.
 
     Ids are hashes of specification, scene and candidate, so they are counted out and nothing is read but
-    the list of commits. InputError where none or more than one fits.
+    the list of commits. `step` is called for every shard. InputError where none or more than one fits.
     """
     place = runs[0].storage.url if len(runs) == 1 else f"{len(runs)} merged runs"
     wanted = text.lower()
@@ -106,6 +109,7 @@ def find_sample(runs: list[Run], text: str) -> tuple[Run, int, int]:
                 for row, sample_id in enumerate(_ids(run, scene, count)):
                     if sample_id.startswith(whole) and sample_id.hex().startswith(wanted):
                         found.append((run, scene, row))
+            step()
             if len(found) > _SHOWN:
                 break
     if not found:
