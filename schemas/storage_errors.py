@@ -79,12 +79,13 @@ def store_trouble(error: Exception) -> StoreTrouble:
     text = str(error)
     status = _found(r"non-2xx status code: ([0-9]{3})", text) or _found(r"status: ([0-9]{3})", text)
     code = _found(rf"<Code>({_TRUSTED})</Code>", text)
-    if "169.254." in text or "latest/api/token" in text:
-        return StoreTrouble("no credentials are set", _KEYS_MEND, passing=False)
+    if "//169.254." in text:  # where a machine of a cloud asks for its role
+        asked_too_often = status.startswith("5") or status == "429"
+        return StoreTrouble("no credentials are set", _KEYS_MEND, passing=asked_too_often)
     if code == "NoSuchBucket":
         mend = "Make the bucket first, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
         return StoreTrouble("no such bucket", mend, passing=False)
-    if "redirect" in text or status in ("301", "307"):
+    if "Received redirect without LOCATION" in text or status in ("301", "307"):
         mend = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
         return StoreTrouble("the bucket is in another region", mend, passing=False)
     if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):

@@ -1,6 +1,6 @@
 """Jobs on an S3 server behind a proxy that fails, resumed until they are done, as a table.
 
-    python -m benchmarks.faults.s3 [--shards 40] [--seeds 3] [--rate 0.05]
+    python -m benchmarks.faults.s3 [--shards 24] [--seeds 2] [--rate 0.05]
 
 The server is moto's, on the loopback address. Of `rate` of all requests two parts in five are refused
 with 500 or 503; one part each is done and answered 500, done and cut off in its answer, and held until the
@@ -47,8 +47,8 @@ def one(upstream: int, shards: int, seed: int, rate: float, folder: Path) -> Out
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--shards", type=int, default=40)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--shards", type=int, default=24)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--rate", type=float, default=0.05)
     options = parser.parse_args()
     kinds = ("error", "lost_answer", "lost_commit", "cut", "hold_before", "hold_after", "down")
