@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import random
 import tempfile
@@ -28,7 +29,7 @@ from schemas.run import Run, commit_key
 from schemas.seal import seal
 from schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard
-from tests.faults.processes import FORKS, ProcessExecutor
+from tests.faults.processes import ProcessExecutor
 from tests.made_runs import commit_of, make_run, rows_of
 from tests.small_runs import arrays_of, assert_equal_runs
 
@@ -38,7 +39,9 @@ PATIENT = Policy(
 )
 SAMPLES_PER_SHARD = 10
 
-FORKS.set_forkserver_preload(["tests.faults.counted"])
+# Drivers are forked from a process that has loaded everything and done nothing.
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(["tests.faults.counted"])
 
 
 @contextmanager
@@ -114,7 +117,7 @@ def drive_counted(place: str, counted: str, seconds: float, workers: int, stubbo
 
 def start_driver(run: Run, counted: Path, seconds: float, workers: int, stubborn: bool = False) -> Any:
     """A driver in a process of its own."""
-    process = FORKS.Process(
+    process = _FORKS.Process(
         target=drive_counted, args=(run.storage.url, str(counted), seconds, workers, stubborn)
     )
     process.start()

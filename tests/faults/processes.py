@@ -16,8 +16,9 @@ from cluster.guard import Meter, guarded, obituary, read_note
 from cluster.task import AttemptReport, Product, Task
 
 T = TypeVar("T", bound=Task)
-# Processes are forked from one that has loaded everything and done nothing: a new one takes milliseconds.
-FORKS = multiprocessing.get_context("forkserver")
+# Forked from a driver that has one thread and has loaded everything: a new worker takes milliseconds. (A
+# fork server would not do: it ends when a driver is killed in the moment of asking it.)
+_FORKS = multiprocessing.get_context("fork")
 
 
 @dataclass(eq=False)
@@ -35,11 +36,15 @@ class ProcessExecutor(Generic[T]):
         self._queue: deque[T] = deque()
         self._ended: list[AttemptReport] = []
         self._killed: set[str] = set()
-        self._workers = [self._new_worker() for _ in range(workers)]
+        self._workers: list[_Worker] = []
+        for _ in range(workers):
+            self._workers.append(self._new_worker())
 
     def _new_worker(self) -> _Worker:
-        ours, theirs = FORKS.Pipe()
-        process = FORKS.Process(target=_work, args=(self._function, theirs), daemon=True)
+        ours, theirs = _FORKS.Pipe()
+        # The child must not hold the driver's ends of pipes open, or nobody sees that the driver is gone.
+        inherited = [ours, *(worker.pipe for worker in self._workers)]
+        process = _FORKS.Process(target=_work, args=(self._function, theirs, inherited), daemon=True)
         process.start()
         theirs.close()
         return _Worker(process, ours)
@@ -102,8 +107,10 @@ class ProcessExecutor(Generic[T]):
             worker.process.join()
 
 
-def _work(function: Callable[[Any, Meter], Product], pipe: Connection) -> None:
+def _work(function: Callable[[Any, Meter], Product], pipe: Connection, inherited: list[Connection]) -> None:
     """A worker's life: until its driver closes the pipe, or is gone."""
+    for other in inherited:
+        other.close()
     while True:
         try:
             pipe.send(guarded(function, pipe.recv()))
