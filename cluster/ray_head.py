@@ -159,6 +159,8 @@ def _end(head: Head) -> None:
     # The number of a group that is gone may be another's by now.
     if any(head.folder in " ".join(_command(p)) for p in _members(head.group)):
         _end_group(head.group)
+    # Workers that were just starting belong to nobody now.
+    _end_all({p for p in _own() if head.folder in " ".join(_command(p))})
     (state_folder() / "head.json").unlink(missing_ok=True)
     if folder.name.startswith("datagen-head-") and folder.parent == Path("/tmp"):
         shutil.rmtree(folder, ignore_errors=True)
@@ -167,25 +169,39 @@ def _end(head: Head) -> None:
 def _end_group(group: int) -> None:
     members = _members(group)
     # Workers and jobs have groups of their own; they are children of this one's processes.
-    family = {*members, *(child for p in members for child in _children(p))}
+    _end_all({*members, *(child for p in members for child in _children(p))})
+
+
+def _end_all(processes: set[psutil.Process]) -> None:
     for number in (signal.SIGTERM, signal.SIGKILL):
-        for process in family:
+        for process in processes:
             try:
                 process.send_signal(number)
             except psutil.NoSuchProcess:
                 continue
-        _, family = psutil.wait_procs(list(family), timeout=_STOP_WITHIN_S)
-        if not family:
-            return
+        _, living = psutil.wait_procs(list(processes), timeout=_STOP_WITHIN_S)
+        processes = set(living)
 
 
 def _members(group: int) -> list[psutil.Process]:
     found: list[psutil.Process] = []
+    for process in _own():
+        try:
+            if os.getpgid(process.pid) == group:
+                found.append(process)
+        except (ProcessLookupError, PermissionError):
+            continue
+    return found
+
+
+def _own() -> list[psutil.Process]:
+    """Processes of this user, without the one that asks."""
+    found: list[psutil.Process] = []
     for process in psutil.process_iter():
         try:
-            if os.getpgid(process.pid) == group and process.uids().real == os.getuid():
+            if process.pid != os.getpid() and process.uids().real == os.getuid():
                 found.append(process)
-        except (ProcessLookupError, PermissionError, psutil.Error):
+        except psutil.Error:
             continue
     return found
 
