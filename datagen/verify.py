@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any
@@ -167,17 +168,19 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
         )
     state = "clean" if not found.damage else f"{found.damage:,} findings"
     print_rows(f"{state}: {report['run']}", rows)
-    print_findings("findings", found.kept, sum(found.counts.values()))
+    print_findings("found", found.kept, sum(found.counts.values()))
 
 
 def print_findings(title: str, findings: list[Finding], total: int) -> None:
-    """A table of findings, or nothing where there is none."""
+    """The findings one by one: the file, and below it what is wrong and how to mend it."""
     if not findings:
         return
-    rows = [(_plain(f.key), _plain(f.problem), f.mend) for f in findings[:_SHOWN]]
-    print_rows(title, rows, ("file", "what is wrong", "how to mend it"))
-    if total > len(rows):
-        print_rows(f"and {total - len(rows):,} more: --json tells them", [])
+    lines = [f"{title}: the file, what is wrong, how to mend it"]
+    for finding in findings[:_SHOWN]:
+        lines += [f"  {_plain(finding.key)}", f"      {_plain(finding.problem)}. {_plain(finding.mend)}"]
+    if total > _SHOWN:
+        lines.append(f"  and {total - _SHOWN:,} more: --json tells them")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 def _plain(text: str) -> str:

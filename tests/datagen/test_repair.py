@@ -12,11 +12,14 @@ import zarr
 from datagen import cli
 from schemas.checking.mending import mend_place
 from schemas.errors import InputError
-from schemas.record_files import signed_json
+from schemas.merged import MERGED, part_folder
+from schemas.record_files import encode_record, signed_json
 from schemas.run import Run
+from schemas.run_records import Merged
+from schemas.seal import seal
 from schemas.storage import open_storage
 from tests.faults.damage_campaign import Damage, apply, copy_run, make_place, remake
-from tests.made_runs import files_of
+from tests.made_runs import files_of, make_run, small_spec
 from tests.small_runs import PER_SCENE, make_small_run
 
 
@@ -171,6 +174,39 @@ def test_what_cannot_be_mended_is_left_and_said(tmp_path: Path) -> None:
     assert zarr.open_array(tmp_path / "run/data.zarr/label", mode="r").shape[0] == 19
     with pytest.raises(InputError):
         run.commit_of(1)
+
+
+def test_the_parts_of_a_merged_place_are_mended(tmp_path: Path) -> None:
+    specs = sorted((small_spec(seed) for seed in (1, 2)), key=lambda spec: spec.hash())
+    for spec in specs:
+        make_run(tmp_path / "clean" / part_folder(spec.hash()), 20, spec=spec)
+    storage = open_storage(tmp_path / "clean")
+    for key in (MERGED, f"copies/{MERGED}"):
+        storage.put(key, encode_record(Merged(parts=tuple(spec.hash() for spec in specs))))
+    seal(storage)
+    copy_run(tmp_path / "clean", tmp_path / "run")
+    part = part_folder(specs[1].hash())
+    chunk = damage(tmp_path / "run", f"{part}/shards/000001/*/label/c.0")
+    records = [damage(tmp_path / "run", key) for key in (f"{part}/commits/000000.json", MERGED)]
+    sealed = damage(tmp_path / "run", "data.zarr/zarr.json")
+    mended = mend_place(open_storage(tmp_path / "run", probe=False), remake)
+    assert sorted(mended.records) == sorted(records) and mended.remade_files == [chunk]
+    assert mended.resealed and mended.left == [] and mended.changed == []
+    assert files_of(tmp_path / "run") == files_of(tmp_path / "clean"), sealed
+
+
+def test_a_relabelled_run_is_mended_after_the_one_whose_scenes_it_shares(
+    finished: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = tmp_path / "again"
+    assert cli.run(["relabel", str(copied), "--out", str(again), "--mu", "0.5"]) == 0
+    whole = files_of(again)
+    shared = damage(again, "shards/000001/*/rgb/c.0.0.0")
+    damage(again, "shards/000002/*/heuristic_score/c.0")  # relabelling wrote this one
+    assert [f["file"] for f in repaired(again, capsys, 1)["left"] if f["kind"] == "file"] == [shared]
+    assert repaired(copied, capsys, 0)["shards_made_again"] == [1]
+    assert repaired(again, capsys, 0)["shards_made_again"] == [1]
+    assert files_of(again) == whole and files_of(copied) == files_of(finished)
 
 
 def test_a_run_on_s3_is_checked_and_mended(bucket: str) -> None:
