@@ -196,7 +196,7 @@ def _try(
             if "\n" in told:
                 violated(f"an error of several lines: {told}")
             if call.kind not in ("unlink", "rmdir"):
-                for name in _drafts(_files(place), known):
+                for name in _drafts(_files(place), known, operation.shared):
                     violated(f"left behind: {name}")
         elif status != 0:
             violated(f"ended with {status}: {told}")
@@ -218,7 +218,7 @@ def _try(
         violated(f"resumed, and damaged: {what}")
 
 
-def _drafts(now: Iterable[str], known: _Reference) -> list[str]:
+def _drafts(now: Iterable[str], known: _Reference, shared: bool) -> list[str]:
     """New files that belong to nothing: drafts, and those of an attempt that is not written whole.
 
     One that is, and lacks only its commit, is left to `gc`: its commit may be on its way.
@@ -232,7 +232,7 @@ def _drafts(now: Iterable[str], known: _Reference) -> list[str]:
             drafts.append(name)
     for folder, there in by_attempt.items():
         whole = {name for name in known.after_files if name.startswith(folder)}
-        if whole - there - {f"{folder}commit.json"}:
+        if whole - there - {f"{folder}commit.json"} and not shared:
             drafts += there
     return sorted(set(drafts) - known.before_files.keys())
 

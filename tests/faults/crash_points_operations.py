@@ -45,7 +45,9 @@ _HEURISTIC = SCHEMAS["heuristic"]
 class Operation:
     """`prepare` makes what is there before, in a new folder; `act` is what is killed; `resume` is what
     the user does then (the same again, where it is not given). `places` are the runs in the folder;
-    `exact` operations, resumed, leave the very files that they leave undisturbed."""
+    `exact` operations, resumed, leave the very files that they leave undisturbed. Attempts of merges have
+    the names that they have in the sources, and another merge may be at them: `shared` ones are not taken
+    back when the disk refuses, as they are links and take no room."""
 
     name: str
     prepare: Callable[[Path], None]
@@ -54,6 +56,7 @@ class Operation:
     places: tuple[str, ...] = ("",)
     fields: tuple[str, ...] = _KEPT
     exact: bool = False
+    shared: bool = False
 
 
 def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
@@ -290,8 +293,8 @@ OPERATIONS = (
     Operation("seal merged", _merged, _seal),
     Operation("unseal", _sealed_and_grown, lambda folder: unseal(open_storage(folder, probe=False))),
     Operation("index", lambda folder: _run(folder, 40, None), lambda folder: refresh_index(Run.open(folder))),
-    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("out",)),
-    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",)),
+    Operation("merge one", lambda f: _apart(f, (0, 0)), _merge, places=("out",), shared=True),
+    Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",), shared=True),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
     Operation("repair files", _damaged_files, _repair),
