@@ -35,7 +35,7 @@ from schemas.run_records import (
 )
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
-from schemas.storage_errors import StoreFailure
+from schemas.storage_errors import OddFile, StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # The mark in the folder of an attempt that is being removed.
@@ -376,8 +376,10 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
 def refuse_foreign(storage: Storage, *also: str) -> None:
     """Refuse a place without a run that holds files of something else; `also` begin further names of ours."""
     ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
-    for file in storage.list(""):
-        if not file.key.startswith(ours):
-            raise InputError(
-                storage.url, file.key, "the folder holds files of something else", "Choose a new --out"
-            )
+    problem, mend = "the folder holds files of something else", "Choose a new --out"
+    try:
+        for file in storage.list(""):
+            if not file.key.startswith(ours):
+                raise InputError(storage.url, file.key, problem, mend)
+    except OddFile as e:
+        raise InputError(e.place, "", problem, mend) from e

@@ -37,6 +37,10 @@ class StoreFailure(InputError):
     """
 
 
+class OddFile(InputError):
+    """A link, a pipe, a socket or a device, or folders within folders without end."""
+
+
 class FileTooLarge(InputError):
     """A file that is not read because of its size."""
 

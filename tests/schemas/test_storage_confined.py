@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from schemas import local_files
 from schemas.errors import InputError
+from schemas.run import refuse_foreign
 from schemas.storage import Storage, open_storage
 from tests.made_runs import files_of
 
@@ -112,6 +113,13 @@ def test_the_root_may_be_a_link(tmp_path: Path):
     s = open_storage(tmp_path / "run")
     assert s.put_new("a/b", b"x") and s.get("a/b", 9) == b"x"
     assert files_of(tmp_path / "disk") == {"a/b": b"x"}
+
+
+def test_a_folder_of_something_else_is_not_told_to_remove_its_links(place: Storage):
+    assert place.folder is not None
+    (place.folder / "link").symlink_to(place.folder.parent / "secrets")
+    with pytest.raises(InputError, match=r"link: the folder holds files of something else\. Choose a new"):
+        refuse_foreign(place)
 
 
 def test_folders_without_end_are_refused(place: Storage):
