@@ -51,6 +51,9 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
     refuse_missing_packages(spec.label_source)
     load_label_source(spec.label_source)
     _ = run.schema  # refuses a run of another schema version
+    if given.scenes_from is not None and spec.scenes_from is None:
+        problem = f"{run.storage.url} draws its own scenes"
+        raise InputError("--scenes-from", given.scenes_from, problem, "Take --scenes-from out")
     _refuse_other_engines(run)
     open_origin(run, given.houses, given.objects, given.scenes_from)
     refuse_unusable_engines(spec, address)
