@@ -16,7 +16,7 @@ from schemas.record_files import encode_record
 from schemas.run import Run
 from tests.datagen.forged import forge
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, PER_SCENE, make_small_run
+from tests.small_runs import CONFIG, PER_SCENE, json_of, make_small_run
 
 SCENES = 4
 N = SCENES * PER_SCENE
@@ -145,7 +145,7 @@ def test_scenes_that_were_labelled_again_are_drawn_from_where_they_came(source: 
 
 
 @needs_sim
-def test_trials_are_planned_and_executed_again(tmp_path: Path) -> None:
+def test_trials_are_planned_and_executed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm = "[candidates]\narm_reach_m = {low = 0.9, high = 1.0}\nrobots_per_scene = 1\n"
     source = make_small_run(tmp_path / "run", 6, "--candidates", "in-range", config=CONFIG + arm, per_scene=6)
     (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 300\nper_scene = 10\n")
@@ -153,6 +153,9 @@ def test_trials_are_planned_and_executed_again(tmp_path: Path) -> None:
     more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
     assert cli.run(["submit", "sim", "--n", "6", "--out", str(out), *more]) == 0
     assert findings(Run.open(out), 3) == []
+    told = json_of(capsys, ["replay", str(out), "--scene", "0"])
+    assert told["equal"] and {"grasps", "plan", "execute"} <= {s["stage"] for s in told["stages"]}
+    assert [s["fields"] for s in told["recomputed"] if s["stage"] == "labels"] == [6]
 
     def other_outcome(a: Columns) -> None:
         a["grasps_tried"] += 1

@@ -23,8 +23,7 @@ from schemas.run import Run
 from schemas.run_records import QuarantineRecord
 from tests.datagen.forged import forge
 from tests.refusals import refused
-from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
+from tests.small_runs import PER_SCENE, arrays_of, files_of, json_of, make_small_run
 from workers.labels import distance_visibility
 
 SCENES = 4
@@ -158,19 +157,6 @@ def test_scenes_of_another_run_are_drawn_by_it_or_recalled(
     capsys.readouterr()
     assert cli.run(["replay", str(out), "--scene", "2", "--out", str(tmp_path / "scene.png")]) == 0
     assert "not drawn again" in capsys.readouterr().out
-
-
-@needs_sim
-def test_plans_are_made_and_executed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arm = "[candidates]\narm_reach_m = {low = 0.9, high = 1.0}\nrobots_per_scene = 1\n"
-    source = make_small_run(tmp_path / "run", 6, "--candidates", "in-range", config=CONFIG + arm, per_scene=6)
-    (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 300\nper_scene = 10\n")
-    out = tmp_path / "sim"
-    more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
-    assert cli.run(["submit", "sim", "--n", "6", "--out", str(out), *more]) == 0
-    told = json_of(capsys, ["replay", str(out), id_of(out, 4)])
-    assert told["equal"] and {"grasps", "plan", "execute"} <= {s["stage"] for s in told["stages"]}
-    assert [s["fields"] for s in told["recomputed"] if s["stage"] == "labels"] == [6]
 
 
 @pytest.mark.parametrize(
