@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from cluster.ray_cluster import refuse_unusable
-from cluster.ray_settings import OBJECT_STORE_BYTES, new_token
+from cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
 from schemas.errors import InputError
 from tests.made_runs import make_run
 
@@ -42,20 +42,17 @@ def ray_start(said: Path, environment: Mapping[str, str], *arguments: str) -> ps
         # Ray gives each machine the same ports by default, and these are one machine.
         *("--dashboard-agent-listen-port=0", "--metrics-export-port=0"),
     ]
-    with said.open("w") as output:
-        return psutil.Popen(
-            [sys.executable, "-m", "ray.scripts.scripts", "start", *shared, *arguments],
-            env=environment,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-
-
-def wait_until_started(machine: psutil.Process, said: Path) -> None:
-    while "Ray runtime started" not in said.read_text():
-        assert machine.is_running() and machine.status() != psutil.STATUS_ZOMBIE, said.read_text()
-        time.sleep(0.1)
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", *shared, *arguments]
+    for _ in range(3):  # Ray gives up after 30 s, which a busy machine may need
+        with said.open("w") as output:
+            machine = psutil.Popen(
+                command, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        while machine.poll() is None:
+            if "Ray runtime started" in said.read_text():
+                return machine
+            time.sleep(0.1)
+    raise AssertionError(said.read_text())
 
 
 def kill_machine(machine: psutil.Process) -> None:
@@ -83,21 +80,18 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         "RAY_health_check_failure_threshold": "3",
     }
     session = Path(tempfile.mkdtemp(prefix="dg"))  # short: sockets below it have at most 107 characters
-    head = ray_start(
-        folder / "head",
-        environment,
-        *("--head", "--node-ip-address=127.0.0.2", "--port=0", "--num-cpus=0", "--include-dashboard=false"),
-        f"--temp-dir={session}",
-    )
-    machines = [head]
+    machines: list[psutil.Process] = []
     try:
-        wait_until_started(head, folder / "head")
+        head = (
+            *("--head", "--node-ip-address=127.0.0.2", "--port=0", "--num-cpus=0"),
+            *("--include-dashboard=false", f"--temp-dir={session}"),
+            f"--ray-client-server-port={free_port()}",
+        )
+        machines.append(ray_start(folder / "head", environment, *head))
         address = (session / "ray_current_cluster").read_text().strip()
         for name, last in (("first", 3), ("second", 4)):
             joining = (f"--address={address}", f"--node-ip-address=127.0.0.{last}", "--num-cpus=1")
             machines.append(ray_start(folder / name, environment, *joining))
-        wait_until_started(machines[1], folder / "first")
-        wait_until_started(machines[2], folder / "second")
         yield Cluster(address, environment, token, machines[2])
     finally:
         for machine in machines:
