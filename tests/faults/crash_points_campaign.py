@@ -17,8 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,6 +28,7 @@ from zarr.core.sync import cleanup_resources
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS, sized_schema
 from schemas.shard_files import group_metadata
+from tests.faults.crash_points_forking import REFUSED, Files, bytes_of, copy_tree, files_below, in_child, must
 from tests.faults.crash_points_operations import (
     LAYOUT,
     OPERATIONS,
@@ -42,8 +42,6 @@ from tests.faults.crash_points_shim import Call, Mode, Shim, read_log
 from tests.made_runs import small_spec
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-_REFUSED, _DEFECT = 3, 4
-Files = Mapping[str, bytes]
 
 
 @dataclass(frozen=True)
@@ -141,16 +139,16 @@ def _trace_one(shim: Shim, folder: Path, operation: Operation, log: BinaryIO) ->
         shim.disarm()
         Path(f"{folder}.end").exists()
 
-    _must(lambda: operation.prepare(folder))
-    _must(act)
+    must(lambda: operation.prepare(folder))
+    must(act)
 
 
 def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
     home = work / operation.name
     home.mkdir()
     template, after = home / "before", home / "after"
-    _must(lambda: operation.prepare(template))
-    _copy(template, after)
+    must(lambda: operation.prepare(template))
+    copy_tree(template, after)
     log = home / "log"
     with log.open("wb") as f:
 
@@ -159,10 +157,10 @@ def _reference(shim: Shim, work: Path, operation: Operation) -> _Reference:
             operation.act(after)
             shim.disarm()
 
-        _must(act)
+        must(act)
     return _Reference(
-        _files(template),
-        _files(after),
+        files_below(template),
+        files_below(after),
         _look(template, operation),
         _look(after, operation),
         read_log(log.read_text()),
@@ -173,7 +171,7 @@ def _try(
     shim: Shim, work: Path, operation: Operation, known: _Reference, point: Point, finding: Finding
 ) -> None:
     place = work / operation.name / "point"
-    _copy(work / operation.name / "before", place)
+    copy_tree(work / operation.name / "before", place)
 
     def act() -> None:
         shim.arm(place, point.mode, point.at, point.error)
@@ -182,7 +180,7 @@ def _try(
         finally:
             shim.disarm()
 
-    status, told = _in_child(act)
+    status, told = in_child(act)
     finding.points += 1
     call = known.calls[point.at - 1]
     where = f"{point.mode.name} {point.error or ''} at {point.at}: {call.kind} {Path(call.path).name}"
@@ -191,12 +189,12 @@ def _try(
         finding.violations.append(f"{where}: {what}")
 
     if point.error:
-        if status == _REFUSED:
+        if status == REFUSED:
             finding.refused += 1
             if "\n" in told:
                 violated(f"an error of several lines: {told}")
             if call.kind not in ("unlink", "rmdir"):
-                for name in _drafts(_files(place), known, operation.shared):
+                for name in _drafts(files_below(place), known, operation.shared):
                     violated(f"left behind: {name}")
         elif status != 0:
             violated(f"ended with {status}: {told}")
@@ -204,14 +202,14 @@ def _try(
         violated(f"ended with {status}: {told}")
     ended = status == 0
     for name, data in known.before_files.items():
-        if known.after_files.get(name) == data and _bytes(place / name) != data:
+        if known.after_files.get(name) == data and bytes_of(place / name) != data:
             violated(f"changed {name}")
     # One fresh process looks, goes on as a user would, and looks again.
     now, resumed, damaged = _look_and_resume(place, operation)
     _judge(now, known, finding, violated, ended)
     if _lasting(resumed) != _lasting(known.after):
         violated(f"resumed to something else: {_different(resumed, known.after)}")
-    other = {name for name in _files(place).keys() ^ known.after_files.keys() if "index/" not in name}
+    other = {name for name in files_below(place).keys() ^ known.after_files.keys() if "index/" not in name}
     if operation.exact and other:
         violated(f"resumed with other files: {sorted(other)}")
     for what in damaged:
@@ -269,7 +267,7 @@ def _different(one: Units, other: Units) -> list[str]:
 
 def _look(folder: Path, operation: Operation) -> Units:
     """The units, seen by a process that has never seen the run."""
-    status, told = _in_child(lambda: json.dumps(units(folder, operation.places)))
+    status, told = in_child(lambda: json.dumps(units(folder, operation.places)))
     return json.loads(told) if status == 0 else {"readers": told}
 
 
@@ -284,64 +282,9 @@ def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units, 
             return json.dumps([now, {"resuming": str(e)}, []])
         return json.dumps([now, units(folder, operation.places), damage(folder, operation.places)])
 
-    status, told = _in_child(go)
+    status, told = in_child(go)
     now, resumed, damaged = json.loads(told) if status == 0 else ({"readers": told}, {}, [])
     return now, resumed, damaged
-
-
-def _must(do: Callable[[], None]) -> None:
-    status, told = _in_child(do)
-    if status != 0:
-        raise RuntimeError(told)
-
-
-def _in_child(do: Callable[[], str | None]) -> tuple[int, str]:
-    """Do it in a forked child: (exit status, negative for a signal; what it returned or failed with)."""
-    reading, writing = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        status, told = _DEFECT, ""
-        try:
-            os.close(reading)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())  # progress
-            told, status = do() or "", 0
-        except InputError as e:
-            told, status = str(e), _REFUSED
-        except BaseException:  # noqa: BLE001 - whatever it is must not come back into the parent's code
-            told = traceback.format_exc()
-        finally:
-            with os.fdopen(writing, "w") as f:
-                f.write(told)
-            os._exit(status)
-    os.close(writing)
-    with os.fdopen(reading) as f:
-        told = f.read()
-    _, ended = os.waitpid(pid, 0)
-    return os.waitstatus_to_exitcode(ended), told
-
-
-def _copy(source: Path, target: Path) -> None:
-    """A copy in which names that share a file share one again."""
-    shutil.rmtree(target, ignore_errors=True)
-    if not source.exists():
-        return
-    seen: dict[int, Path] = {}
-    for path in [source, *sorted(source.rglob("*"))]:
-        copy = target / path.relative_to(source)
-        if path.is_dir():
-            copy.mkdir()
-        elif (first := seen.setdefault(path.stat().st_ino, copy)) != copy:
-            os.link(first, copy)
-        else:
-            shutil.copy(path, copy)
-
-
-def _files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def _bytes(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
 
 
 # As a program, and how to start it --------------------------------------------------------------
