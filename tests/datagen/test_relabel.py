@@ -289,3 +289,21 @@ def test_runs_on_s3_are_relabelled_and_replayed_there(
         there.check_digests(mine)
     told = json_of(capsys, ["replay", second, arrays_of(tmp_path / "here")["sample_id"][11].tobytes().hex()])
     assert told["equal"] and told["drawn_again"] and told["sample"]["candidate"] == 3
+
+
+def test_damage_to_a_shared_file_is_mended_in_the_source_and_then_in_the_run(
+    source: Path, tmp_path: Path
+) -> None:
+    origin, out = tmp_path / "origin", tmp_path / "run"
+    shutil.copytree(source, origin)
+    assert cli.run(["relabel", str(origin), "--out", str(out), *RULE]) == 0
+    held = {place: files_of(place, "shards", "commits") for place in (origin, out)}
+    file = next((origin / "shards/000002").glob("*/T_world_object/c.0.0.0.0"))
+    file.chmod(0o644)
+    with file.open("r+b") as shared:  # in place, so in both
+        shared.seek(20)
+        shared.write(b"\xff\x00\xff")
+    assert [cli.run(["verify", str(place)]) for place in held] == [1, 1]
+    assert [cli.run(["repair", str(place)]) for place in held] == [0, 0]
+    assert {place: files_of(place, "shards", "commits") for place in held} == held
+    assert [cli.run(["verify", str(place)]) for place in held] == [0, 0]
