@@ -74,14 +74,14 @@ def test_what_is_missing_is_made_and_what_is_there_stays(finished: Path, copied:
 
 def test_merged_runs_are_resumed_part_by_part(finished: Path, copied: Path, tmp_path: Path) -> None:
     lose(copied, 3)
-    other = make_small_run(tmp_path / "other", N, "--seed", "7")
-    lose(other, 0, 5)
+    whole, other = make_small_run(tmp_path / "whole", 2 * PER_SCENE, "--seed", "7"), tmp_path / "other"
+    shutil.copytree(whole, other)
+    lose(other, 0)
     place = tmp_path / "merged"
     assert cli.run(["merge", str(copied), str(other), "--out", str(place)]) == 0
     assert [list(run.missing()) for run in open_runs(place)] != [[], []]
     assert cli.run(["resume", str(place), *HERE]) == 0
     assert [list(run.missing()) for run in open_runs(place)] == [[], []]
-    whole = make_small_run(tmp_path / "whole", N, "--seed", "7")
     assert cli.run(["merge", str(finished), str(whole), "--out", str(tmp_path / "again")]) == 0
     assert_equal_runs(arrays_of(place), arrays_of(tmp_path / "again"))
 
