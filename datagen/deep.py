@@ -80,7 +80,7 @@ def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterato
     made = replayer.recompute(stored, rows)
     kept = chosen_rows(stored, rows)
     if what_differs_here(run, shard):
-        problems = beyond_tolerance(run.manifest.spec.heuristic, kept.samples, made.samples)
+        problems = beyond_tolerance(run.manifest.spec, kept.samples, made.samples)
         if problems:
             yield _finding(run, shard, scene, f"recomputed from stored poses: {'; '.join(problems)}")
         yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, ("candidates",)))

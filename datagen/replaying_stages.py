@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from schemas.fields import Field, RecordSchema, SceneRows
-from schemas.specification import HeuristicParams
+from schemas.specification import Specification
 from workers.labels.heuristic import heuristic
 
 Array = np.ndarray[Any, Any]
@@ -131,7 +131,7 @@ def _bits(values: Array, field: Field) -> Array:
 
 
 def beyond_tolerance(
-    params: HeuristicParams, stored: Mapping[str, Array], made: Mapping[str, Array]
+    spec: Specification, stored: Mapping[str, Array], made: Mapping[str, Array]
 ) -> list[str]:
     """How samples break what holds across platforms and versions; nothing where they keep to it.
 
@@ -155,11 +155,16 @@ def beyond_tolerance(
     rho = (stored["visible_px"] / np.maximum(stored["target_px"], 1)).astype(np.float32)
     within("visibility", np.abs(rho.astype(np.float64) - stored["visibility"]), 1e-7, "")
     score, _ = heuristic(
-        stored["distance_m"], stored["mount_distance_m"], stored["arm_reach_m"], stored["visibility"], params
+        stored["distance_m"],
+        stored["mount_distance_m"],
+        stored["arm_reach_m"],
+        stored["visibility"],
+        spec.heuristic,
     )
     gap = np.abs(score.astype(np.float64) - stored["heuristic_score"])
     within("heuristic_score", gap, SCORE_TOLERANCE, "")
-    label = (stored["heuristic_score"] >= np.float32(params.tau)).astype(np.uint8)
+    label = (stored["heuristic_score"] >= np.float32(spec.heuristic.tau)).astype(np.int64)
     name = "heuristic_label" if "heuristic_label" in stored else "label"
-    within(name, np.abs(label.astype(np.int64) - stored[name]), 0, "")
+    if name != "label" or spec.label_source == "heuristic":  # else it is by another rule than this
+        within(name, np.abs(label - stored[name]), 0, "")
     return problems
