@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from schemas.run import Run
 from schemas.run_records import Merged
 from schemas.seal import seal
 from schemas.storage import open_storage
-from tests.faults.damage_campaign import Damage, apply, copy_run, make_place, remake
+from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, remake
 from tests.made_runs import files_of, make_run, small_spec
 from tests.small_runs import PER_SCENE, make_small_run
 
@@ -209,11 +210,19 @@ def test_a_relabelled_run_is_mended_after_the_one_whose_scenes_it_shares(
     assert files_of(again) == whole and files_of(copied) == files_of(finished)
 
 
+@pytest.fixture
+def quick() -> Iterator[None]:
+    """Runs of few files."""
+    with fewer_arrays():
+        yield
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_run_on_s3_is_checked_and_mended(bucket: str) -> None:
     run = make_place(f"{bucket}/run", 19)
     storage = run.storage
     whole = {f.key: storage.get(f.key, 2**30) for f in storage.list("")}
-    for key in ("shards/000001/a-1/points_m/c.0.0.0", "data.zarr/rgb/c.0.0.0", "manifest.json"):
+    for key in ("shards/000001/a-1/points_m/c.0.0.0", "data.zarr/house_id/c.0", "manifest.json"):
         data = whole[key]
         assert data is not None
         storage.put(key, data[:-1] + b"\0")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,16 @@ from schemas.run import Run, commit_copy_key, commit_key
 from schemas.run_records import Merged, QuarantineRecord
 from schemas.seal import seal
 from schemas.storage import open_storage
+from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import attempt, make_run, small_spec
 from tests.schemas.checked import check, edit, folder_of, found, sealed_run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Runs of few files."""
+    with fewer_arrays():
+        yield
 
 
 @pytest.fixture
