@@ -21,7 +21,7 @@ import numpy as np
 import zarr
 
 from schemas.fields import OUTCOMES
-from schemas.seal import SEALED
+from schemas.sealing import SEALED
 from workers.geometry.mesh import F64
 
 _NAMES = tuple(OUTCOMES)

@@ -21,7 +21,7 @@ import numpy as np
 import zarr
 
 from schemas.run import Run
-from schemas.seal import SEALED, seal
+from schemas.sealing import SEALED, seal
 from tests.made_runs import make_run, small_spec
 from train.reader import SAMPLE_FIELDS, SCENE_FIELDS, SampleReader
 

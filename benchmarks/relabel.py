@@ -15,7 +15,7 @@ from pathlib import Path
 
 from datagen.relabel import relabel_all, relabelled_specification
 from schemas.run import Run
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.made_runs import make_run, small_spec
 from workers.labels import load_label_source

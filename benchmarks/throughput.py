@@ -36,7 +36,7 @@ from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Commit
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.objects import open_objects

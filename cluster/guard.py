@@ -32,7 +32,7 @@ from typing import TypeVar
 from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from schemas.cost import StageClock
 from schemas.run_records import Cost, Host, Outcome
-from schemas.storage_errors import StoreFailure
+from schemas.storage.errors import StoreFailure
 
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.

@@ -32,7 +32,7 @@ from schemas.errors import InputError
 from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from schemas.record_files import now
 from schemas.run import Run
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import Storage
 
 # Set for the driver of a detached job: its name at the Jobs API, and where that listens.

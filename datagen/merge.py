@@ -13,9 +13,9 @@ from datagen.cli import EXIT_INTERRUPTED
 from datagen.console import print_json, print_rows, seconds
 from datagen.steps import steps
 from schemas.lineage import lineage_summary
-from schemas.merge_writing import Written
 from schemas.merged import open_runs, wanted
 from schemas.merging import Merge, Result, carry_out, plan_merge
+from schemas.merging.writing import Written
 from schemas.run import Run
 
 

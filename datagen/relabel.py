@@ -32,7 +32,7 @@ from schemas.merged import MERGED, open_runs, part_folder
 from schemas.record_files import encode_record
 from schemas.run import Run
 from schemas.run_records import Merged
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.specification import Specification
 from schemas.storage import Storage, open_storage
 from workers.labels import load_label_source

@@ -8,9 +8,9 @@ from cyclopts import Parameter
 
 from datagen.console import print_rows
 from schemas.merged import open_runs
-from schemas.seal import SEALED, SealedRoot, sealed_root
-from schemas.seal import seal as seal_place
-from schemas.seal import unseal as unseal_place
+from schemas.sealing import SEALED, SealedRoot, sealed_root
+from schemas.sealing import seal as seal_place
+from schemas.sealing import unseal as unseal_place
 from schemas.storage import open_storage
 
 

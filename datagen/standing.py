@@ -12,7 +12,7 @@ from schemas.merged import open_runs
 from schemas.quarantine import lifted_records
 from schemas.run import Run
 from schemas.run_records import Outcome
-from schemas.seal import SealedRoot, sealed_root
+from schemas.sealing import SealedRoot, sealed_root
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage
 

@@ -39,7 +39,7 @@ def signed_json(fields: Mapping[str, Any]) -> bytes:
 
 
 def compact_record(record: BaseModel) -> bytes:
-    """A record's file without indentation, for records of many rows. `decode_record` reads it all the same."""
+    """A record's file without indentation, for those of many rows. `decode_record` reads it too."""
     return _signed(record.model_dump_json().encode().removesuffix(b"}"))
 
 

@@ -35,7 +35,7 @@ from schemas.run_records import (
 )
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
-from schemas.storage_errors import OddFile, StoreFailure
+from schemas.storage.errors import OddFile, StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # The mark in the folder of an attempt that is being removed.

@@ -19,8 +19,8 @@ from schemas.checking.shards import form_of
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import FileEntry
-from schemas.seal import SEALED, seal
-from schemas.seal_metadata import ROOT
+from schemas.sealing import SEALED, seal
+from schemas.sealing.metadata import ROOT
 from schemas.shard_files import chunk_key
 from schemas.storage import Storage
 

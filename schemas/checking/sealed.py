@@ -13,8 +13,8 @@ from schemas.errors import InputError
 from schemas.record_files import MAX_RECORD_BYTES
 from schemas.run import Run, shard_folder
 from schemas.run_records import Commit
-from schemas.seal_contents import Contents, SealedRun, SealedShard
-from schemas.seal_metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
+from schemas.sealing.contents import Contents, SealedRun, SealedShard
+from schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
 from schemas.shard_files import TABLES, chunk_key, rows_per_shard
 from schemas.storage import Storage
 

@@ -22,7 +22,7 @@ from schemas.jobs import JobRecord, Jobs, new_job_id
 from schemas.merged import open_runs
 from schemas.record_files import now
 from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import Storage, StoredFile, open_storage
 from tests.made_runs import attempt, files_of, make_run, small_spec, write
 from tests.refusals import refused

@@ -142,7 +142,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
 def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
     """A real Ctrl-C at the first shard that is written."""
     program = (
-        "import os, signal, sys, schemas.merge_writing as w\n"
+        "import os, signal, sys, schemas.merging.writing as w\n"
         "from datagen import cli\n"
         "link = w._link\n"
         "w._link = lambda *given: (link(*given), os.kill(os.getpid(), signal.SIGINT))[0]\n"

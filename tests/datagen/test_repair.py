@@ -17,7 +17,7 @@ from schemas.merged import MERGED, part_folder
 from schemas.record_files import encode_record, signed_json
 from schemas.run import Run
 from schemas.run_records import Merged
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, remake
 from tests.made_runs import files_of, make_run, small_spec

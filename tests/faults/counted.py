@@ -26,7 +26,7 @@ from cluster.task import Product
 from datagen.accounts import account_for
 from schemas.cost import StageClock
 from schemas.run import Run, commit_key
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard
 from tests.faults.processes import ProcessExecutor

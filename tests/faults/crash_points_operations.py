@@ -23,7 +23,7 @@ from schemas.merging import carry_out, plan_merge
 from schemas.record_files import encode_record
 from schemas.run import Run, publish
 from schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
-from schemas.seal import SEALED, seal, unseal
+from schemas.sealing import SEALED, seal, unseal
 from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
 from tests.made_runs import attempt, make_run, manifest_of, rows_of, small_spec, write

@@ -18,7 +18,7 @@ from schemas.checking.place import Checked, check_place
 from schemas.fields import SCHEMAS
 from schemas.run import Run
 from schemas.run_records import LedgerEntry
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema

@@ -21,7 +21,7 @@ from cluster.task import Product
 from schemas.errors import InputError
 from schemas.run import Run, commit_copy_key, shard_folder
 from schemas.run_records import Layout
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.cluster.simulated import Heard
 from tests.made_runs import make_run, manifest_of, small_spec, write

@@ -36,7 +36,7 @@ from schemas.quarantine import lift_quarantine
 from schemas.record_files import now
 from schemas.run import Run, commit_key, shard_folder
 from schemas.run_records import Layout, QuarantineRecord
-from schemas.seal import SEALED, seal, unseal
+from schemas.sealing import SEALED, seal, unseal
 from schemas.shard_files import encode_shard
 from schemas.specification import HeuristicParams, Specification
 from schemas.storage import open_storage

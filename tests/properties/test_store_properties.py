@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from schemas.errors import InputError
 from schemas.fields import Field, RecordSchema
 from schemas.run_records import Layout
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from schemas.shard_reading import decode_chunk, parse_metadata
 from tests.made_runs import make_run

@@ -11,7 +11,7 @@ from schemas.checking.place import Checked, check_place
 from schemas.record_files import signed_json
 from schemas.run import Run
 from schemas.run_records import Cost, LedgerEntry
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.made_runs import make_run
 

@@ -10,13 +10,13 @@ import pytest
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.lineage import LINEAGE, Lineage, lineage_summary
-from schemas.merge_ledger import LOST_CAUSE, SPARE_CAUSE
 from schemas.merged import MERGED, find_scene, open_runs, part_folder, wanted
 from schemas.merging import Result, carry_out, plan_merge
+from schemas.merging.ledgers import LOST_CAUSE, SPARE_CAUSE
 from schemas.record_files import read_record
 from schemas.run import Run
 from schemas.run_records import LedgerEntry, QuarantineRecord
-from schemas.seal import seal, sealed_root
+from schemas.sealing import seal, sealed_root
 from schemas.shard_files import encode_shard
 from schemas.specification import Source
 from schemas.storage import open_storage

@@ -14,10 +14,11 @@ import pytest
 import xarray
 import zarr
 
-from schemas import seal_local, shard_files
+from schemas import shard_files
 from schemas.errors import InputError
 from schemas.run import Run
-from schemas.seal import SEALED, seal
+from schemas.sealing import SEALED, seal
+from schemas.sealing import local as seal_local
 from tests.made_runs import files_of, make_run, rows_of, small_spec, write
 
 

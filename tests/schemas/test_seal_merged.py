@@ -13,7 +13,7 @@ from schemas.merged import MERGED, open_runs, part_folder
 from schemas.record_files import encode_record
 from schemas.run import Run
 from schemas.run_records import Merged
-from schemas.seal import SEALED, seal, sealed_root, unseal
+from schemas.sealing import SEALED, seal, sealed_root, unseal
 from schemas.storage import Storage, open_storage
 from tests.made_runs import files_of, make_run, rows_of, small_spec
 

@@ -14,7 +14,7 @@ from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.run import Run
 from schemas.run_records import Layout
-from schemas.seal import SEALED, seal, sealed_root, unseal
+from schemas.sealing import SEALED, seal, sealed_root, unseal
 from schemas.storage import Storage, open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import attempt, manifest_of, rows_of, small_spec

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import local_files
 from schemas.errors import InputError
 from schemas.run import refuse_foreign
-from schemas.storage import Storage, open_storage
+from schemas.storage import Storage, local_files, open_storage
 from tests.made_runs import files_of
 
 VERBS: dict[str, Callable[[Storage, str], object]] = {

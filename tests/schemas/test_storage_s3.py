@@ -14,7 +14,7 @@ from obstore.exceptions import GenericError
 
 from schemas.errors import InputError
 from schemas.storage import Storage, open_storage
-from schemas.storage_errors import StoreFailure, store_trouble
+from schemas.storage.errors import StoreFailure, store_trouble
 from tests.s3_servers import Faults, environment, faulty_proxy
 
 Behind = Callable[[Faults], AbstractContextManager[Storage]]

@@ -16,7 +16,7 @@ from schemas.merged import MERGED, part_folder
 from schemas.record_files import encode_record, signed_json
 from schemas.run import Run, commit_copy_key, commit_key
 from schemas.run_records import Merged, QuarantineRecord
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import attempt, make_run, small_spec

@@ -11,7 +11,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.run import Run
-from schemas.seal import seal
+from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of, small_spec
 from train.reader import Batch, SampleReader

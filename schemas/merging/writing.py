@@ -16,15 +16,15 @@ from schemas.errors import InputError
 from schemas.fields import REDRAW_CAUSES
 from schemas.ledger import end_key, start_key
 from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
-from schemas.merge_ledger import UnitedAttempt, united_attempts
-from schemas.merge_plan import Holding, Union
+from schemas.merging.ledgers import UnitedAttempt, united_attempts
+from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.run import Run, commit_key, copy_key, publish, shard_folder
 from schemas.run_records import Commit, QuarantineRecord
 from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard
 from schemas.storage import Storage
-from schemas.storage_errors import StoreFailure
+from schemas.storage.errors import StoreFailure
 
 Tick = Callable[[], None]
 _AT_ONCE = 16  # files asked of a server at one time

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from schemas.errors import InputError
 from schemas.fields import Field
-from schemas.seal_contents import Contents
-from schemas.seal_metadata import SEALED
+from schemas.sealing.contents import Contents
+from schemas.sealing.metadata import SEALED
 from schemas.shard_files import TABLES
 from schemas.storage import storage_error
 

@@ -20,9 +20,9 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from schemas.errors import InputError
-from schemas.remote_settings import bucket_and_prefix, connection_settings, timeout_s
-from schemas.storage_errors import StoreTrouble, store_trouble, too_large
-from schemas.stored_file import StoredFile
+from schemas.storage.errors import StoreTrouble, store_trouble, too_large
+from schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
+from schemas.storage.stored_file import StoredFile
 
 AT_ONCE = 16  # requests under way for one call
 PATIENCE = 1.5  # timeouts for which a request is repeated, at least once

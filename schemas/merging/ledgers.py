@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from schemas.ledger import end_key, start_key
-from schemas.merge_plan import Holding, Union
+from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
 from schemas.run import commit_key
 from schemas.run_records import AttemptStart, Commit, LedgerEntry

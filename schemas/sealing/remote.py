@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from schemas.fields import Field
-from schemas.remote_objects import in_order
-from schemas.seal_contents import Contents
-from schemas.seal_metadata import ROOT, SEALED, sealed_root
+from schemas.sealing.contents import Contents
+from schemas.sealing.metadata import ROOT, SEALED, sealed_root
 from schemas.shard_files import TABLES
 from schemas.storage import Storage
+from schemas.storage.remote_objects import in_order
 
 
 def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:

@@ -12,7 +12,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from schemas.record_files import MAX_RECORD_BYTES
-from schemas.seal_contents import Contents, SealedRun
+from schemas.sealing.contents import Contents, SealedRun
 from schemas.shard_files import TABLES, root_attributes, zarr_metadata
 from schemas.storage import Storage
 

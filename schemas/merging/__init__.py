@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
-from schemas.merge_plan import Union, plan_union, refuse_incompatible
-from schemas.merge_writing import Written, begin_union, replace_record, write_union
 from schemas.merged import MERGED, open_runs, part_folder, wanted
+from schemas.merging.plan import Union, plan_union, refuse_incompatible
+from schemas.merging.resharding import common_layout
+from schemas.merging.writing import Written, begin_union, replace_record, write_union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.resharding import common_layout
 from schemas.run import Run, refuse_foreign
 from schemas.run_records import Layout, Merged
-from schemas.seal import SEALED, seal, sealed_metadata
-from schemas.seal_contents import read_contents
+from schemas.sealing import SEALED, seal, sealed_metadata
+from schemas.sealing.contents import read_contents
 from schemas.storage import Storage, open_storage
 
 _ELSEWHERE = "Choose a new --out, and name this one among the runs that are merged"

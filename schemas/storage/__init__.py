@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.errors import InputError
-from schemas.local_files import LocalFiles
-from schemas.storage_errors import FileTooLarge, storage_error
-from schemas.stored_file import StoredFile
+from schemas.storage.errors import FileTooLarge, storage_error
+from schemas.storage.local_files import LocalFiles
+from schemas.storage.stored_file import StoredFile
 
 if TYPE_CHECKING:
-    from schemas.remote_objects import RemoteObjects
+    from schemas.storage.remote_objects import RemoteObjects
 
 __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 
@@ -186,7 +186,7 @@ def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> 
     scheme, colon, rest = text.partition("://")
     if colon and scheme == "s3":
         # Loaded here: who works on a disk does not wait for the client.
-        from schemas.remote_objects import RemoteObjects
+        from schemas.storage.remote_objects import RemoteObjects
 
         storage = Storage(RemoteObjects(text))
     elif colon and scheme != "file":

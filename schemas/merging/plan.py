@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from schemas.errors import InputError
 from schemas.identity import digest_of
-from schemas.merge_conflicts import refuse_different_rows
+from schemas.merging.conflicts import refuse_different_rows
+from schemas.merging.resharding import Cut, rank
 from schemas.record_files import different_fields, encode_record
-from schemas.resharding import Cut, rank
 from schemas.run import Run
 from schemas.run_records import Commit, Cost, Layout, Manifest, Plan
 

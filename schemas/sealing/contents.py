@@ -120,7 +120,7 @@ def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
 
     if run.storage.folder is not None:
         return map(check, commits)
-    from schemas.remote_objects import in_order
+    from schemas.storage.remote_objects import in_order
 
     return in_order(check, commits)
 
