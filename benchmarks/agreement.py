@@ -14,8 +14,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from datagen.agreement import CANDIDATE_SETS, Bools, Labelled, agreement, confusion
-from datagen.labelled import read_labelled
+from datagen.reports.agreement import CANDIDATE_SETS, Bools, Labelled, agreement, confusion
+from datagen.reports.labelled import read_labelled
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.specification import HeuristicParams

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.options import scene_options
-from datagen.specify import specify
+from datagen.specifying.specify import specify
 from schemas.cost import StageClock
 from schemas.identity import Stream, generator
 from schemas.specification import DisturbanceParams, Specification, TrialParams

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.options import scene_options
 from benchmarks.robots import robots_folder
-from datagen.specify import specify
+from datagen.specifying.specify import specify
 from schemas.cost import StageClock
 from schemas.identity import Stream, generator
 from schemas.specification import ArmParams

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.job import JobPlan, Work, make_missing, open_board
-from datagen.job_options import Placing
-from datagen.specify import layout_of, specify
+from datagen.jobs.job import JobPlan, Work, make_missing, open_board
+from datagen.jobs.options import Placing
+from datagen.specifying.specify import layout_of, specify
 from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.options import scene_options
-from datagen.specify import specify
+from datagen.specifying.specify import specify
 from schemas.cost import StageClock
 from workers.geometry.mesh import F64
 from workers.houses import open_houses

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.accounts import Account, Books, account_for
-from datagen.agreement import common_candidates, compare, outcome_report
-from datagen.audit_tables import print_pair, print_ratios, print_source
-from datagen.console import print_json
-from datagen.labelled import join_labelled, read_labelled
+from datagen.console.printing import print_json
+from datagen.reports.accounts import Account, Books, account_for
+from datagen.reports.agreement import common_candidates, compare, outcome_report
+from datagen.reports.audit_tables import print_pair, print_ratios, print_source
+from datagen.reports.labelled import join_labelled, read_labelled
 from schemas.cost import STAGES
 from schemas.errors import InputError
 from schemas.merged import open_runs

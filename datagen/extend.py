@@ -8,9 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.detach import detach_job
-from datagen.going_on import Sources, go_on, open_work
-from datagen.job_options import (
+from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.jobs.detach import detach_job
+from datagen.jobs.going_on import Sources, go_on, open_work
+from datagen.jobs.options import (
     DEFAULT_SHARE,
     Address,
     Detach,
@@ -25,8 +26,7 @@ from datagen.job_options import (
     resumable,
     words_of,
 )
-from datagen.stored_scenes import StoredScenes, refuse_too_few
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.run import Run

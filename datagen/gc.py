@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from cluster.books import refresh_index
-from datagen.console import print_json, print_rows, size
-from datagen.counting import counting
+from datagen.console.counting import counting
+from datagen.console.printing import print_json, print_rows, size
 from schemas.errors import InputError
 from schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
 from schemas.merged import open_runs

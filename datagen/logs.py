@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.detach import jobs_api_of
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.jobs.detach import jobs_api_of
 from schemas.errors import InputError
 from schemas.index import Heads
 from schemas.jobs import Jobs

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.accounts import account_for
 from datagen.cli import EXIT_INTERRUPTED
-from datagen.console import print_json, print_rows, seconds
-from datagen.steps import steps
+from datagen.console.printing import print_json, print_rows, seconds
+from datagen.console.steps import steps
+from datagen.reports.accounts import account_for
 from schemas.lineage import lineage_summary
 from schemas.merged import open_runs, wanted
 from schemas.merging import Merge, Result, carry_out, plan_merge

@@ -23,9 +23,9 @@ from cluster.progress import progress
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary
 from cluster.task import Product
-from datagen.console import print_json, print_rows, seconds
-from datagen.relabelling import Flips, RelabelTask, relabel_shard
-from datagen.stored_scenes import StoredScenes, specify_again
+from datagen.console.printing import print_json, print_rows, seconds
+from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
+from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.merged import MERGED, open_runs, part_folder

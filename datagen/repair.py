@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console import print_json, print_rows
-from datagen.counting import counting
+from datagen.console.counting import counting
+from datagen.console.printing import print_json, print_rows
+from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.verify import finding_row, print_findings
-from datagen.whole_number import WHOLE_NUMBER
 from schemas.checking.mending import Mended, RemakeShard, mend_place
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.remaking import Origin
+    from datagen.remaking.shards import Origin
 
 Sources = tuple[str | None, str | None, str | None]
 
@@ -85,14 +85,14 @@ def _leave_signals() -> None:
 def _remake(run: Run, shard: int, sources: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed here."""
     # Simulators are imported only where a shard is bad.
-    from datagen.remaking import remade_files, remake
+    from datagen.remaking.shards import remade_files, remake
 
     return remade_files(run, remake(run, shard, _origin(run.storage.url, sources)))
 
 
 @lru_cache(maxsize=1)  # a world is large
 def _origin(place: str, sources: Sources) -> Origin:
-    from datagen.remaking import open_origin
+    from datagen.remaking.shards import open_origin
 
     return open_origin(Run.open(place), *sources)
 
@@ -118,7 +118,7 @@ def _apart(mended: Mended) -> list[str]:
     """In what this machine is not the one that made the run, where remade bytes were not the committed."""
     if not any("other bytes" in finding.mend for finding in mended.left):
         return []
-    from datagen.replaying import what_differs_here
+    from datagen.remaking.scenes import what_differs_here
 
     texts = [text for run in mended.checked.runs for text in what_differs_here(run)]
     return list(dict.fromkeys(texts))

@@ -9,16 +9,16 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.arms import refuse_missing_packages
-from datagen.console import print_json, print_rows
+from datagen.console.printing import print_json, print_rows
+from datagen.console.steps import Step, steps
+from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
-from datagen.job_options import HousesAgain, ObjectsAgain, ScenesFromAgain
-from datagen.remaking import Origin, open_origin
-from datagen.replaying import chosen_rows, open_replayer, origin_to_check, what_differs_here
-from datagen.replaying_shard import replay_shard
-from datagen.replaying_stages import RECOMPUTED, StageComparison, compare_stages
-from datagen.steps import Step, steps
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.jobs.options import HousesAgain, ObjectsAgain, ScenesFromAgain
+from datagen.remaking.alone import replay_shard
+from datagen.remaking.scenes import chosen_rows, open_replayer, origin_to_check, what_differs_here
+from datagen.remaking.shards import Origin, open_origin
+from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
 from schemas.fields import SceneRows
 from schemas.identity import sample_ids

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.detach import detach_job
-from datagen.going_on import Sources, go_on, open_work
-from datagen.job_options import (
+from datagen.jobs.detach import detach_job
+from datagen.jobs.going_on import Sources, go_on, open_work
+from datagen.jobs.options import (
     DEFAULT_SHARE,
     Address,
     Detach,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.console import print_rows
+from datagen.console.printing import print_rows
 from schemas.merged import open_runs
 from schemas.sealing import SEALED, SealedRoot, sealed_root
 from schemas.sealing import seal as seal_place

@@ -8,10 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.arms import refuse_missing_packages
-from datagen.console import print_rows
-from datagen.pictures import Shown, draw_arm, draw_heuristic
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.console.printing import print_rows
+from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
+from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
 from schemas.merged import find_scene, open_runs
 from schemas.scene_rows import read_scene
@@ -55,7 +55,7 @@ def show(
     shown = Shown(run, spec, rows, recall_scene(world, rows.record))
     if of_trial:
         # Imported here, so that scenes can be seen without what plans and executes.
-        from datagen.trial_picture import draw_trial
+        from datagen.drawing.trial_picture import draw_trial
 
         lines = draw_trial(shown, candidate, out)
     else:

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console import print_json, print_rows
-from datagen.job_records import health_line, jobs_report
-from datagen.standing import place_report
+from datagen.console.printing import print_json, print_rows
+from datagen.jobs.report import health_line, jobs_report
+from datagen.reports.standing import place_report
 from schemas.jobs import Jobs
 from schemas.storage import Storage, open_storage
 

@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from datagen import __version__
-from datagen.arms import arm_versions, refuse_missing_packages
-from datagen.detach import detach_job
-from datagen.going_on import go_on, refuse_unusable_engines
-from datagen.job import Work
-from datagen.job_options import (
+from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.jobs.detach import detach_job
+from datagen.jobs.going_on import go_on, refuse_unusable_engines
+from datagen.jobs.job import Work
+from datagen.jobs.options import (
     DEFAULT_SHARE,
     Address,
     Detach,
@@ -27,9 +27,9 @@ from datagen.job_options import (
     resumable,
     words_of,
 )
-from datagen.specify import layout_of, specify
-from datagen.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.specifying.arms import arm_versions, refuse_missing_packages
+from datagen.specifying.specify import layout_of, specify
+from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS

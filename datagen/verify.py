@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.console import print_json, print_rows, seconds, size
-from datagen.counting import counting
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.console.counting import counting
+from datagen.console.printing import print_json, print_rows, seconds, size
+from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.checking.finding import Finding
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
@@ -96,8 +96,8 @@ def _deep(
 ) -> Iterator[Finding]:
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
-    from datagen.deep import deep_findings
-    from datagen.replaying import origin_to_check
+    from datagen.remaking.deep import deep_findings
+    from datagen.remaking.scenes import origin_to_check
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))

@@ -21,7 +21,7 @@ from rich.progress import (
 from datagen.assets import lock as locks
 from datagen.assets.catalogue import CATALOGUE, Asset, select
 from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
-from datagen.console import print_json, print_rows, size
+from datagen.console.printing import print_json, print_rows, size
 from schemas.errors import InputError, choices
 from workers.content_cache import cache_folder
 

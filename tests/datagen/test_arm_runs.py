@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.stored_scenes import open_stored_scenes, specify_again
+from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
 from schemas.fields import OUTCOMES
 from schemas.run import Run
 from tests.sim_extra import needs_sim

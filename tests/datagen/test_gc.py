@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.accounts import account_for
+from datagen.reports.accounts import account_for
 from schemas.errors import InputError
 from schemas.garbage import find_garbage, sweep
 from schemas.index import index_files, refresh

@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from datagen import cli
+from datagen.remaking.alone import ShardFailed
+from datagen.remaking.stages import STAGES
 from datagen.replay import find_sample
-from datagen.replaying_shard import ShardFailed
-from datagen.replaying_stages import STAGES
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.run import Run

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import datagen.going_on
+import datagen.jobs.going_on
 import datagen.submit
 from datagen import cli
 from schemas.merged import open_runs
@@ -160,10 +160,10 @@ def test_an_early_ctrl_c_says_how_to_go_on(
         again = the_command(capsys, lambda: cli.run(submit_arguments(run, N)))
     assert again[:2] == ["submit", "heuristic"] and not run.exists()
     with monkeypatch.context() as patched:  # while workers start: the run is there
-        patched.setattr("datagen.job.InProcessExecutor", interrupting)
+        patched.setattr("datagen.jobs.job.InProcessExecutor", interrupting)
         assert the_command(capsys, lambda: cli.run(again))[:2] == ["resume", str(run)]
     with monkeypatch.context() as patched:  # while sources are opened
-        patched.setattr(datagen.going_on, "open_origin", interrupting)
+        patched.setattr(datagen.jobs.going_on, "open_origin", interrupting)
         again = the_command(capsys, lambda: cli.run(["resume", str(run), *HERE]))
     jobs = json_of(capsys, ["status", str(run)])["jobs"]
     assert [job["state"]["end"] for job in jobs] == ["interrupted"]

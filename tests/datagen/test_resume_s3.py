@@ -32,7 +32,7 @@ def test_a_run_on_s3_is_resumed_extended_and_told_of(
         "--config", str(config), *HERE,
     ]  # fmt: skip
     with monkeypatch.context() as patched:
-        patched.setattr("datagen.job.InProcessExecutor", _interrupting)
+        patched.setattr("datagen.jobs.job.InProcessExecutor", _interrupting)
         assert cli.run(submit) == 130
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.strip().startswith("datagen ")]
     assert shlex.split(line) == ["datagen", "resume", run, *HERE]

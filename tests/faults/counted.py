@@ -23,7 +23,7 @@ from cluster.open_shards import OpenShards
 from cluster.policy import Policy
 from cluster.stop import StopRequest
 from cluster.task import Product
-from datagen.accounts import account_for
+from datagen.reports.accounts import account_for
 from schemas.cost import StageClock
 from schemas.run import Run, commit_key
 from schemas.sealing import seal

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.deep import deep_findings
-from datagen.replaying import origin_to_check, what_differs_here
+from datagen.remaking.deep import deep_findings
+from datagen.remaking.scenes import origin_to_check, what_differs_here
 from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from schemas.merged import open_runs
 from schemas.run import Run

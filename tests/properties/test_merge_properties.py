@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from datagen.accounts import Books, account_for
+from datagen.reports.accounts import Books, account_for
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS

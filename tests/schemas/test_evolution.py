@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.deep import deep_findings
-from datagen.remaking import open_origin
+from datagen.remaking.deep import deep_findings
+from datagen.remaking.shards import open_origin
 from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION, SCHEMAS, Field, sized_schema
 from schemas.run import Run
 from schemas.scene_rows import read_scene
@@ -54,7 +54,7 @@ def learn_fields(patch: pytest.MonkeyPatch) -> None:
         return {**source.label(scene, candidates, spec, clock), "bearing_rad": bearing}
 
     patch.setattr(run_shard, "scene_row", scene_row)
-    patch.setattr("datagen.replaying.scene_row", scene_row)
+    patch.setattr("datagen.remaking.scenes.scene_row", scene_row)
     patch.setattr(distance_visibility, "HEURISTIC", replace(source, label=label))
 
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import schemas.index
-from datagen.accounts import Books, account_for
+from datagen.reports.accounts import Books, account_for
 from schemas.errors import InputError
 from schemas.heads import CommitHead, EndHead, head_of_commit, head_of_end
 from schemas.index import closed_ends, committed_heads, index_files, refresh

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from datagen.specify import layout_of
+from datagen.specifying.specify import layout_of
 from schemas.fields import SCHEMAS, Field
 from schemas.specification import Source, Specification
 

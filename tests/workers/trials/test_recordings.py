@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
-from datagen.specify import specify
+from datagen.specifying.specify import specify
 from schemas.cost import StageClock
 from tests.workers.motion.tables import HalfSpaces
 from workers.geometry.mesh import F64

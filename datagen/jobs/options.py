@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from cluster.ray_cluster import refuse_unusable
-from datagen.whole_number import WHOLE_NUMBER
+from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 
 if TYPE_CHECKING:

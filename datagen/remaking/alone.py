@@ -9,8 +9,8 @@ import traceback
 from hashlib import sha256
 from typing import Any
 
-from datagen.console import print_json, print_rows
-from datagen.remaking import Origin, remade_files, remake
+from datagen.console.printing import print_json, print_rows
+from datagen.remaking.shards import Origin, remade_files, remake
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import QuarantineRecord

@@ -28,7 +28,7 @@ from tests.small_runs import (
     submit_arguments,
 )
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY = Path(__file__).resolve().parents[3]
 N = 8 * PER_SCENE
 
 

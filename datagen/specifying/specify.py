@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from datagen.arms import (
+from datagen.specifying.arms import (
     ARM_PACKAGES,
     arm_versions,
     complete_arm,

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 from cluster.ray_head import ensure_head, head_token
 from cluster.ray_jobs import RayJobs, open_ray_jobs
-from datagen.console import print_rows
-from datagen.job import JOBS_API, SUBMISSION
-from datagen.job_options import Placing, command_line
+from datagen.console.printing import print_rows
+from datagen.jobs.job import JOBS_API, SUBMISSION
+from datagen.jobs.options import Placing, command_line
 from schemas.errors import InputError
 from schemas.jobs import new_job_id
 

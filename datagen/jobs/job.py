@@ -25,9 +25,9 @@ from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask
 from cluster.watch import Together, Watch
-from datagen.console import print_rows, seconds
-from datagen.job_board import JobBoard
-from datagen.job_options import Placing, command_line
+from datagen.console.printing import print_rows, seconds
+from datagen.jobs.board import JobBoard
+from datagen.jobs.options import Placing, command_line
 from schemas.errors import InputError
 from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from schemas.record_files import now

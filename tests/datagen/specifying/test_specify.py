@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.specify import specify
+from datagen.specifying.specify import specify
 from workers.houses import open_houses
 from workers.objects import open_objects
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from datagen.console import print_rows, seconds, size
+from datagen.console.printing import print_rows, seconds, size
 
 
 def print_source(report: dict[str, Any], candidates: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from datagen.console import seconds
+from datagen.console.printing import seconds
 from schemas.jobs import Job, Jobs
 from schemas.storage import Storage
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.agreement import ROWS, Labelled
+from datagen.reports.agreement import ROWS, Labelled
 from schemas.run import Run, shard_folder
 from schemas.shard_reading import Array, committed_place, read_metadata
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from datagen.steps import steps
+from datagen.console.steps import steps
 
 
 def test_lines_say_how_far_it_is(capsys: pytest.CaptureFixture[str]):

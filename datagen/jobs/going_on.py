@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 
-from datagen.arms import refuse_missing_packages
-from datagen.detach import detached_words
 from datagen.doctor.engines import probe_render_device
-from datagen.job import JobPlan, Work, carry_out
-from datagen.job_options import Placing, absolute_place, absolute_source, resumable, words_of
-from datagen.remaking import open_origin
-from datagen.specify import label_engines, scene_engines
+from datagen.jobs.detach import detached_words
+from datagen.jobs.job import JobPlan, Work, carry_out
+from datagen.jobs.options import Placing, absolute_place, absolute_source, resumable, words_of
+from datagen.remaking.shards import open_origin
+from datagen.specifying.arms import refuse_missing_packages
+from datagen.specifying.specify import label_engines, scene_engines
 from schemas.errors import InputError
 from schemas.record_files import different_fields
 from schemas.run import Run

@@ -17,8 +17,8 @@ from datagen.drawing.filmstrip import (
 )
 from datagen.drawing.outcome_colours import LOOKS
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.pictures import Lines, Shown
-from datagen.retrial import Retrial, try_again
+from datagen.drawing.retrial import Retrial, try_again
+from datagen.drawing.shown import Lines, Shown
 from schemas.errors import InputError
 from schemas.fields import OUTCOMES
 from workers.labels.trials import arm_of

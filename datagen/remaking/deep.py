@@ -11,9 +11,9 @@ from itertools import groupby
 
 import numpy as np
 
-from datagen.remaking import Origin
-from datagen.replaying import Replayer, chosen_rows, open_replayer, what_differs_here
-from datagen.replaying_stages import (
+from datagen.remaking.scenes import Replayer, chosen_rows, open_replayer, what_differs_here
+from datagen.remaking.shards import Origin
+from datagen.remaking.stages import (
     DRAWN,
     RECOMPUTED,
     STAGES,

@@ -8,16 +8,17 @@ from typing import Any
 
 import pytest
 
-from datagen import arms, cli
-from datagen.arms import (
+from datagen import cli
+from datagen.specifying import arms
+from datagen.specifying.arms import (
     complete_arm,
     narrow_candidates,
     refuse_missing_packages,
     refuse_unsuited,
     robot_of,
 )
-from datagen.specify import layout_of, specify
-from datagen.stored_scenes import open_stored_scenes, specify_again
+from datagen.specifying.specify import layout_of, specify
+from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
 from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datagen.accounts import account_for
 from datagen.audit import audit_report
-from datagen.standing import status_report
+from datagen.reports.accounts import account_for
+from datagen.reports.standing import status_report
 from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from tests.made_runs import make_run, write

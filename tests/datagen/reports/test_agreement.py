@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.agreement import (
+from datagen.reports.agreement import (
     CANDIDATE_SETS,
     DISTANCE_EDGES_M,
     REACH_EDGES_M,
@@ -22,7 +22,7 @@ from datagen.agreement import (
     confusion,
     outcome_report,
 )
-from datagen.labelled import join_labelled
+from datagen.reports.labelled import join_labelled
 from schemas.fields import OUTCOMES
 
 CODES = {name: code for code, name in enumerate(OUTCOMES)}

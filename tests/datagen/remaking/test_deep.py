@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.deep import Finding, deep_findings
-from datagen.remaking import open_origin
+from datagen.remaking.deep import Finding, deep_findings
+from datagen.remaking.shards import open_origin
 from schemas.record_files import encode_record
 from schemas.run import Run
 from tests.datagen.forged import forge

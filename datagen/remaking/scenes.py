@@ -10,8 +10,8 @@ from importlib.metadata import PackageNotFoundError
 import numpy as np
 
 from cluster.guard import this_host
-from datagen.remaking import Origin, open_origin
-from datagen.specify import label_engines, scene_engines
+from datagen.remaking.shards import Origin, open_origin
+from datagen.specifying.specify import label_engines, scene_engines
 from schemas.cost import StageClock
 from schemas.errors import InputError
 from schemas.fields import SceneRows
@@ -91,7 +91,7 @@ def origin_to_check(
 
 
 def open_replayer(run: Run, origin: Origin) -> Replayer:
-    """A run opened to make its scenes again, from `origin_to_check` or `datagen.remaking.open_origin`."""
+    """A run opened to make its scenes again, from `origin_to_check` or `open_origin`."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
         drawn_by = _source_of(drawn_by)

@@ -7,8 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
-from datagen.specify import label_engines, layout_of, put_field, read_fields, scene_engine_names, validated
+from datagen.specifying.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
+from datagen.specifying.specify import (
+    label_engines,
+    layout_of,
+    put_field,
+    read_fields,
+    scene_engine_names,
+    validated,
+)
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Layout

@@ -1,0 +1,1 @@
+"""The terminal: tables, JSON, progress, numbers among the options."""

@@ -1,0 +1,1 @@
+"""Labels by another rule over the files of a run."""

@@ -1,0 +1,1 @@
+"""From options, files and stored scenes to a specification, a layout and a manifest."""
