@@ -57,8 +57,8 @@ def run_command(command: Command, folder: Path, environment: Mapping[str, str]) 
 
 
 def labels_of(output: tuple[str, ...]) -> list[str]:
-    """The words that begin the lines of an output, up to the first number or wide gap."""
-    starts = (re.split(r"\s{2,}|[0-9]", line.strip(), maxsplit=1)[0].strip() for line in output)
+    """The words that begin the lines of an output, up to the first with a digit in it or a wide gap."""
+    starts = (re.split(r"\s{2,}|\b\w*[0-9]", line.strip(), maxsplit=1)[0].strip() for line in output)
     return [start for start in starts if start]
 
 

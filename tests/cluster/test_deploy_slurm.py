@@ -7,6 +7,7 @@ see: run a command on a named machine, list the machines, note a request to be q
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -95,6 +96,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
     finally:
         for process in [*job.children(recursive=True), job] if job.is_running() else []:
             process.kill()
+        shutil.rmtree(f"/tmp/ray-{os.getuid()}-{job_id}", ignore_errors=True)
     said = (tmp_path / "output").read_text()
     assert code == 130, said
     assert (here / "requeued").read_text().split() == [job_id]

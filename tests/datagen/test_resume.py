@@ -115,7 +115,7 @@ def test_shards_that_were_given_up_are_tried_again_only_when_asked(
     give_up(copied, 2, 5)
     assert cli.run(["resume", str(copied), *HERE]) == 1
     told = capsys.readouterr()
-    assert "2 shards, [2, 5]" in told.out and "no luck" in told.err
+    assert "2 shards (2, 5)" in told.out and "no luck" in told.err
     (line,) = [line for line in told.out.splitlines() if line.startswith("quarantined")]
     assert f"datagen resume {copied} --quarantined" in " ".join(told.out.split()), line
     assert cli.run(["resume", str(copied), "--quarantined", *HERE]) == 0

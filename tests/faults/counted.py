@@ -96,8 +96,13 @@ def make_counted(task: CountedRows, meter: Meter) -> Product:
     return Product(won, commit.samples, commit.positives, cost)
 
 
-def drive_counted(place: str, counted: str, seconds: float, workers: int, stubborn: bool = False) -> None:
-    """A driver's life: the missing shards of the run. With `stubborn` it does not heed other drivers."""
+def drive_counted(
+    place: str, counted: str, seconds: float, workers: int, stubborn: bool = False, together: Any = None
+) -> None:
+    """A driver's life: the missing shards of the run. With `stubborn` it does not heed other drivers.
+
+    `together` is a barrier of all that begin at once: a busy machine may start one long after another.
+    """
     run = Run.open(place)
     if stubborn:
         OpenShards.go_elsewhere = lambda self: None
@@ -110,18 +115,26 @@ def drive_counted(place: str, counted: str, seconds: float, workers: int, stubbo
         )
 
     executor = ProcessExecutor(make_counted, workers)
+    if together is not None:
+        together.wait(60)
     drive(run.missing(), make_task, executor, RunBooks(run), PATIENT, Heard(), StopRequest())
     executor.close()
     close_lost_attempts(run)
 
 
-def start_driver(run: Run, counted: Path, seconds: float, workers: int, stubborn: bool = False) -> Any:
+def start_driver(
+    run: Run, counted: Path, seconds: float, workers: int, stubborn: bool = False, together: Any = None
+) -> Any:
     """A driver in a process of its own."""
-    process = _FORKS.Process(
-        target=drive_counted, args=(run.storage.url, str(counted), seconds, workers, stubborn)
-    )
+    arguments = (run.storage.url, str(counted), seconds, workers, stubborn, together)
+    process = _FORKS.Process(target=drive_counted, args=arguments)
     process.start()
     return process
+
+
+def all_at_once(drivers: int) -> Any:
+    """What drivers wait at until so many are ready."""
+    return _FORKS.Barrier(drivers)
 
 
 @dataclass(frozen=True)

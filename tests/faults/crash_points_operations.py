@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cluster.books import close_lost_attempts, refresh_index
 from datagen.gc import remove
-from datagen.relabel import relabel_all, relabelled_specification
+from datagen.relabelling.runs import relabel_all, relabelled_specification
 from schemas.checking.mending import mend_place
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from schemas.run import Run
-from tests.faults.counted import SAMPLES_PER_SHARD, await_ends, check_run, start_driver
+from tests.faults.counted import SAMPLES_PER_SHARD, all_at_once, await_ends, check_run, start_driver
 from tests.made_runs import make_run
 
 
@@ -19,7 +19,8 @@ def drive_in_pairs(
     run = make_run(folder / "run", n=shards * SAMPLES_PER_SHARD, shards=())
     counted = folder / "executions"
     counted.touch()
-    pair = [start_driver(run, counted, seconds, workers, stubborn) for _ in range(drivers)]
+    together = all_at_once(drivers)
+    pair = [start_driver(run, counted, seconds, workers, stubborn, together) for _ in range(drivers)]
     for driver in pair:
         driver.join()
         assert driver.exitcode == 0

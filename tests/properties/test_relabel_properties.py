@@ -13,7 +13,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.relabel import relabel_all, relabelled_specification
+from datagen.relabelling.runs import relabel_all, relabelled_specification
 from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
 from schemas.run import Run
 from schemas.specification import HeuristicParams

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cluster.books import close_lost_attempts
-from datagen.relabel import relabel_all, relabelled_specification
+from datagen.relabelling.runs import relabel_all, relabelled_specification
 from schemas.checking.mending import mend_place
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError

@@ -45,14 +45,15 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
     state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    # A shell in a session of its own, which dies with all that it started.
-    shell = subprocess.Popen(
-        [sys.executable, "-m", "datagen.cli", *submit_arguments(run, N, workers=1), "--detach"],
-        cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
-    out, err = shell.communicate(timeout=200)
-    if shell.returncode == 2 and "does not start" in err:
-        pytest.skip(err)
+    for _ in range(2):  # a head that does not start in time is refused, and a busy machine may need longer
+        # A shell in a session of its own, which dies with all that it started.
+        shell = subprocess.Popen(
+            [sys.executable, "-m", "datagen.cli", *submit_arguments(run, N, workers=1), "--detach"],
+            cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+        out, err = shell.communicate(timeout=140)
+        if shell.returncode != 2 or "does not start" not in err:
+            break
     assert shell.returncode == 0, err
     assert f"datagen logs {run} --follow" in out and "datagen cancel" in out
     try:
@@ -93,7 +94,7 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
     assert running_head() == head
     while len(jobs.all()) < 2:
         time.sleep(0.1)
-    refused(["cancel", "--head"], capsys, "1 jobs are at work", "extend")
+    refused(["cancel", "--head"], capsys, "at work: 1 job", "extend")
     assert cli.run(["cancel", str(run), "--now"]) == 0
     told = capsys.readouterr().out
     assert "ended interrupted" in told

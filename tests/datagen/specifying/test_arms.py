@@ -17,9 +17,9 @@ from datagen.specifying.arms import (
     refuse_unsuited,
     robot_of,
 )
+from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
 from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
-from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Specification, TrialParams
