@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from datagen.relabel import relabel_all, relabelled_specification
+from datagen.relabelling.runs import relabel_all, relabelled_specification
 from schemas.run import Run
 from schemas.sealing import seal
 from schemas.storage import open_storage

@@ -31,8 +31,8 @@ import zarr
 
 from datagen.jobs.job import JobPlan, Work, make_missing, open_board
 from datagen.jobs.options import Placing
+from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
-from datagen.submit import manifest_of
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import Commit

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from datagen.console.options import AsJson
 from datagen.console.printing import print_json
 from datagen.reports.accounts import Account, Books, account_for
 from datagen.reports.agreement import common_candidates, compare, outcome_report
@@ -35,7 +36,7 @@ def audit(
         Literal["grid", "clear", "in-range"],
         Parameter(help="Candidates whose outcomes and agreement are counted; grid takes all there are."),
     ] = "grid",
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """What labels cost: seconds per label by stage, waste, and a projection to 180,000; how they agree.
 

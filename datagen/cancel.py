@@ -11,7 +11,8 @@ from cyclopts import Parameter
 
 from cluster.ray_head import running_head, stop_head
 from cluster.ray_jobs import open_ray_jobs
-from datagen.console.printing import print_json, print_rows, seconds
+from datagen.console.options import AsJson
+from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
 from datagen.jobs.options import command_line
 from datagen.jobs.report import health_line, job_report
@@ -26,7 +27,9 @@ _ANSWER_WITHIN_S = 30.0
 
 
 def cancel(
-    run: Annotated[str | None, Parameter(help="The run's folder or s3:// address.")] = None,
+    run: Annotated[
+        str | None, Parameter(help="The run's folder or s3:// address; also of merged runs.")
+    ] = None,
     *,
     now: Annotated[
         bool, Parameter(negative=(), help="End what is in flight by force, instead of letting it commit.")
@@ -34,7 +37,7 @@ def cancel(
     head: Annotated[
         bool, Parameter(negative=(), help="End the Ray that stays on this machine for detached jobs.")
     ] = False,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """Ask every job at work on a run to stop, and wait until it has: what is committed stays.
 
@@ -105,7 +108,7 @@ def _cancel_head(now: bool) -> int:
         if working:
             mend = "Cancel them first, or give --now to end them by force"
             raise InputError(
-                "--head", "", f"{len(working)} jobs are at work, first: {working[0][:200]}", mend
+                "--head", "", f"at work: {counted(len(working), 'job')}, first {working[0][:200]}", mend
             )
     began_s = time.monotonic()
     ended = stop_head()

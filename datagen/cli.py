@@ -1,7 +1,7 @@
 """The program `datagen`: its verbs, and what becomes of errors on the way out.
 
-Exit codes: 0 good, 1 finished with too many failures, 2 bad input, 130 interrupted. Verbs are loaded
-only when called, so that `datagen --help` does not wait for simulators.
+Exit codes: 0 good, 1 finished and something is wrong (too many failures, findings, differences), 2 bad input,
+130 interrupted. Verbs are loaded only when called, so that `datagen --help` does not wait for simulators.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from cyclopts import App
+from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError, UnknownCommandError
 
 from datagen import __version__
@@ -59,8 +59,11 @@ _PLACE_ERRNOS = {
 }
 
 
-def build_app() -> App:
-    """The command line with every verb of `VERBS` registered and none imported."""
+def build_app(called: str = "") -> App:
+    """The command line with every verb of `VERBS` registered and none imported.
+
+    The verb that is called describes itself, by its docstring.
+    """
     app = App(
         name="datagen",
         help="Labelled robot base poses from furnished houses.",
@@ -70,9 +73,11 @@ def build_app() -> App:
         exit_on_error=False,
         suppress_keyboard_interrupt=False,
         result_action="return_value",
+        # Every flag is off unless given.
+        default_parameter=Parameter(show_default=lambda value: None if value is False else value),
     )
     for verb, (target, line) in VERBS.items():
-        app.command(target, name=verb, help=line)
+        app.command(target, name=verb, help=None if verb == called else line)
     return app
 
 
@@ -128,7 +133,7 @@ def run(arguments: Sequence[str]) -> int:
     Defects of this program are not caught: their traceback is what a report of them needs.
     """
     try:
-        result = build_app()(list(arguments))
+        result = build_app(next(iter(arguments), ""))(list(arguments))
         sys.stdout.flush()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")

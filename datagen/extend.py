@@ -8,24 +8,23 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import Sources, go_on, open_work
+from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import (
     DEFAULT_SHARE,
     Address,
     Detach,
-    HousesAgain,
     JsonLines,
     MaxQuarantined,
-    ObjectsAgain,
     Placing,
-    ScenesFromAgain,
     Workers,
     absolute_place,
     resumable,
     words_of,
 )
+from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 from schemas.errors import InputError
 from schemas.merged import open_runs
@@ -34,7 +33,7 @@ from schemas.storage import open_storage
 
 
 def extend(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
     houses: HousesAgain = None,
@@ -50,14 +49,12 @@ def extend(
 
     Merged runs share the further labels evenly, in whole shards.
     """
-    placing, given = (
-        Placing(workers, address, json, max_quarantined, detach),
-        Sources(houses, objects, scenes_from),
-    )
+    placing = Placing(workers, address, json, max_quarantined, detach)
+    given = Sources(houses, objects, scenes_from)
     placing.refuse_bad()
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
-    words = ["extend", absolute_place(run), "--n", str(n), *given.words(), *placing.words()]
+    words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
     if detach and address != "local":
         return detach_job(words, run, placing)
     with resumable([*words, *words_of({"--address": None if address == "local" else address})]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import time
 from collections import Counter
 from typing import Annotated, Any
@@ -10,8 +11,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from cluster.books import refresh_index
-from datagen.console.counting import counting
+from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import print_json, print_rows, size
+from datagen.console.steps import counting
 from schemas.errors import InputError
 from schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
 from schemas.merged import open_runs
@@ -23,13 +25,13 @@ _SHOWN = 100
 
 
 def gc(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address.")],
+    run: RunPlace,
     *,
     older_than: Annotated[
         str, Parameter(help="What was written later than this ago stays: 90s, 30m, 24h or 7d.")
     ] = "24h",
     dry_run: Annotated[bool, Parameter(negative=(), help="Tell what would go, and remove nothing.")] = False,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """Remove files that no commit names: of attempts that lost or never committed, drafts and probes.
 
@@ -39,11 +41,11 @@ def gc(
     """
     place = open_storage(run, probe=False, create=False)
     age_s = age_of(older_than)
-    with counting("looking", as_json=json or None) as seen:
+    with counting("shards looked at", as_json=True if json else None) as seen:
         garbage = find_garbage(place, age_s, time.time(), seen)
     swept = Swept()
     if not dry_run:
-        with counting("removing", "pieces", as_json=json or None) as seen:
+        with counting("pieces removed", as_json=True if json else None) as seen:
             swept = remove(place, garbage, seen)
     report = gc_report(place, garbage, swept, dry_run)
     if json:
@@ -102,6 +104,6 @@ def _print(place: str, report: dict[str, Any]) -> None:
     if report["committed_meanwhile"]:
         print_rows("committed meanwhile, and kept", [("attempts", str(report["committed_meanwhile"]))])
     if report["damaged"]:
-        mend = f"datagen repair {place}"
+        mend = f"datagen repair {shlex.quote(place)}"
         rows = [(key, mend) for key in report["damaged"][:_SHOWN]]
         print_rows("their attempts died in their commit while their files went", rows, ("commit", "mend"))

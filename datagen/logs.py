@@ -5,40 +5,25 @@ from __future__ import annotations
 import json as json_text
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import jobs_api_of
+from datagen.reports.events import Event, Known, events_of
 from schemas.errors import InputError
-from schemas.index import Heads
 from schemas.jobs import Jobs
 from schemas.merged import open_runs
-from schemas.quarantine import lifted_records
-from schemas.run import Run
 from schemas.storage import Storage, open_storage
 
 _LOOK_S = 2.0
-_GOOD = ("committed", "superseded")
-
-
-@dataclass(frozen=True)
-class Event:
-    """One line: when, what, and all that is known of it. Events of one key are one."""
-
-    at: str  # UTC, ISO 8601; "" where it is not known
-    key: str  # of the record that says so, and what it says
-    what: str
-    text: str
-    stack: str = ""
-    shard: int | None = None
 
 
 def logs(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     follow: Annotated[
         bool, Parameter(negative=(), help="Go on while a job is at work, and say what is new.")
@@ -65,33 +50,6 @@ def logs(
     return 0
 
 
-_NOTHING = Event("", "", "", "")
-
-
-class Known:
-    """Events that were read before: ledger entries are read once, however long one follows."""
-
-    def __init__(self) -> None:
-        self._events: dict[str, Event] = {}
-
-    def once(self, key: str, read: Callable[[], Event]) -> Event:
-        """The event of this key, read if it is new."""
-        if key not in self._events:
-            self._events[key] = read()
-        return self._events[key]
-
-
-def events_of(place: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
-    """What the records of a place say, in order of time; `known` is what earlier calls have read."""
-    known = known or Known()
-    found = _job_events(place) if shard is None else []
-    runs = open_runs(place)
-    for number, run in enumerate(runs):
-        part = f"part {number}: " if len(runs) > 1 else ""
-        found += _attempt_events(run, part, shard, known) + _quarantine_events(run, part, shard)
-    return sorted(found, key=lambda event: (event.at, event.key))
-
-
 def _growing(place: Storage, shard: int | None, follow: bool) -> Iterator[Event]:
     told, known = set[str](), Known()
     while True:
@@ -104,86 +62,6 @@ def _growing(place: Storage, shard: int | None, follow: bool) -> Iterator[Event]
         if not live:
             return
         time.sleep(_LOOK_S)
-
-
-def _job_events(place: Storage) -> list[Event]:
-    events: list[Event] = []
-    for job in Jobs(place).all():
-        record, state, order = job.record, job.state, job.order
-        where = f"on {record.host}, process {record.pid}"
-        if record.submission:
-            where += f", submitted to Ray as {record.submission}"
-        text = f"job {job.id} began {where}: {' '.join(record.command)}"
-        events.append(Event(record.started, f"{job.id} began", "job_began", text))
-        if order is not None:
-            how = "at once" if order.now else "when what is in flight has ended"
-            text = f"job {job.id} is asked to stop {how}, from {order.host}"
-            events.append(Event(order.asked, f"{job.id} asked {order.now}", "stop_asked", text))
-        if state is not None and state.end:
-            why = f": {state.cause}" if state.cause else ""
-            text = (
-                f"job {job.id} ended {state.end}, exit code {state.exit_code}, {state.done} of "
-                f"{state.shards} shards, {state.labels:,} labels{why}"
-            )
-            events.append(Event(state.updated, f"{job.id} ended", "job_ended", text))
-        elif job.health() == "dead":
-            text = f"job {job.id} is dead: last heard of then, and its process is gone"
-            heard = state.updated if state else record.started
-            events.append(Event(heard, f"{job.id} dead", "job_dead", text))
-    return events
-
-
-def _attempt_events(run: Run, part: str, shard: int | None, known: Known) -> list[Event]:
-    heads, failed = Heads(run), set[int]()
-    ends, shards = list(heads.ends()), {start.attempt: start.shard for start in heads.unfinished()}
-    for end in ends:
-        shards[end.attempt] = end.shard
-        if end.outcome not in _GOOD:
-            failed.add(end.shard)
-    wanted = failed if shard is None else {shard}
-    events: list[Event] = []
-    for end in ends:
-        if end.shard in wanted and (shard is not None or end.outcome not in _GOOD):
-            key = f"{run.storage.url} {end.attempt} {end.outcome}"
-            events.append(known.once(key, lambda end=end, key=key: _end_event(run, part, end.attempt, key)))
-    for attempt in sorted(attempt for attempt, number in shards.items() if number in wanted):
-        key = f"{run.storage.url} {attempt} begins"
-        events.append(known.once(key, lambda attempt=attempt, key=key: _start_event(run, part, attempt, key)))
-    return [event for event in events if event.what]
-
-
-def _end_event(run: Run, part: str, attempt: str, key: str) -> Event:
-    entry = run.ledger.end_of(attempt)
-    if entry is None:
-        return _NOTHING
-    cause = f": {entry.cause}" if entry.cause else ""
-    text = f"{part}shard {entry.shard} {entry.outcome}{cause} ({attempt})"
-    return Event(entry.ended, key, f"attempt_{entry.outcome}", text, entry.stack, entry.shard)
-
-
-def _start_event(run: Run, part: str, attempt: str, key: str) -> Event:
-    start = run.ledger.start_of(attempt)
-    if start is None:
-        return _NOTHING
-    text = f"{part}shard {start.shard} begins on {start.host or 'a host unknown'} ({attempt})"
-    return Event(start.started, key, "attempt_begins", text, "", start.shard)
-
-
-def _quarantine_events(run: Run, part: str, shard: int | None) -> list[Event]:
-    events: list[Event] = []
-    for lifted, records in ((False, run.quarantine_records()), (True, lifted_records(run))):
-        for record in records:
-            if shard is not None and record.shard != shard:
-                continue
-            last = record.causes[-1] if record.causes else "for no cause that is known"
-            since = ", and was taken out of it later" if lifted else ""
-            text = (
-                f"{part}shard {record.shard} is given up after {len(record.attempts)} attempts{since}: {last}"
-            )
-            key = f"{run.storage.url} {record.shard} given up {record.created}"
-            stack = record.stacks[-1] if record.stacks else ""
-            events.append(Event(record.created, key, "quarantined", text, stack, record.shard))
-    return events
 
 
 def _print(event: Event, stacks: bool, as_json: bool) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.cli import EXIT_INTERRUPTED
+from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.steps import steps
 from datagen.reports.accounts import account_for
@@ -23,7 +24,7 @@ def merge(
     runs: Annotated[list[str], Parameter(negative=(), help="Runs made apart, or places of merged ones.")],
     *,
     out: Annotated[str, Parameter(help="The result's folder or s3:// address; what is there is added to.")],
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """One run of several: other machines, seeds, houses; partial, overlapping or merged themselves.
 

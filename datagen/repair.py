@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.counting import counting
-from datagen.console.printing import print_json, print_rows
+from datagen.console.options import AsJson, RunPlace
+from datagen.console.printing import counted, listed, print_json, print_rows
+from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from datagen.verify import finding_row, print_findings
 from schemas.checking.mending import Mended, RemakeShard, mend_place
 from schemas.errors import InputError
@@ -24,21 +26,17 @@ from schemas.storage import open_storage
 if TYPE_CHECKING:
     from datagen.remaking.shards import Origin
 
-Sources = tuple[str | None, str | None, str | None]
-
 
 def repair(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     workers: Annotated[
         int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0 works in this one.")
     ] = 0,
-    houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
-    objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
-    scenes_from: Annotated[
-        str | None, Parameter(help="The run whose scenes this one labelled, where it has moved since.")
-    ] = None,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    houses: HousesAgain = None,
+    objects: ObjectsAgain = None,
+    scenes_from: ScenesFromAgain = None,
+    json: AsJson = False,
 ) -> int:
     """Check a run as verify does, mend what can be mended, and check again.
 
@@ -50,8 +48,8 @@ def repair(
         raise InputError("--workers", str(workers), "is not between 0 and 256", "Leave it out for none")
     place = open_storage(run, probe=False, create=False)
     with (
-        counting("checked", as_json=True if json else None) as seen,
-        _remaking((houses, objects, scenes_from), workers) as remake,
+        counting("shards checked", as_json=True if json else None) as seen,
+        _remaking(Sources(houses, objects, scenes_from), workers) as remake,
     ):
         mended = mend_place(place, remake, max(1, workers), seen)
     left = [finding for finding in mended.left if finding.is_damage]
@@ -64,16 +62,16 @@ def repair(
 
 
 @contextmanager
-def _remaking(sources: Sources, workers: int) -> Generator[RemakeShard]:
+def _remaking(given: Sources, workers: int) -> Generator[RemakeShard]:
     """How shards are made again: in this process, or in so many others."""
     if workers == 0:
-        yield lambda run, shard: _remake(run, shard, sources)
+        yield lambda run, shard: _remake(run, shard, given)
         return
     # Workers are spawned when the first shard is bad, and not before.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_signals)
     try:
-        yield lambda run, shard: pool.submit(_remake, run, shard, sources).result()
+        yield lambda run, shard: pool.submit(_remake, run, shard, given).result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
@@ -82,19 +80,19 @@ def _leave_signals() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
 
 
-def _remake(run: Run, shard: int, sources: Sources) -> Mapping[str, bytes]:
+def _remake(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed here."""
     # Simulators are imported only where a shard is bad.
     from datagen.remaking.shards import remade_files, remake
 
-    return remade_files(run, remake(run, shard, _origin(run.storage.url, sources)))
+    return remade_files(run, remake(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
-def _origin(place: str, sources: Sources) -> Origin:
+def _origin(place: str, given: Sources) -> Origin:
     from datagen.remaking.shards import open_origin
 
-    return open_origin(Run.open(place), *sources)
+    return open_origin(Run.open(place), given)
 
 
 def _report(run: str, mended: Mended) -> dict[str, Any]:
@@ -125,20 +123,22 @@ def _apart(mended: Mended) -> list[str]:
 
 
 def _print(report: dict[str, Any], mended: Mended) -> None:
+    made, of_shards = len(report["files_made_again"]), report["shards_made_again"]
     rows = [
         ("records", f"{len(report['records'])} put back from copies and other records"),
         ("files", f"{len(report['files_from_copies'])} put back from copies"),
-        ("", f"{len(report['files_made_again'])} made again, of shards {report['shards_made_again'][:10]}"),
-        ("sealed", "anew" if mended.resealed else f"{len(report['sealed_files'])} files mended"),
-        ("all others", f"{mended.untouched:,} files have the bytes and times they had"),
+        ("", f"{made} made again" + (f", of shards {listed(of_shards)}" if of_shards else "")),
+        ("sealed", "anew" if mended.resealed else f"{counted(len(report['sealed_files']), 'file')} mended"),
+        ("all others", f"the bytes and times that they had: {counted(mended.untouched, 'file')}"),
     ]
     if mended.changed:
         rows.append(
-            ("changed", f"{len(mended.changed)} files changed meanwhile, not by this: is a job at work?")
+            ("changed", f"{counted(len(mended.changed), 'file')} meanwhile, not by this: is a job at work?")
         )
     if any("other bytes" in finding.mend for finding in mended.left):
         apart = "; ".join(report["apart_from_here"]) or "nothing that the run's records tell of"
         rows.append(("differs here", apart))
     left = sum(finding.is_damage for finding in mended.left)
-    print_rows(f"{'clean' if not left else f'{left} findings left'}: {report['run']}", rows)
+    state = f"{counted(left, 'finding')} left" if left else "clean"
+    print_rows(f"{state}: {report['run']}", rows)
     print_findings("left", mended.left, len(mended.left))

@@ -9,14 +9,15 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
+from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import Step, steps
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
-from datagen.jobs.options import HousesAgain, ObjectsAgain, ScenesFromAgain
 from datagen.remaking.alone import replay_shard
 from datagen.remaking.scenes import chosen_rows, open_replayer, origin_to_check, what_differs_here
 from datagen.remaking.shards import Origin, open_origin
+from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
 from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
@@ -32,7 +33,7 @@ _SHOWN = 5
 
 
 def replay(
-    run: Annotated[str, Parameter(help="The run's folder or address, also of merged runs.")],
+    run: RunPlace,
     sample: Annotated[
         str | None,
         Parameter(help="A sample's id, 32 hexadecimal digits, or as many as make it the only one."),
@@ -51,7 +52,7 @@ def replay(
     houses: HousesAgain = None,
     objects: ObjectsAgain = None,
     scenes_from: ScenesFromAgain = None,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """Draw a sample's scene again from its seeds, as a worker does, and compare it with what is stored.
 
@@ -67,7 +68,7 @@ def replay(
     if out is not None and (out.suffix.lower() != ".png" or not out.parent.is_dir()):
         problem = "is not a .png file in a folder that exists"
         raise InputError(out, "--out", problem, "Give such a name")
-    runs = open_runs(run)
+    runs, given = open_runs(run), Sources(houses, objects, scenes_from)
     if sample is not None:
         shards = sum(len(found.committed()) for found in runs)
         with steps("shards searched", shards, True if json else None) as step:
@@ -78,10 +79,10 @@ def replay(
     if shard is not None:
         if out is not None:
             raise InputError("--out", str(out), "a shard has no picture", "Take it out, or give --scene")
-        return replay_shard(run, found, shard, open_origin(found, houses, objects, scenes_from), json)
+        return replay_shard(run, found, shard, open_origin(found, given), json)
     assert index is not None
     stored = read_scene(found, index)
-    return _compare(run, found, stored, row, origin_to_check(found, houses, objects, scenes_from), out, json)
+    return _compare(run, found, stored, row, origin_to_check(found, given), out, json)
 
 
 def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:

@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
 
-from cyclopts import Parameter
-
+from datagen.console.options import RunPlace
+from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import Sources, go_on, open_work
+from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import (
     DEFAULT_SHARE,
     Address,
     Detach,
-    HousesAgain,
     JsonLines,
     MaxQuarantined,
-    ObjectsAgain,
     Placing,
     Quarantined,
-    ScenesFromAgain,
     Workers,
     absolute_place,
     resumable,
     words_of,
 )
+from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from schemas.merged import open_runs
 from schemas.quarantine import lift_quarantine
 from schemas.storage import open_storage
 
 
 def resume(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     quarantined: Quarantined = False,
     houses: HousesAgain = None,
@@ -47,12 +44,10 @@ def resume(
 
     Of merged runs every part is resumed, one after the other.
     """
-    placing, given = (
-        Placing(workers, address, json, max_quarantined, detach),
-        Sources(houses, objects, scenes_from),
-    )
+    placing = Placing(workers, address, json, max_quarantined, detach)
+    given = Sources(houses, objects, scenes_from)
     placing.refuse_bad()
-    words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *given.words()]
+    words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += placing.words()
     if detach and address != "local":
         return detach_job(words, run, placing)
@@ -64,5 +59,5 @@ def resume(
             return detach_job(words, run, placing)
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
-            sys.stderr.write(f"{lifted} shards are taken out of quarantine\n")
+            sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
     return go_on(place, run, works, placing, given)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from cyclopts import Parameter
-
-from datagen.console.printing import print_rows
+from datagen.console.options import RunPlace
+from datagen.console.printing import counted, listed, print_rows
 from schemas.merged import open_runs
 from schemas.sealing import SEALED, SealedRoot, sealed_root
 from schemas.sealing import seal as seal_place
@@ -15,7 +12,7 @@ from schemas.storage import open_storage
 
 
 def seal(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
 ) -> int:
     """Lay one flat Zarr store, data.zarr, over the committed shards, also of an unfinished run.
 
@@ -32,7 +29,7 @@ def seal(
 
 
 def unseal(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
 ) -> int:
     """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again."""
     storage = open_storage(run, probe=False, create=False)
@@ -56,8 +53,8 @@ def _told(root: SealedRoot) -> list[tuple[str, str]]:
         head = f"run {part.spec_hash[:16]}"
         absent = part.missing_shards
         if absent:
-            shown = ", ".join(map(str, absent[:10])) + (", ..." if len(absent) > 10 else "")
-            rows.append((head, f"{part.n:,} labels wanted; without {len(absent)} of its shards: {shown}"))
+            lacks = f"without {len(absent)} of its shards: {listed(absent)}"
+            rows.append((head, f"{counted(part.n, 'label')} wanted; {lacks}"))
         else:
-            rows.append((head, f"{part.n:,} labels, every shard"))
+            rows.append((head, f"{counted(part.n, 'label')}, every shard"))
     return rows

@@ -8,9 +8,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.console.options import RunPlace
 from datagen.console.printing import print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
+from datagen.remaking.sources import HousesAgain, ObjectsAgain
 from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
 from schemas.merged import find_scene, open_runs
@@ -22,15 +24,15 @@ _BEST = "best"
 
 
 def show(
-    run: Annotated[str, Parameter(help="The run's folder.")],
+    run: RunPlace,
     *,
     out: Annotated[Path, Parameter(help="The picture to write: a .png file, or a .gif of a trial.")],
     scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
     trial: Annotated[
         str | None, Parameter(help="A candidate's index, or best: show how its trial went (plan, sim).")
     ] = None,
-    houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
-    objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
+    houses: HousesAgain = None,
+    objects: ObjectsAgain = None,
 ) -> int:
     """A picture of one scene: the RGB-D frame, floor plans with the candidates, numbers.
 

@@ -6,7 +6,9 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.printing import print_json, print_rows
+from datagen.console.options import AsJson, RunPlace
+from datagen.console.printing import counted, listed, print_json, print_rows
+from datagen.jobs.options import command_line
 from datagen.jobs.report import health_line, jobs_report
 from datagen.reports.standing import place_report
 from schemas.jobs import Jobs
@@ -14,10 +16,10 @@ from schemas.storage import Storage, open_storage
 
 
 def status(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     stacks: Annotated[bool, Parameter(negative=(), help="With one stack of each cause of failure.")] = False,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
 ) -> int:
     """How far a run is: shards, labels, jobs at work, failed attempts by cause, quarantine.
 
@@ -35,9 +37,9 @@ def status(
 def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
     shards = report["shards"]
     given_up = len(shards["quarantined"])
-    state = "complete" if report["complete"] else f"{shards['missing']} shards to make"
+    state = "complete" if report["complete"] else f"{counted(shards['missing'], 'shard')} to make"
     if given_up:
-        state += f", {given_up} in quarantine: {shards['quarantined'][:10]}"
+        state += f", {given_up} in quarantine ({listed(shards['quarantined'])})"
     attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
@@ -50,7 +52,8 @@ def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
     if report["scenes_from"]:
         rows.append(("scenes from", report["scenes_from"]))
     if report["attempts_without_end"]:
-        rows.insert(3, ("without end", f"{report['attempts_without_end']} attempts run now, or were lost"))
+        without = counted(report["attempts_without_end"], "attempt")
+        rows.insert(3, ("without end", f"{without}: at work now, or lost"))
     print_rows(f"run {name}", rows)
     _print_jobs(place)
     _print_parts(report)
@@ -108,7 +111,8 @@ def _print_failures(name: str, report: dict[str, Any]) -> None:
     if given_up:
         rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in given_up[:20]]
         print_rows("quarantine", rows, ("shard", "attempts", "last cause"))
-        print_rows(f"try them again: datagen resume {name} --quarantined", [])
+        again = command_line(["resume", name, "--quarantined"])
+        print_rows(f"try them again: {again}", [])
 
 
 def _seal(report: dict[str, Any]) -> str:

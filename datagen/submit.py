@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import platform
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen import __version__
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, refuse_unusable_engines
@@ -27,17 +24,15 @@ from datagen.jobs.options import (
     resumable,
     words_of,
 )
-from datagen.specifying.arms import arm_versions, refuse_missing_packages
+from datagen.specifying.arms import refuse_missing_packages
+from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
 from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from schemas.cost import StageClock
 from schemas.errors import InputError
-from schemas.fields import SCHEMAS
 from schemas.merged import MERGED
-from schemas.record_files import now
 from schemas.run import Run
-from schemas.run_records import Layout, Manifest
-from schemas.specification import Specification
+from schemas.run_records import Layout
 from schemas.storage import open_storage
 from workers.houses import open_houses
 from workers.labels import load_label_source
@@ -45,15 +40,13 @@ from workers.objects import open_objects
 from workers.scenes.draw import draw_scene
 from workers.world import World, assemble_world, open_world
 
-_LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
-
 
 def submit(
     label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic, plan or sim.")],
     /,
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number later extends the run.")],
-    out: Annotated[str, Parameter(help="The run's folder.")],
+    out: Annotated[str, Parameter(help="The run's folder or s3:// address.")],
     houses: Annotated[str | None, Parameter(help="builtin, procthor:DIR or ai2thor:DIR [builtin].")] = None,
     objects: Annotated[str | None, Parameter(help="builtin or ycb:DIR [builtin].")] = None,
     scenes_from: Annotated[
@@ -207,29 +200,6 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         draw_scene(world, 0, StageClock())
     except InputError as error:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
-
-
-def manifest_of(
-    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
-) -> Manifest:
-    """The manifest of a new run in shards of this layout.
-
-    `schema_version` is that of the run whose scenes are taken: what their rows lack cannot be stored.
-    """
-    source = load_label_source(spec.label_source)
-    newest = SCHEMAS[source.schema].version
-    return Manifest(
-        spec=spec,
-        spec_hash=spec.hash(),
-        schema_name=source.schema,
-        schema_version=newest if schema_version is None else min(schema_version, newest),
-        layout=layout,
-        code_version=__version__,
-        libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
-        platform=platform.platform(),
-        created=now(),
-        sources=sources,
-    )
 
 
 def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:

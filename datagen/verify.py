@@ -11,9 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.console.counting import counting
-from datagen.console.printing import print_json, print_rows, seconds, size
+from datagen.console.options import AsJson, RunPlace
+from datagen.console.printing import counted, print_json, print_rows, seconds, size
+from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from schemas.checking.finding import Finding
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
@@ -25,7 +27,7 @@ _SHOWN = 50  # of them on a terminal
 
 
 def verify(
-    run: Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")],
+    run: RunPlace,
     *,
     deep: Annotated[
         int,
@@ -35,12 +37,10 @@ def verify(
     seed: Annotated[
         int | None, WHOLE_NUMBER, Parameter(help="Which samples and scenes --deep takes [others each time].")
     ] = None,
-    houses: Annotated[str | None, Parameter(help="Houses, where they have moved since.")] = None,
-    objects: Annotated[str | None, Parameter(help="Objects, where they have moved since.")] = None,
-    scenes_from: Annotated[
-        str | None, Parameter(help="The run whose scenes this one labelled, where it has moved since.")
-    ] = None,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    houses: HousesAgain = None,
+    objects: ObjectsAgain = None,
+    scenes_from: ScenesFromAgain = None,
+    json: AsJson = False,
 ) -> int:
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
 
@@ -51,13 +51,13 @@ def verify(
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
     place = open_storage(run, probe=False, create=False)
     checked, found = Checked(), Found()
-    with counting("checked", as_json=True if json else None) as seen:
+    with counting("shards checked", as_json=True if json else None) as seen:
         found.take(check_place(place, checked, seen))
     chosen = secrets.randbits(32) if seed is None else seed
     recomputed = deep > 0 and not found.damage
     if recomputed:
-        sources = (houses, objects, scenes_from)
-        found.take(_deep(place, checked.runs, deep, chosen, sources))
+        given = Sources(houses, objects, scenes_from)
+        found.take(_deep(place, checked.runs, deep, chosen, given))
     report = _report(run, checked, found)
     report["deep"] = {"asked": deep, "done": recomputed, "seed": chosen} if deep else None
     if json:
@@ -87,13 +87,7 @@ class Found:
         return self.counts.total() - self.counts["stale"]
 
 
-def _deep(
-    place: Storage,
-    runs: list[Run],
-    count: int,
-    seed: int,
-    sources: tuple[str | None, str | None, str | None],
-) -> Iterator[Finding]:
+def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
     from datagen.remaking.deep import deep_findings
@@ -104,7 +98,7 @@ def _deep(
     shares[: count % len(runs)] += 1
     mend = "Trust neither it nor its neighbours: find out what made it"
     for run, share in zip(runs, shares.tolist(), strict=True):
-        origin = origin_to_check(run, *sources)
+        origin = origin_to_check(run, given)
         folder = run.storage.url.removeprefix(place.url).strip("/")
         for where, shard, problem in deep_findings(run, share, origin, rng):
             key = where.removeprefix(f"{run.storage.url}/")
@@ -150,23 +144,25 @@ def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
 def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
     books = checked.books
     wall_s = books.committed_wall_s + books.wasted_wall_s
+    files, attempts = counted(checked.files, "file"), counted(books.attempts, "attempt")
     rows = [
-        ("shards", f"{checked.shards:,}, {checked.files:,} files of {size(checked.bytes)}, every byte"),
+        ("shards", f"{checked.shards:,}, {files} of {size(checked.bytes)}, every byte"),
         ("samples", f"{checked.samples:,}; each id is that of its specification, scene and candidate"),
         (
             "ledger",
-            f"{books.attempts:,} attempts: {seconds(wall_s)} = {seconds(books.committed_wall_s)} in commits"
+            f"{attempts}: {seconds(wall_s)} = {seconds(books.committed_wall_s)} in commits"
             f" + {seconds(books.wasted_wall_s)} waste",
         ),
         ("sealed", "yes" if checked.is_sealed else "no"),
     ]
     deep = report["deep"]
     if deep:
-        done = f"{deep['asked']:,} samples recomputed, {deep['asked']:,} scenes drawn again"
+        asked = deep["asked"]
+        done = f"{counted(asked, 'sample')} recomputed, {counted(asked, 'scene')} drawn again"
         rows.append(
             ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: mend it first")
         )
-    state = "clean" if not found.damage else f"{found.damage:,} findings"
+    state = "clean" if not found.damage else counted(found.damage, "finding")
     print_rows(f"{state}: {report['run']}", rows)
     print_findings("found", found.kept, sum(found.counts.values()))
 

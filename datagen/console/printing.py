@@ -31,6 +31,16 @@ def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] =
     console.print(table)
 
 
+def counted(n: int, what: str) -> str:
+    """How many there are of what has a regular plural: 1 shard, 1,200 shards."""
+    return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
+
+
+def listed(values: Sequence[object], most: int = 10) -> str:
+    """The first of them: 3, 5, 8, ..."""
+    return ", ".join(map(str, values[:most])) + (", ..." if len(values) > most else "")
+
+
 def seconds(value: float) -> str:
     """A duration as people read it: 0.8 s, 3 min 20 s, 2 h 5 min, 3.1 days."""
     if value < 60:

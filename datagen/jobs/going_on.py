@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 
 from datagen.doctor.engines import probe_render_device
@@ -11,6 +10,7 @@ from datagen.jobs.detach import detached_words
 from datagen.jobs.job import JobPlan, Work, carry_out
 from datagen.jobs.options import Placing, absolute_place, absolute_source, resumable, words_of
 from datagen.remaking.shards import open_origin
+from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.specify import label_engines, scene_engines
 from schemas.errors import InputError
@@ -22,23 +22,15 @@ from workers.labels import load_label_source
 from workers.robots import gripper_of
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Where the user says that a run's sources lie now; None is where the run found them."""
-
-    houses: str | None = None
-    objects: str | None = None
-    scenes_from: str | None = None
-
-    def words(self) -> list[str]:
-        """The options that say the same again."""
-        return words_of(
-            {
-                "--houses": self.houses and absolute_source(self.houses),
-                "--objects": self.objects and absolute_source(self.objects),
-                "--scenes-from": self.scenes_from and absolute_place(self.scenes_from),
-            }
-        )
+def source_words(given: Sources) -> list[str]:
+    """The options that say the same again, from any folder."""
+    return words_of(
+        {
+            "--houses": given.houses and absolute_source(given.houses),
+            "--objects": given.objects and absolute_source(given.objects),
+            "--scenes-from": given.scenes_from and absolute_place(given.scenes_from),
+        }
+    )
 
 
 def open_work(run: Run, given: Sources, address: str) -> Work:
@@ -55,7 +47,7 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
         problem = f"{run.storage.url} draws its own scenes"
         raise InputError("--scenes-from", given.scenes_from, problem, "Take --scenes-from out")
     _refuse_other_engines(run)
-    open_origin(run, given.houses, given.objects, given.scenes_from)
+    open_origin(run, given)
     refuse_unusable_engines(spec, address)
     return Work(
         run,
@@ -66,10 +58,10 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
 
 
 def go_on(
-    place: Storage, name: str, works: Sequence[Work], placing: Placing, given: Sources | None = None
+    place: Storage, name: str, works: Sequence[Work], placing: Placing, given: Sources = AS_FOUND
 ) -> int:
     """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
-    words = ["resume", absolute_place(name), *(given or Sources()).words(), *placing.words()]
+    words = ["resume", absolute_place(name), *source_words(given), *placing.words()]
     words += detached_words() or words_of(
         {"--address": None if placing.address == "local" else placing.address}
     )

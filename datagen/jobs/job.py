@@ -25,7 +25,7 @@ from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally
 from cluster.task import ShardTask
 from cluster.watch import Together, Watch
-from datagen.console.printing import print_rows, seconds
+from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing, command_line
 from schemas.errors import InputError
@@ -228,7 +228,8 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
     ]
     if given_up:
         again = command_line(["resume", name, "--quarantined"])
-        shown = f"{len(given_up)} shards, {[shard for _, shard in given_up[:10]]}: {again} tries them again"
+        those = f"{counted(len(given_up), 'shard')} ({listed([shard for _, shard in given_up])})"
+        shown = f"{those}: {again} tries again"
         rows.append(("quarantined", shown))
     if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
         sealed = seal(plan.place)
@@ -242,7 +243,8 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         see = command_line(["status", name])
         sys.stderr.write(f"error: {name}: too many shards failed{most}. See: {see}\n")
     if summary.end == "interrupted":
-        sys.stderr.write(f"interrupted with {summary.remaining} shards to go. Resume with:\n  {resume}\n")
+        left = counted(summary.remaining, "shard")
+        sys.stderr.write(f"interrupted with {left} to go. Go on with:\n  {resume}\n")
     return summary.exit_code
 
 

@@ -37,18 +37,6 @@ Detach = Annotated[
         "cluster (its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine.",
     ),
 ]
-HousesAgain = Annotated[
-    str | None, Parameter(help="Where the houses lie now [where the run found them].", name="--houses")
-]
-ObjectsAgain = Annotated[
-    str | None, Parameter(help="Where the objects lie now [where the run found them].", name="--objects")
-]
-ScenesFromAgain = Annotated[
-    str | None,
-    Parameter(
-        help="Where the run lies whose scenes are labelled again [where it was found].", name="--scenes-from"
-    ),
-]
 Quarantined = Annotated[
     bool, Parameter(negative=(), help="Try the shards in quarantine again; their records stay as history.")
 ]

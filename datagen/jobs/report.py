@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from datagen.console.printing import seconds
+from datagen.console.printing import counted, seconds
 from schemas.jobs import Job, Jobs
 from schemas.storage import Storage
 
@@ -47,4 +47,4 @@ def health_line(job: Job) -> str:
     elif job.order is not None:
         doing += ", asked to stop"
     silent = "silent, " if health == "silent" else ""
-    return f"{silent}{state.done} of {state.shards} shards, {doing}, {heard} ({where})"
+    return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"

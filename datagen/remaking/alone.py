@@ -85,7 +85,7 @@ def _recorded(run: Run, shard: int, record: QuarantineRecord | None) -> list[dic
     return [
         {"attempt": end.attempt, "cause": f"{end.outcome}: {end.cause}", "stack": end.stack}
         for end in run.ledger.ends()
-        if end.shard == shard and end.outcome not in ("committed", "superseded")
+        if end.shard == shard and end.outcome not in ("committed", "superseded", "cancelled")
     ]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from cluster.guard import this_host
 from datagen.remaking.shards import Origin, open_origin
+from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.specifying.specify import label_engines, scene_engines
 from schemas.cost import StageClock
 from schemas.errors import InputError
@@ -75,18 +76,17 @@ _NO_DRAWING = "the run that drew the scenes is not there any more"
 _MEND = "Give --scenes-from the run that drew them"
 
 
-def origin_to_check(
-    run: Run, houses: str | None = None, objects: str | None = None, scenes_from: str | None = None
-) -> Origin:
+def origin_to_check(run: Run, given: Sources = AS_FOUND) -> Origin:
     """The run's sources as `open_origin` gives them; without the run that drew its scenes where that is gone.
 
     What is stored is enough to work out labels again. InputError as `open_origin`, also for a
     `scenes_from` that is given and is not there.
     """
-    if scenes_from is not None or run.manifest.spec.scenes_from is None or _source_of(run) is not None:
-        return open_origin(run, houses, objects, scenes_from)
     spec, known = run.manifest.spec, run.manifest.sources
-    houses, objects = houses or known.get("houses", "builtin"), objects or known.get("objects", "builtin")
+    if given.scenes_from is not None or spec.scenes_from is None or _source_of(run) is not None:
+        return open_origin(run, given)
+    houses = given.houses or known.get("houses", "builtin")
+    objects = given.objects or known.get("objects", "builtin")
     return Origin(open_world(spec, houses, objects), None)
 
 

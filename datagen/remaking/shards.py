@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from datagen.remaking.sources import AS_FOUND, Sources
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.scene_rows import read_scenes
@@ -20,20 +21,18 @@ class Origin:
     scenes: Run | None  # the run whose scenes are labelled again
 
 
-def open_origin(
-    run: Run, houses: str | None = None, objects: str | None = None, scenes_from: str | None = None
-) -> Origin:
+def open_origin(run: Run, given: Sources = AS_FOUND) -> Origin:
     """Open the run's sources: those given, or else where the run found them.
 
     InputError where they are not there any more, or are not those that the run was made from.
     """
     spec, known = run.manifest.spec, run.manifest.sources
     world = open_world(
-        spec, houses or known.get("houses", "builtin"), objects or known.get("objects", "builtin")
+        spec, given.houses or known.get("houses", "builtin"), given.objects or known.get("objects", "builtin")
     )
     if spec.scenes_from is None:
         return Origin(world, None)
-    place = scenes_from or known.get("scenes_from", "")
+    place = given.scenes_from or known.get("scenes_from", "")
     mend = "Give --scenes-from the run that this one was started with"
     if not place:
         raise InputError(run.storage.url, "scenes_from", "the run does not say where its scenes lie", mend)

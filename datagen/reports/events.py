@@ -1,0 +1,134 @@
+"""What happened in a run, from its records: jobs, failed attempts, retries, shards given up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from datagen.console.printing import counted
+from schemas.index import Heads
+from schemas.jobs import Jobs
+from schemas.merged import open_runs
+from schemas.quarantine import lifted_records
+from schemas.run import Run
+from schemas.storage import Storage
+
+_GOOD = ("committed", "superseded")
+
+
+@dataclass(frozen=True)
+class Event:
+    """One line: when, what, and all that is known of it. Events of one key are one."""
+
+    at: str  # UTC, ISO 8601; "" where it is not known
+    key: str  # of the record that says so, and what it says
+    what: str
+    text: str
+    stack: str = ""
+    shard: int | None = None
+
+
+_NOTHING = Event("", "", "", "")
+
+
+class Known:
+    """Events that were read before: ledger entries are read once, however long one follows."""
+
+    def __init__(self) -> None:
+        self._events: dict[str, Event] = {}
+
+    def once(self, key: str, read: Callable[[], Event]) -> Event:
+        """The event of this key, read if it is new."""
+        if key not in self._events:
+            self._events[key] = read()
+        return self._events[key]
+
+
+def events_of(place: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
+    """What the records of a place say, in order of time; `known` is what earlier calls have read."""
+    known = known or Known()
+    found = _job_events(place) if shard is None else []
+    runs = open_runs(place)
+    for number, run in enumerate(runs):
+        part = f"part {number}: " if len(runs) > 1 else ""
+        found += _attempt_events(run, part, shard, known) + _quarantine_events(run, part, shard)
+    return sorted(found, key=lambda event: (event.at, event.key))
+
+
+def _job_events(place: Storage) -> list[Event]:
+    events: list[Event] = []
+    for job in Jobs(place).all():
+        record, state, order = job.record, job.state, job.order
+        where = f"on {record.host}, process {record.pid}"
+        if record.submission:
+            where += f", submitted to Ray as {record.submission}"
+        text = f"job {job.id} began {where}: {' '.join(record.command)}"
+        events.append(Event(record.started, f"{job.id} began", "job_began", text))
+        if order is not None:
+            how = "at once" if order.now else "when what is in flight has ended"
+            text = f"job {job.id} is asked to stop {how}, from {order.host}"
+            events.append(Event(order.asked, f"{job.id} asked {order.now}", "stop_asked", text))
+        if state is not None and state.end:
+            why = f": {state.cause}" if state.cause else ""
+            text = (
+                f"job {job.id} ended {state.end}, exit code {state.exit_code}, {state.done} of "
+                f"{counted(state.shards, 'shard')}, {counted(state.labels, 'label')}{why}"
+            )
+            events.append(Event(state.updated, f"{job.id} ended", "job_ended", text))
+        elif job.health() == "dead":
+            text = f"job {job.id} is dead: last heard of then, and its process is gone"
+            heard = state.updated if state else record.started
+            events.append(Event(heard, f"{job.id} dead", "job_dead", text))
+    return events
+
+
+def _attempt_events(run: Run, part: str, shard: int | None, known: Known) -> list[Event]:
+    heads, failed = Heads(run), set[int]()
+    ends, shards = list(heads.ends()), {start.attempt: start.shard for start in heads.unfinished()}
+    for end in ends:
+        shards[end.attempt] = end.shard
+        if end.outcome not in _GOOD:
+            failed.add(end.shard)
+    wanted = failed if shard is None else {shard}
+    events: list[Event] = []
+    for end in ends:
+        if end.shard in wanted and (shard is not None or end.outcome not in _GOOD):
+            key = f"{run.storage.url} {end.attempt} {end.outcome}"
+            events.append(known.once(key, lambda end=end, key=key: _end_event(run, part, end.attempt, key)))
+    for attempt in sorted(attempt for attempt, number in shards.items() if number in wanted):
+        key = f"{run.storage.url} {attempt} begins"
+        events.append(known.once(key, lambda attempt=attempt, key=key: _start_event(run, part, attempt, key)))
+    return [event for event in events if event.what]
+
+
+def _end_event(run: Run, part: str, attempt: str, key: str) -> Event:
+    entry = run.ledger.end_of(attempt)
+    if entry is None:
+        return _NOTHING
+    cause = f": {entry.cause}" if entry.cause else ""
+    text = f"{part}shard {entry.shard} {entry.outcome}{cause} ({attempt})"
+    return Event(entry.ended, key, f"attempt_{entry.outcome}", text, entry.stack, entry.shard)
+
+
+def _start_event(run: Run, part: str, attempt: str, key: str) -> Event:
+    start = run.ledger.start_of(attempt)
+    if start is None:
+        return _NOTHING
+    text = f"{part}shard {start.shard} begins on {start.host or 'a host unknown'} ({attempt})"
+    return Event(start.started, key, "attempt_begins", text, "", start.shard)
+
+
+def _quarantine_events(run: Run, part: str, shard: int | None) -> list[Event]:
+    events: list[Event] = []
+    for lifted, records in ((False, run.quarantine_records()), (True, lifted_records(run))):
+        for record in records:
+            if shard is not None and record.shard != shard:
+                continue
+            last = record.causes[-1] if record.causes else "for no cause that is known"
+            since = ", and was taken out of it later" if lifted else ""
+            tried = counted(len(record.attempts), "attempt")
+            text = f"{part}shard {record.shard} is given up after {tried}{since}: {last}"
+            key = f"{run.storage.url} {record.shard} given up {record.created}"
+            stack = record.stacks[-1] if record.stacks else ""
+            events.append(Event(record.created, key, "quarantined", text, stack, record.shard))
+    return events
