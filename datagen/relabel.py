@@ -43,8 +43,8 @@ def relabel(
 
     Distances are in metres, or shares of the reach where --distance says so. What is not given is as in the
     run; an option wins over the file. The new run is that of `datagen submit heuristic --scenes-from RUN`,
-    and shares all files but those of labels, scores and ids. The same command again resumes it, and extends it
-    where the run has grown.
+    and shares all files but those of labels, scores and ids. The same command again resumes it, and
+    extends it where the run has grown.
     """
     given = {
         "a": a, "mu": mu, "sigma_l": sigma_l, "sigma_r": sigma_r, "d_min": d_min, "d_max": d_max,
