@@ -84,9 +84,10 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
 def refuse_unusable(address: str) -> None:
     """Raise InputError where no cluster answers, or one that lets nobody in with the token known here.
 
-    `local` and `auto` pass. Ray itself tries for minutes, and with messages of its own.
+    `local` passes. Ray itself tries for minutes, and with messages of its own.
     """
-    if address not in ("local", "auto"):
+    if address != "local":
+        address = _resolved(address)
         refuse_unreachable(address)
         token_for(address)
 
@@ -138,9 +139,9 @@ def known_token() -> tuple[str, str] | None:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's text."""
+    """The first line of an error's text, without its full stop."""
     lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    return lines[0].rstrip(".") if lines else type(error).__name__
 
 
 def _resolved(address: str) -> str:
@@ -152,7 +153,10 @@ def _resolved(address: str) -> str:
     _keep_loopback()
     try:
         return str(canonicalize_bootstrap_address_or_die("auto"))
-    except (ConnectionError, ValueError) as error:
+    except ConnectionError as error:
+        problem = "no Ray cluster runs on this machine, and RAY_ADDRESS names none"
+        raise InputError("--address", address, problem, _START_MEND) from error
+    except ValueError as error:
         raise InputError("--address", address, first_line(error), _START_MEND) from error
 
 

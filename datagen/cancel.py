@@ -45,6 +45,9 @@ def cancel(
     does not answer are ended through Ray. Ctrl-C ends the waiting, and the request stands.
     """
     if head:
+        if run is not None:
+            problem = "--head is of this machine, and not of a run"
+            raise InputError("datagen cancel", run, problem, "Give one of the two")
         return _cancel_head(now)
     if run is None:
         raise InputError("datagen cancel", "RUN", "no run is named", "Name one, or give --head")

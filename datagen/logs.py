@@ -42,11 +42,19 @@ def logs(
     Attempts that went well are told with --shard; `datagen status` counts them.
     """
     place = open_storage(run, probe=False, create=False)
-    open_runs(place)  # refuses what is none
+    runs = open_runs(place)
+    if shard is not None and not any(shard in part.planned() for part in runs):
+        last = max(len(part.planned()) for part in runs) - 1
+        raise InputError(run, "--shard", f"{shard} is not in this run", f"Choose one from 0 to {last}")
     if driver:
         return _print_driver(place, follow)
+    told = 0
     for event in _growing(place, shard, follow):
         _print(event, stacks, json)
+        told += 1
+    if not told:
+        what = "no job has begun here, and no attempt has failed" if shard is None else "nobody has begun it"
+        sys.stderr.write(f"nothing to tell: {what}\n")
     return 0
 
 

@@ -62,6 +62,12 @@ def token_of(process: psutil.Process) -> str:
         return ""
 
 
+def test_the_cluster_of_this_machine_is_asked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(InputError, match=r"127\.0\.0\.1:1: cannot be reached"):
+        refuse_unusable("auto")
+
+
 def test_a_token_is_looked_for_where_ray_looks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert known_token() is None
     (tmp_path / ".ray").mkdir()

@@ -119,6 +119,7 @@ def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(["cancel", str(tmp_path), "--head"], capsys, str(tmp_path), "one of the two")
     refused(["cancel"], capsys, "RUN")
     for verb in ("cancel", "logs"):
         refused([verb, str(tmp_path)], capsys, "not a run")

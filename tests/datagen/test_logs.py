@@ -83,7 +83,7 @@ def test_stacks_and_one_shard(troubled: Path, capsys: pytest.CaptureFixture[str]
     assert [e["event"] for e in events if "stack" in e] == ["attempt_crashed"]
     fine = lines_of(capsys, str(troubled), "--shard", "2")
     assert [e["event"] for e in fine if e["event"] != "attempt_begins"] == ["attempt_committed"]
-    assert lines_of(capsys, str(troubled), "--shard", "77") == []
+    refused(["logs", str(troubled), "--shard", "77"], capsys, "--shard", "77 is not in this run", "0 to 4")
     assert cli.run(["logs", str(troubled), "--stacks"]) == 0
     told = capsys.readouterr().out
     assert "    Current thread" in told and "2026-01-01 00:03:00.000  shard 1 crashed" in told
@@ -107,6 +107,16 @@ def test_status_tells_budgets_stacks_and_quarantine(
     told = capsys.readouterr().out
     for words in ("1 of 10", "line 3 in settle", "no rays", f"datagen resume {troubled} --quarantined"):
         assert words in told
+
+
+def test_silence_is_told_from_a_run_of_which_nothing_is_to_be_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "run", n=20, shards=[0])
+    for more, words in (((), "no attempt has failed"), (("--shard", "1"), "nobody has begun it")):
+        assert cli.run(["logs", run.storage.url, *more]) == 0
+        told = capsys.readouterr()
+        assert told.out == "" and words in told.err and len(told.err.splitlines()) == 1
 
 
 def test_a_lifted_quarantine_stays_in_the_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
