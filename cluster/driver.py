@@ -214,6 +214,9 @@ class _Driver(Generic[T]):
         if report.outcome == "cancelled" and flight.verdict is not None:
             outcome, cause = flight.verdict
             report = replace(report, outcome=outcome, cause=cause)
+        elif report.outcome == "cancelled" and self._end is None and not self._stop.drain:
+            # Nobody here asked for it: the shard is as open as after any loss, and not dropped.
+            report = replace(report, outcome="lost", cause="cancelled by somebody else")
         if report.outcome not in ("committed", "superseded"):
             report = self._what_the_run_says(report)
         shard = report.shard
