@@ -204,7 +204,7 @@ def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> 
 def _open_folder(folder: Path, create: bool) -> Storage:
     try:
         if create:
-            folder.mkdir(parents=True, exist_ok=True)
+            LocalFiles.make_root(folder)
         if not folder.is_dir():
             problem = "not a folder" if folder.exists() else "no such folder"
             raise InputError(folder, "", problem, "Name the folder of a run")

@@ -43,6 +43,18 @@ class LocalFiles:
         self.root, self.prefix = root, prefix
         self.folder = root.joinpath(*prefix)
 
+    @staticmethod
+    def make_root(folder: Path) -> None:
+        """Make a folder that survives a power cut with what is made in it."""
+        missing = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in missing:
+            fd = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(fd)
+            finally:
+                os.close(fd)
+
     def below(self, key: str) -> LocalFiles:
         """The files of a folder below, which need not exist; reached from the same root."""
         return LocalFiles(self.root, (*self.prefix, *key.split("/")))
