@@ -93,7 +93,8 @@ def _check_unfinished(
         )
         problem = "missing, though its shard is decided; what it cost is lost"
         books.without_account += 1
-        yield curable(f"ledger/{attempt}.json", "account", problem, Restore(encode_record(entry)), shard)
+        cure = Restore(encode_record(entry), is_guess=True)
+        yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
     else:
         books.unfinished += 1
 

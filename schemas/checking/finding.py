@@ -19,9 +19,13 @@ REPAIR = "Run datagen repair"
 
 @dataclass(frozen=True)
 class Restore:
-    """Put these bytes: they come from a second copy, or follow from other records."""
+    """Put these bytes: they come from a second copy, or follow from other records.
+
+    `is_guess` where whoever is still at work may write the truth: then only a missing file is made.
+    """
 
     data: bytes
+    is_guess: bool = False
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,15 @@ that is broken off has only less mended, and the next goes on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 
 from schemas.checking.finding import Finding, Remake, Reseal, Restore
 from schemas.checking.place import Checked, check_place
-from schemas.checking.roots import Roots, open_roots
-from schemas.checking.sealed import read_root, slices_of
+from schemas.checking.roots import open_roots
+from schemas.checking.sealed import SealedSlice, read_root, slices_of
 from schemas.checking.shards import form_of
 from schemas.errors import InputError
 from schemas.run import Run
@@ -22,7 +22,7 @@ from schemas.run_records import FileEntry
 from schemas.sealing import SEALED, seal
 from schemas.sealing.metadata import ROOT
 from schemas.shard_files import chunk_key
-from schemas.storage import Storage
+from schemas.storage import Storage, StoredFile
 
 # Mending a record shows what rests on it: commits, then files, then the sealed store.
 _PASSES = 5
@@ -65,26 +65,32 @@ def mend_place(
     where all bad files of its shard have. What is left is in the result. InputError as `check_place`.
     """
     mended = Mended()
-    before = _times(place)
+    before = {file.key: _state(file) for file in place.list("")}
     refused: dict[str, str] = {}  # key -> why; not tried twice
     for _ in range(_PASSES):
         found = _pass(place, remake, workers, seen, mended, refused)
         if not found:
             break
-    after = _times(place)
-    for key, time in before.items():
-        if key in mended.written or (mended.resealed and key.startswith(f"{SEALED}/")):
+    written = mended.written
+    for file in place.list(""):  # in a second dictionary the files of a large run would not fit
+        state = before.pop(file.key, None)
+        if state is None or _is_ours(file.key, written, mended.resealed):
             continue
-        if after.get(key) == time:
+        if state == _state(file):
             mended.untouched += 1
         else:
-            mended.changed.append(key)
+            mended.changed.append(file.key)
+    mended.changed += [key for key in before if not _is_ours(key, written, mended.resealed)]
     return mended
 
 
-def _times(place: Storage) -> dict[str, tuple[float, int]]:
-    """When each file was written, and its size; what links to it does not matter."""
-    return {file.key: (file.modified_s, file.size) for file in place.list("")}
+def _state(file: StoredFile) -> int:
+    """When a file was written, and its size, as one number; what links to it does not matter."""
+    return hash((file.modified_s, file.size))
+
+
+def _is_ours(key: str, written: Container[str], resealed: bool) -> bool:
+    return key in written or (resealed and key.startswith(f"{SEALED}/"))
 
 
 def _pass(
@@ -98,7 +104,7 @@ def _pass(
     for finding in check_place(place, mended.checked, seen):
         cure = finding.cure
         if isinstance(cure, Restore):
-            done |= _put(place, finding, cure.data, mended.records, mended, refused)
+            done |= _put(place, finding, cure.data, mended.records, mended, refused, cure.is_guess)
         elif isinstance(cure, Remake) and finding.key not in refused:
             bad.setdefault((cure.run.storage.url, cure.shard), []).append(finding)
         elif isinstance(cure, Reseal) and SEALED not in refused:
@@ -128,15 +134,21 @@ def _put(
     noted: list[str],
     mended: Mended,
     refused: dict[str, str],
+    is_guess: bool = False,
 ) -> bool:
+    """Write the right bytes; whether the place changed. A guess gives way to what was written since."""
     if finding.key not in refused:
         try:
-            place.put(finding.key, data)
-            place.sync([finding.key])
+            if is_guess:
+                is_put = place.put_new(finding.key, data)
+            else:
+                place.put(finding.key, data)
+                place.sync([finding.key])
+                is_put = True
         except InputError as error:
             refused[finding.key] = f"{error.problem}. {error.mend}"
         else:
-            noted.append(finding.key)
+            noted += [finding.key] * is_put
             return True
     mended.left.append(_refused(finding, refused))
     return False
@@ -151,12 +163,12 @@ def _mend_files(
     refused: dict[str, str],
 ) -> int:
     """Files of shards from the sealed store, from their schema, or remade; how many were put."""
-    roots, put = open_roots(place), 0
+    slices, put = _slices(place), 0
     to_make: list[tuple[Run, int, list[Finding]]] = []
     for (_, shard), findings in bad.items():
         rest: list[Finding] = []
         for finding in findings:
-            data = _second_source(place, roots, finding)
+            data = _second_source(place, slices, finding)
             if data is None:
                 rest.append(finding)
             else:
@@ -177,7 +189,14 @@ def _mend_files(
     return put
 
 
-def _second_source(place: Storage, roots: Roots, finding: Finding) -> bytes | None:
+def _slices(place: Storage) -> Mapping[str, SealedSlice]:
+    """What the sealed store has of each run, by specification hash."""
+    runs = open_roots(place).runs
+    root, _ = read_root(place, runs, {run.manifest.spec_hash: run.n for run in runs})
+    return slices_of(root, runs) if root else {}
+
+
+def _second_source(place: Storage, slices: Mapping[str, SealedSlice], finding: Finding) -> bytes | None:
     """The committed bytes of a file where they are known without making the shard again."""
     cure = finding.cure
     if not isinstance(cure, Remake):
@@ -187,9 +206,7 @@ def _second_source(place: Storage, roots: Roots, finding: Finding) -> bytes | No
     data = form.metadata.get(entry.path)
     if data is not None and _has_digest(data, entry):
         return data
-    wanted = {one.manifest.spec_hash: one.n for one in roots.runs}
-    root, _ = read_root(place, wanted)
-    slice_ = slices_of(root, roots.runs).get(run.manifest.spec_hash) if root else None
+    slice_ = slices.get(run.manifest.spec_hash)
     if slice_ is None or cure.shard not in slice_.positions:
         return None
     name = entry.path.split("/")[0]

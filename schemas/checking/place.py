@@ -84,7 +84,7 @@ def check_place(
         yield from (below(roots.folder_of(run), finding) for finding in check_notes(run.storage))
     if roots.is_merged:
         yield from check_notes(place)
-    root, found = read_root(place, wanted)
+    root, found = read_root(place, roots.runs, wanted)
     yield from found
     slices = slices_of(root, roots.runs) if root else {}
     tally = SealedTally()

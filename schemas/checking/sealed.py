@@ -13,7 +13,7 @@ from schemas.errors import InputError
 from schemas.record_files import MAX_RECORD_BYTES
 from schemas.run import Run, shard_folder
 from schemas.run_records import Commit
-from schemas.sealing.contents import Contents, SealedRun, SealedShard
+from schemas.sealing.contents import MOST_SHARDS, Contents, SealedRun, SealedShard
 from schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
 from schemas.shard_files import TABLES, chunk_key, rows_per_shard
 from schemas.storage import Storage
@@ -55,7 +55,9 @@ class SealedTally:
             update(f"{entry.path} {entry.sha256}\n".encode())
 
 
-def read_root(place: Storage, wanted: Mapping[str, int]) -> tuple[SealedRoot | None, list[Finding]]:
+def read_root(
+    place: Storage, runs: Iterable[Run], wanted: Mapping[str, int]
+) -> tuple[SealedRoot | None, list[Finding]]:
     """What data.zarr says of itself; a finding where it is there and that cannot be so.
 
     `wanted` are the samples that the newest plans want, by specification hash.
@@ -73,6 +75,11 @@ def read_root(place: Storage, wanted: Mapping[str, int]) -> tuple[SealedRoot | N
     told = {part.spec_hash: part.n for part in root.parts}
     if told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
         problem = "says that it holds other rows than any plan wants"
+        return None, [curable(key, "sealed", problem, Reseal())]
+    layouts = {run.manifest.spec_hash: run.layout for run in runs}
+    held = sum(layouts[part.spec_hash].shards_for(part.n) - len(part.missing_shards) for part in root.parts)
+    if held > MOST_SHARDS:  # before so many places are set aside
+        problem = f"says that it holds {held} shards, more than any store does"
         return None, [curable(key, "sealed", problem, Reseal())]
     return root, []
 

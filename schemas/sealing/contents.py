@@ -12,7 +12,13 @@ from schemas.merged import open_runs, part_folder
 from schemas.run import Run, shard_folder
 from schemas.run_records import Commit, Layout
 from schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
+from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage
+
+# Far above any run that can be made; what asks for more was made up.
+MOST_SHARDS = 10_000_000
+# The root's metadata names them one by one, and is read as a record is.
+_MOST_MISSING = 500_000
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,11 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
             for entry in sorted(commit.files, key=lambda e: e.path):
                 digest.update(f"{entry.path} {entry.sha256}\n".encode())
             digests.append(digest.hexdigest())
-        absent = sorted(set(range(run.layout.shards_for(n))) - set(done))
+        absent = ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(done))
+        if len(absent) > _MOST_MISSING:
+            problem = f"{len(absent)} planned shards are missing, and a store names at most {_MOST_MISSING}"
+            mend = "Make more of them with `datagen resume`, or a smaller run"
+            raise InputError(run.storage.url, "plans", problem, mend)
         sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
     if not shards:
         raise InputError(place.url, "commits", "no shard is committed", "Make some with `datagen resume`")

@@ -28,11 +28,12 @@ def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
     kept = contents.digests.index(old.rows_sha256) if old and old.rows_sha256 in contents.digests else 0
     if not kept:
         unseal_prefix(place)
-    for table in TABLES:
-        for field in contents.schema.table(table):
-            _copy_chunks(contents, field, kept)
+    _copy_chunks(contents, kept, tidy=True)
     place.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
     place.put(f"{SEALED}/{ROOT}", metadata[ROOT])
+    # Whoever seals or unseals at the same time may have removed chunks of these shards before the root
+    # stood. What he published since is his own to look after.
+    _copy_chunks(contents, len(contents.shards), tidy=False)
 
 
 def unseal_prefix(place: Storage) -> None:
@@ -43,11 +44,20 @@ def unseal_prefix(place: Storage) -> None:
     place.delete(f.key for f in place.list(SEALED))
 
 
-def _copy_chunks(contents: Contents, field: Field, kept: int) -> None:
-    """Copy an array's chunks but those that the first `kept` shards left there; remove what is no chunk.
+def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
+    """Copy all chunks but those that the first `kept` shards left there; `tidy` removes what is no chunk.
 
     What a killed seal left beyond them may be of other shards, and is copied anew.
     """
+    for table in TABLES:
+        for field in contents.schema.table(table):
+            odd = _copy_array(contents, field, kept)
+            if tidy:
+                contents.place.delete(odd)
+
+
+def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
+    """Copy an array's chunks; keys of what is none of them."""
     place, folder = contents.place, f"{SEALED}/{field.name}"
     there = {f.key.removeprefix(f"{folder}/") for f in place.list(folder)} - {ROOT}
 
@@ -59,4 +69,4 @@ def _copy_chunks(contents: Contents, field: Field, kept: int) -> None:
 
     for _ in in_order(lambda pair: place.link_or_copy(*pair), missing()):
         pass
-    place.delete([f"{folder}/{name}" for name in sorted(there)])
+    return [f"{folder}/{name}" for name in sorted(there)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import threading
@@ -15,6 +16,7 @@ import xarray
 import zarr
 
 from schemas import shard_files
+from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.sealing import SEALED, seal
@@ -98,6 +100,22 @@ def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_stor
     with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: missing"):
         seal(run.storage)
     assert files_of(tmp_path / "run" / SEALED) == before
+
+
+def test_runs_of_more_shards_than_a_store_can_name_are_refused(tmp_path: Path):
+    run = make_run(tmp_path, n=20, shards=[0])
+    seal(run.storage)
+    run.grow(10**12)
+    with pytest.raises(InputError, match="99999999999 planned shards are missing"):
+        seal(run.storage)
+    root = tmp_path / SEALED / "zarr.json"
+    told = json.loads(root.read_bytes())
+    told["attributes"] |= {"n": 10**12, "missing_shards": []}
+    root.chmod(0o644)
+    root.write_text(json.dumps(told))
+    findings = list(check_place(run.storage, Checked()))
+    assert [(f.key, f.kind) for f in findings] == [(f"{SEALED}/zarr.json", "sealed")]
+    assert "holds 100000000000 shards" in findings[0].problem
 
 
 def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):

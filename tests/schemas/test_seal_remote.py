@@ -106,6 +106,27 @@ def test_rows_that_shift_are_copied_anew(place: Storage, monkeypatch: pytest.Mon
     check(place, run, [0, 1, 3], 30)
 
 
+def test_chunks_that_another_seal_takes_away_meanwhile_come_back(
+    place: Storage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, plain = make(place, 23), Storage.put
+    taken: list[str] = []
+
+    def other_removes_some(storage: Storage, key: str, data: bytes) -> None:
+        if key == f"{SEALED}/zarr.json":
+            taken.extend(f.key for f in place.list(SEALED) if "/c.1" in f.key)
+            place.delete(taken)
+            plain(place, f"{SEALED}/label/c.3", b"of a longer store")
+        plain(storage, key, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Storage, "put", other_removes_some)
+        seal(place)
+    assert taken
+    check(place, run, [0, 1, 2], 23)
+    assert place.exists(f"{SEALED}/label/c.3")  # the longer store's root may stand by now
+
+
 @pytest.mark.parametrize("grown", [True, False])
 def test_ended_at_any_change_it_leaves_the_old_store_the_new_one_or_none(
     place: Storage, monkeypatch: pytest.MonkeyPatch, grown: bool

@@ -1,0 +1,58 @@
+"""Mending beside those who are at work: what they wrote since stays, and is told of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.checking import mending
+from schemas.checking.finding import Finding
+from schemas.checking.mending import mend_place
+from schemas.run_records import Cost, LedgerEntry
+from tests.made_runs import make_run
+
+
+def never(*_: Any) -> dict[str, bytes]:
+    raise AssertionError("no shard is bad")
+
+
+def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path, 20)
+    for name in ("slow", "lost"):
+        run.ledger.start(name, 0)
+    account = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=7, cpu_s=5))
+    check = mending.check_place
+
+    def and_the_driver_goes_on(*arguments: Any) -> Iterator[Finding]:
+        for finding in check(*arguments):
+            if finding.key == "ledger/slow.json":
+                assert run.ledger.end(account)
+            yield finding
+
+    monkeypatch.setattr(mending, "check_place", and_the_driver_goes_on)
+    mended = mend_place(run.storage, never)
+    assert (mended.records, mended.left) == (["ledger/lost.json"], [])
+    assert run.ledger.end_of("slow") == account
+    end = run.ledger.end_of("lost")
+    assert end is not None and end.outcome == "lost"
+
+
+def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path, 20)
+    for key in ("other.txt", "gone.txt", "same.txt"):
+        run.storage.put(key, b"1")
+    files = sum(1 for _ in run.storage.list(""))
+
+    def others(done: int, total: int) -> None:
+        run.storage.put("other.txt", b"22")
+        run.storage.put("new.txt", b"1")
+        run.storage.delete(["gone.txt"])
+
+    mended = mend_place(run.storage, never, 1, others)
+    assert mended.records == [] and sorted(mended.changed) == ["gone.txt", "other.txt"]
+    assert mended.untouched == files - 2
