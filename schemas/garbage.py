@@ -97,7 +97,12 @@ def find_garbage(
 def sweep(garbage: Garbage) -> Swept:
     """Remove one piece of garbage; attempts that were committed meanwhile are spared."""
     if garbage.attempt is not None:
-        return _sweep_attempt(Run.open(garbage.storage), garbage, *garbage.attempt)
+        shard, name = garbage.attempt
+        done = Run.open(garbage.storage).remove_attempt(shard, name)
+        if done == "spared":
+            return Swept(spared=1)
+        damaged = (commit_key(shard),) if done == "damaged" else ()
+        return Swept(garbage.files, garbage.bytes, damaged=damaged)
     if garbage.folder:
         garbage.storage.delete([file.key for file in garbage.storage.list(garbage.key)])
         garbage.storage.remove_empty(garbage.key)
@@ -179,22 +184,6 @@ def _loose(
 
 def _one(storage: Storage, kind: Kind, file: StoredFile) -> Garbage:
     return Garbage(storage, kind, file.key, 1, file.size)
-
-
-def _sweep_attempt(run: Run, garbage: Garbage, shard: int, name: str) -> Swept:
-    storage, mark = run.storage, f"{garbage.key}/{REMOVING}"
-    storage.put(mark, b"")
-    storage.sync([mark])
-    if storage.exists(commit_key(shard)) and _winner(run, shard) in (name, None):
-        storage.delete([mark])
-        return Swept(spared=1)
-    storage.delete([file.key for file in storage.list(garbage.key) if file.key != mark])
-    damaged = ()
-    if storage.exists(commit_key(shard)) and _winner(run, shard) == name:
-        damaged = (commit_key(shard),)
-    storage.delete([mark])
-    storage.remove_empty(garbage.key)
-    return Swept(garbage.files, garbage.bytes, damaged=damaged)
 
 
 def _seconds(text: str) -> float:

@@ -7,10 +7,11 @@ create-only, so that of two racing attempts one wins and the other is waste.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
+from typing import Literal
 
 from schemas.errors import InputError
 from schemas.fields import RecordSchema, sized_schema
@@ -18,11 +19,11 @@ from schemas.ledger import MAX_STACK_CHARS, Ledger
 from schemas.record_files import (
     MAX_RECORD_BYTES,
     decode_record,
-    different_fields,
     encode_record,
     now,
     read_record,
 )
+from schemas.root_records import publish, refuse_foreign, refuse_other
 from schemas.run_records import (
     FORMAT_VERSION,
     Commit,
@@ -32,14 +33,18 @@ from schemas.run_records import (
     Merged,
     Plan,
     QuarantineRecord,
+    foreign_field,
 )
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
-from schemas.storage.errors import OddFile, StoreFailure
+from schemas.storage.errors import StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # The mark in the folder of an attempt that is being removed.
 REMOVING = "removing"
+# What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
+Removal = Literal["removed", "spared", "damaged"]
+_MOST_PLANS = 10**9
 # A commit with its file entries takes some 30 kB of memory.
 _COMMITS_KEPT = 1000
 
@@ -70,7 +75,8 @@ class Run:
             refuse_foreign(storage)
             publish(storage, "manifest.json", encode_record(manifest))
         run = cls.open(storage)
-        run._refuse_other(manifest)
+        _ = run.schema  # refuses a version that this program does not know
+        refuse_other(storage.url, run.manifest, manifest)
         run.grow(n)
         return run
 
@@ -136,6 +142,9 @@ class Run:
             number, wanted = self._newest_plan()
             if wanted >= n:
                 return
+            if number >= _MOST_PLANS:  # its next would have a name that is no plan's
+                place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
+                raise InputError(place, "", problem, "Move it away")
             plan = Plan(n=n, created=created or now())
             # Losing this race means that another plan appeared: look again.
             publish(self.storage, f"plans/{number + 1}.json", encode_record(plan))
@@ -189,17 +198,8 @@ class Run:
         """The commit record in the bytes of a shard's file, checked against the manifest."""
         place = f"{self.storage.url}/{commit_key(shard)}"
         commit = decode_record(place, data, Commit)
-        expected = {
-            "shard": shard,
-            "spec_hash": self.manifest.spec_hash,
-            "scenes": self.layout.scenes_per_shard,
-            "samples": self.layout.samples_per_shard,
-        }
-        for field, value in expected.items():
-            if (given := getattr(commit, field)) != value:
-                raise InputError(
-                    place, field, f"{given}, where this run has {value}", "Remove this foreign commit"
-                )
+        if (found := foreign_field(self.manifest, shard, commit)) is not None:
+            raise InputError(place, *found, "Remove this foreign commit")
         return commit
 
     def commits(self) -> Iterator[Commit]:
@@ -212,25 +212,51 @@ class Run:
                 yield self.decode_commit(shard, data)
 
     def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; its entries for the commit. Nothing counts before it.
-
-        Where the disk refuses one, none is left behind: a full disk gets its room back.
-        """
+        """Write an attempt's files durably; its entries for the commit. Nothing counts before it."""
         folder = shard_folder(shard, attempt)
         entries = tuple(
             FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())
             for path, data in files.items()
         )
-        try:
+        with self.nothing_left_behind(shard, attempt):
             self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
             self.storage.sync(f"{folder}/{path}" for path in files)
+        return entries
+
+    @contextmanager
+    def nothing_left_behind(self, shard: int, attempt: str) -> Generator[None]:
+        """Remove what the block wrote of an attempt where the disk refuses: a full one gets its room back."""
+        try:
+            yield
         except StoreFailure:
             raise  # it would not delete either
         except InputError:
             with suppress(InputError):
-                self.storage.delete(f"{folder}/{path}" for path in files)
+                self.remove_attempt(shard, attempt)
             raise
-        return entries
+
+    def remove_attempt(self, shard: int, attempt: str) -> Removal:
+        """Remove an attempt's files, unless its shard's commit may name it (schemas/garbage.py says how)."""
+        folder = shard_folder(shard, attempt)
+        mark = f"{folder}/{REMOVING}"
+        self.storage.put(mark, b"")
+        self.storage.sync([mark])
+        if self._is_committed(shard, attempt) is not False:
+            self.storage.delete([mark])
+            return "spared"
+        self.storage.delete([file.key for file in self.storage.list(folder) if file.key != mark])
+        broken = self._is_committed(shard, attempt)
+        self.storage.delete([mark])
+        self.storage.remove_empty(folder)
+        return "damaged" if broken else "removed"
+
+    def _is_committed(self, shard: int, attempt: str) -> bool | None:
+        """Whether a shard's commit, as it is now, names the attempt; None where it cannot be read."""
+        data = self.storage.get(commit_key(shard), MAX_RECORD_BYTES)
+        try:
+            return data is not None and self.decode_commit(shard, data).attempt == attempt
+        except InputError:
+            return None
 
     def commit(self, commit: Commit) -> bool:
         """Publish a shard. False when another attempt has won; its files then are garbage.
@@ -248,7 +274,8 @@ class Run:
         if not won:
             self.storage.delete([copy])
         elif (problem := self._lack(commit, committing=True)) is not None:
-            self.storage.delete([commit_key(commit.shard)])
+            # With its copy, which would stand for a commit whose record was lost.
+            self.storage.delete([commit_key(commit.shard), copy])
             raise problem
         return won
 
@@ -318,29 +345,6 @@ class Run:
             if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
                 yield found.group(1), file.stamp
 
-    def _refuse_other(self, manifest: Manifest) -> None:
-        _ = self.schema  # refuses a version that this program does not know
-        ours = manifest.model_dump(mode="json")
-        theirs = self.manifest.model_dump(mode="json")
-        keys = ("spec", "schema_name")  # not its version: a run goes on in the one it was begun with
-        rows = different_fields({k: ours[k] for k in keys}, {k: theirs[k] for k in keys})
-        if self.layout.candidates_per_scene != manifest.layout.candidates_per_scene:
-            raise InputError(
-                f"{self.storage.url}/manifest.json",
-                "layout.candidates_per_scene",
-                f"{self.layout.candidates_per_scene}, not the {manifest.layout.candidates_per_scene} asked",
-                "Choose another --out",
-            )
-        if rows:
-            shown = [f"{path.removeprefix('spec.')}: it has {b!r}, asked {a!r}" for path, a, b in rows[:20]]
-            more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
-            raise InputError(
-                f"{self.storage.url}/manifest.json",
-                "",
-                "another specification lives here (" + "; ".join(shown) + more + ")",
-                "Choose another --out, or ask for what it has",
-            )
-
 
 def shard_folder(shard: int, attempt: str) -> str:
     """Key of the folder of one attempt at a shard."""
@@ -355,31 +359,3 @@ def commit_key(shard: int) -> str:
 def commit_copy_key(shard: int, attempt: str) -> str:
     """Key of the copy of a commit record in its attempt's folder."""
     return f"{shard_folder(shard, attempt)}/commit.json"
-
-
-def copy_key(key: str) -> str:
-    """Key of the copy of a record at the run's root."""
-    return f"copies/{key}"
-
-
-def publish(storage: Storage, key: str, record: bytes) -> None:
-    """Write a record of the run's root once: its copy first, then the record with the copy's bytes.
-
-    The copy decides races, so that both are always equal; one that was killed in between is completed
-    by the next.
-    """
-    storage.put_new(copy_key(key), record)
-    kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
-    storage.put_new(key, record if kept is None else kept)
-
-
-def refuse_foreign(storage: Storage, *also: str) -> None:
-    """Refuse a place without a run that holds files of something else; `also` begin further names of ours."""
-    ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
-    problem, mend = "the folder holds files of something else", "Choose a new --out"
-    try:
-        for file in storage.list(""):
-            if not file.key.startswith(ours):
-                raise InputError(storage.url, file.key, problem, mend)
-    except OddFile as e:
-        raise InputError(e.place, "", problem, mend) from e

@@ -126,6 +126,20 @@ class Commit(_Record):
     created: str
 
 
+def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
+    """(field, problem) where a commit cannot be that of this shard of the run; None where it can."""
+    expected = {
+        "shard": shard,
+        "spec_hash": manifest.spec_hash,
+        "scenes": manifest.layout.scenes_per_shard,
+        "samples": manifest.layout.samples_per_shard,
+    }
+    for field, value in expected.items():
+        if (given := getattr(commit, field)) != value:
+            return field, f"{given}, where this run has {value}"
+    return None
+
+
 class AttemptStart(_Record):
     """ledger/<attempt>.start.json: an attempt that began; without an end it was lost."""
 

@@ -9,7 +9,7 @@ from schemas.checking.records import Read, compare, read
 from schemas.ledger import end_key, start_key
 from schemas.record_files import encode_record
 from schemas.run import Run, commit_copy_key, commit_key
-from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry
+from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
 from schemas.storage import StoredFile
 
 _ROUNDING = 1e-6
@@ -63,16 +63,8 @@ def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Re
 
 def foreign_to(run: Run, shard: int, commit: Commit) -> str:
     """Why a commit cannot be this shard's, or ""."""
-    expected = {
-        "shard": shard,
-        "spec_hash": run.manifest.spec_hash,
-        "scenes": run.layout.scenes_per_shard,
-        "samples": run.layout.samples_per_shard,
-    }
-    for field, value in expected.items():
-        if (given := getattr(commit, field)) != value:
-            return f"{field}: {given}, where this run has {value}"
-    return ""
+    found = foreign_field(run.manifest, shard, commit)
+    return ": ".join(found) if found else ""
 
 
 def check_account(run: Run, commit: Commit) -> list[Finding]:

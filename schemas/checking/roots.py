@@ -13,7 +13,8 @@ from schemas.errors import InputError
 from schemas.lineage import LINEAGE, Lineage
 from schemas.merged import MERGED, part_folder
 from schemas.record_files import encode_record
-from schemas.run import Run, copy_key
+from schemas.root_records import copy_key
+from schemas.run import Run
 from schemas.run_records import FORMAT_VERSION, Manifest, Merged, Plan
 from schemas.storage import Storage
 

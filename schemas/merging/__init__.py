@@ -12,7 +12,8 @@ from schemas.merging.plan import Union, plan_union, refuse_incompatible
 from schemas.merging.resharding import common_layout
 from schemas.merging.writing import Written, begin_union, replace_record, write_union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.run import Run, refuse_foreign
+from schemas.root_records import refuse_foreign
+from schemas.run import Run
 from schemas.run_records import Layout, Merged
 from schemas.sealing import SEALED, seal, sealed_metadata
 from schemas.sealing.contents import read_contents

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 
@@ -19,12 +18,12 @@ from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
 from schemas.merging.ledgers import UnitedAttempt, united_attempts
 from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.run import Run, commit_key, copy_key, publish, shard_folder
+from schemas.root_records import copy_key, publish
+from schemas.run import Run, shard_folder
 from schemas.run_records import Commit, QuarantineRecord
 from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard
 from schemas.storage import Storage
-from schemas.storage.errors import StoreFailure
 
 Tick = Callable[[], None]
 _AT_ONCE = 16  # files asked of a server at one time
@@ -106,21 +105,14 @@ def _link(union: Union, run: Run, holding: Holding) -> bool:
     def adopt(key: str) -> None:
         run.storage.adopt(source.storage, key, key, limit_bytes=sizes[key])
 
-    try:
+    # Another merge may be at this very attempt, and have committed it.
+    with run.nothing_left_behind(holding.shard, holding.attempt):
         if run.storage.folder is None or source.storage.folder is None:
             with ThreadPoolExecutor(_AT_ONCE) as pool:
                 deque(pool.map(adopt, sizes), maxlen=0)
         else:
             deque(map(adopt, sizes), maxlen=0)
         run.storage.sync(sizes)
-    except StoreFailure:
-        raise  # it would not delete either
-    except InputError:
-        # A full disk gets its room back, unless another merge was faster with this very attempt.
-        with suppress(InputError):
-            if not run.storage.exists(commit_key(holding.shard)):
-                run.storage.delete(sizes)
-        raise
     return run.commit(commit)
 
 

@@ -21,7 +21,8 @@ from schemas.index import closed_ends, committed_heads
 from schemas.merged import MERGED, open_runs, part_folder
 from schemas.merging import carry_out, plan_merge
 from schemas.record_files import encode_record
-from schemas.run import Run, publish
+from schemas.root_records import publish
+from schemas.run import Run
 from schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from schemas.sealing import SEALED, seal, unseal
 from schemas.shard_files import encode_shard

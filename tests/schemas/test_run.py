@@ -46,6 +46,13 @@ def test_racing_plans_end_at_the_largest(tmp_path: Path):
     assert run.n == 21
 
 
+def test_a_plan_after_which_none_can_be_named_is_refused(tmp_path: Path):
+    run = make_run(tmp_path, n=1, shards=[])
+    (tmp_path / f"plans/{10**18 - 1}.json").write_bytes((tmp_path / "plans/1.json").read_bytes())
+    with pytest.raises(InputError, match=r"plans/9{18}\.json: no run has so many plans\. Move it away"):
+        run.grow(2)
+
+
 def test_the_existing_layout_wins(tmp_path: Path):
     make_run(tmp_path, n=30, scenes_per_shard=3, shards=[])
     assert make_run(tmp_path, n=30, scenes_per_shard=7, shards=[]).layout.scenes_per_shard == 3

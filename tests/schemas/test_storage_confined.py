@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.errors import InputError
-from schemas.run import refuse_foreign
+from schemas.root_records import refuse_foreign
 from schemas.storage import Storage, local_files, open_storage
 from tests.made_runs import files_of
 

@@ -1,0 +1,86 @@
+"""What is taken away again, by whom it was written, leaves what others have committed meanwhile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.errors import InputError
+from schemas.merging import carry_out, plan_merge
+from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
+from schemas.storage import Storage
+from tests.made_runs import attempt, make_run, write
+
+FULL = InputError("the disk", "", "No space left on device", "Free disk space")
+
+
+@pytest.mark.parametrize("size", [1, 2])  # of the other run's shards: 1 lets both be cut, 2 links them
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_merge_without_room_leaves_what_another_one_has_committed(
+    size: int, is_first: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two merges to one place give equal attempts: what one removes may be the other's by then."""
+    make_run(tmp_path / "a", 10, 2)
+    make_run(tmp_path / "b", 10, size, shards=[])
+    planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
+    plain, calls = Storage.sync, 0
+
+    def full(storage: Storage, keys: Any) -> None:
+        nonlocal calls
+        some = list(keys)
+        plain(storage, some)
+        if any(key.startswith("shards/") and not key.endswith(REMOVING) for key in some):
+            calls += 1
+            if calls == 1:
+                with monkeypatch.context() as patch:
+                    patch.setattr(Storage, "sync", plain)
+                    if not is_first:
+                        carry_out(planned)
+                raise FULL
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="No space left"):
+        patch.setattr(Storage, "sync", full)
+        carry_out(planned)
+    out = Run.open(tmp_path / "out")
+    assert calls == 1
+    assert out.committed() == (set() if is_first else {0, 1} if size == 1 else {0})
+    for commit in out.commits():
+        out.check_digests(commit)
+    left = [file.key for file in out.storage.list("shards")]
+    assert not any(key.endswith(REMOVING) for key in left)
+    assert bool(left) != is_first
+    carry_out(planned)
+    assert list(Run.open(tmp_path / "out").missing()) == []
+
+
+def test_a_commit_that_is_taken_back_leaves_no_copy_that_stands_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path, shards=[])
+    commit, plain = write(run, 0, "slow"), Storage.put_new
+
+    def and_gc_marks_it(storage: Storage, key: str, data: bytes) -> bool:
+        won = plain(storage, key, data)
+        storage.put(f"{shard_folder(0, 'slow')}/{REMOVING}", b"")
+        return won
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="is being removed as garbage"):
+        patch.setattr(Storage, "put_new", and_gc_marks_it)
+        run.commit(commit)
+    assert not run.storage.exists(commit_key(0))
+    assert not run.storage.exists(commit_copy_key(0, "slow"))
+    assert attempt(run, 0, "next")
+
+
+def test_an_attempt_is_removed_unless_its_shards_commit_may_name_it(tmp_path: Path) -> None:
+    run = make_run(tmp_path, n=20, shards=[0])
+    write(run, 0, "late")
+    before = {file.key for file in run.storage.list(shard_folder(0, "a-0"))}
+    assert run.remove_attempt(0, "late") == "removed"
+    assert not (tmp_path / shard_folder(0, "late")).exists()
+    assert run.remove_attempt(0, "a-0") == "spared"
+    (tmp_path / commit_key(0)).write_bytes(b"{}")
+    assert run.remove_attempt(0, "a-0") == "spared"
+    assert {file.key for file in run.storage.list(shard_folder(0, "a-0"))} == before
