@@ -34,7 +34,7 @@ demo: venv
 	@echo "the picture: $(DEMO)/scene-0.png"
 
 test: lint
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Each ends with an error where a promise was broken.
 FAULTS := crash_points damage kills two_drivers s3 confinement listing

@@ -9,6 +9,7 @@ than a tenth of a second per shard. Tests hold the bytes equal to what zarr-pyth
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -27,6 +28,10 @@ from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
 from schemas.run_records import Layout
 
 Array = npt.NDArray[Any]
+# A schema's name, version and fields; its axis lengths; scenes a shard and candidates a scene.
+_Key = tuple[str, int, tuple[Field, ...], tuple[Field, ...]]
+_Sizes = tuple[tuple[str, int], ...]
+_Cut = tuple[int, int]
 
 ZSTD_LEVEL = 3
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
@@ -104,24 +109,13 @@ def encode_chunk(field: Field, values: Array) -> bytes:
 
 def group_metadata(schema: RecordSchema, layout: Layout, spec_hash: str) -> Mapping[str, bytes]:
     """Every zarr.json of a shard, by path: the root's with the schema's name, and each array's."""
-    key = (schema.name, schema.version, schema.scene_fields, schema.sample_fields)
-    cut = (layout.scenes_per_shard, layout.candidates_per_scene)
-    return _metadata(*key, tuple(sorted(schema.sizes.items())), cut, spec_hash)
+    return _group_metadata(*_key(schema, layout), spec_hash)
 
 
 @lru_cache(maxsize=16)
-def _metadata(
-    name: str,
-    version: int,
-    scene_fields: tuple[Field, ...],
-    sample_fields: tuple[Field, ...],
-    sizes: tuple[tuple[str, int], ...],
-    cut: tuple[int, int],
-    spec_hash: str,
-) -> Mapping[str, bytes]:
-    layout = Layout(scenes_per_shard=cut[0], candidates_per_scene=cut[1])
-    schema = RecordSchema(name, version, scene_fields, sample_fields, dict(sizes))
-    rows: dict[str, int] = {t: rows_per_shard(layout, t) for t in TABLES}
+def _group_metadata(key: _Key, sizes: _Sizes, cut: _Cut, spec_hash: str) -> Mapping[str, bytes]:
+    schema, layout = _from_key(key, sizes, cut)
+    rows: dict[str, int] = {table: rows_per_shard(layout, table) for table in TABLES}
     return zarr_metadata(schema, layout, rows, root_attributes(schema, layout, spec_hash))
 
 
@@ -140,17 +134,35 @@ def root_attributes(schema: RecordSchema, layout: Layout, spec_hash: str) -> dic
 def zarr_metadata(
     schema: RecordSchema, layout: Layout, rows: Mapping[str, int], attributes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """zarr.json files of a group with so many rows a table; chunks are those of the layout's shards."""
+    """zarr.json files of a group with so many rows a table; chunks are those of the layout's shards.
+
+    zarr-python takes 3 ms an array, so it is asked once a layout; rows and attributes are put in after.
+    """
+    files: dict[str, bytes] = {}
+    for path, data in _made_by_zarr(*_key(schema, layout)).items():
+        meta = json.loads(data)
+        if path == "zarr.json":
+            meta["attributes"] = dict(attributes)
+        else:
+            meta["shape"][0] = rows[meta["dimension_names"][0]]
+        files[path] = json.dumps(meta, indent=2).encode()
+    return files
+
+
+@lru_cache(maxsize=16)
+def _made_by_zarr(key: _Key, sizes: _Sizes, cut: _Cut) -> Mapping[str, bytes]:
+    """What zarr-python writes for a group of one shard's rows."""
+    schema, layout = _from_key(key, sizes, cut)
     store: dict[str, Any] = {}
-    group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes=dict(attributes))
+    group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes={"": ""})
     for table in TABLES:
+        rows = rows_per_shard(layout, table)
         for field in schema.table(table):
-            step = chunk_rows(schema, field, rows_per_shard(layout, table))
             codec = VLenUTF8Codec() if field.is_text else BytesCodec(endian="little")
             group.create_array(
                 field.name,
-                shape=schema.shape(field, rows[table]),
-                chunks=schema.shape(field, step),
+                shape=schema.shape(field, rows),
+                chunks=schema.shape(field, chunk_rows(schema, field, rows)),
                 dtype=field.dtype,
                 fill_value=fill_value(field),
                 serializer=codec,
@@ -162,6 +174,17 @@ def zarr_metadata(
                 config={"write_empty_chunks": True},
             )
     return {path: buffer.to_bytes() for path, buffer in store.items()}
+
+
+def _key(schema: RecordSchema, layout: Layout) -> tuple[_Key, _Sizes, _Cut]:
+    """What metadata depend on, as values that can be looked up."""
+    fields = (schema.name, schema.version, schema.scene_fields, schema.sample_fields)
+    return fields, tuple(sorted(schema.sizes.items())), (layout.scenes_per_shard, layout.candidates_per_scene)
+
+
+def _from_key(key: _Key, sizes: _Sizes, cut: _Cut) -> tuple[RecordSchema, Layout]:
+    layout = Layout(scenes_per_shard=cut[0], candidates_per_scene=cut[1])
+    return RecordSchema(*key, dict(sizes)), layout
 
 
 def field_attributes(field: Field) -> dict[str, Any]:

@@ -24,6 +24,11 @@ from schemas.sealing import local as seal_local
 from tests.made_runs import files_of, make_run, rows_of, small_spec, write
 
 
+def clear_metadata() -> None:
+    shard_files._group_metadata.cache_clear()
+    shard_files._made_by_zarr.cache_clear()
+
+
 def expected(run: Run, shards: list[int], scenes: int, samples: int) -> dict[str, np.ndarray]:
     tables = [rows_of(run, shard) for shard in shards]
     out: dict[str, np.ndarray] = {}
@@ -138,14 +143,14 @@ def test_large_clouds_in_several_chunks_a_shard(tmp_path: Path):
     patch = pytest.MonkeyPatch()
     with patch.context() as m:
         m.setattr(shard_files, "MAX_CHUNK_BYTES", 1000)  # of real clouds this takes gigabytes
-        shard_files._metadata.cache_clear()
+        clear_metadata()
         run.grow(75)
         for shard in run.missing():
             assert run.commit(write(run, shard, "a"))
         group = zarr.open(seal(run.storage), mode="r")
         assert_equal(group, expected(run, [0, 1, 2], 15, 75))
         assert group["points_m"].chunks[0] == 2
-    shard_files._metadata.cache_clear()
+    clear_metadata()
 
 
 def test_labels_of_random_clouds_fit_the_budget(tmp_path: Path):

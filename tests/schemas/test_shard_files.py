@@ -11,7 +11,7 @@ from zarr.storage import MemoryStore
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS, Field, sized_schema
 from schemas.run_records import Layout
-from schemas.shard_files import MAX_CHUNK_BYTES, chunk_rows, encode_shard, group_metadata
+from schemas.shard_files import MAX_CHUNK_BYTES, chunk_rows, encode_shard, group_metadata, zarr_metadata
 from tests.made_runs import small_spec, tables_of
 
 LAYOUT = Layout(scenes_per_shard=3, candidates_per_scene=4)
@@ -28,6 +28,19 @@ def test_the_bytes_are_those_that_zarr_writes():
     for name, values in (*scenes.items(), *samples.items()):
         group[name][:] = values
     assert {path: buffer.to_bytes() for path, buffer in store.items()} == ours
+
+
+def test_metadata_of_more_rows_are_those_that_zarr_writes_when_an_array_grows():
+    attributes = {"said": "größer", "parts": [{"n": 7, "absent": []}]}
+    rows = {"scene": 3 * LAYOUT.scenes_per_shard, "sample": 3 * LAYOUT.samples_per_shard - 1}
+    store = {path: make_buffer(data) for path, data in group_metadata(SCHEMA, LAYOUT, HASH).items()}
+    group = zarr.open_group(MemoryStore(store), mode="r+")
+    for name, array in group.arrays():
+        table = "scene" if name in {f.name for f in SCHEMA.scene_fields} else "sample"
+        array.resize((rows[table], *array.shape[1:]))
+    group.attrs.put(attributes)
+    theirs = {path: buffer.to_bytes() for path, buffer in store.items()}
+    assert zarr_metadata(SCHEMA, LAYOUT, rows, attributes) == theirs
 
 
 def test_all_zero_chunks_are_written_too():
