@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import zarr
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -118,8 +118,8 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
     """(ids, labels) that a store over these parts must hold, from the drawn rows alone."""
     ids, labels = [], []
     order = sorted(sealed, key=lambda key: specification(*key).hash())
-    order = [key for key in order if sealed[key].committed & set(sealed[key].planned)]
-    for key in order:
+    with_rows = [key for key in order if sealed[key].committed & set(sealed[key].planned)]
+    for key in with_rows:
         spec, part = specification(*key), sealed[key]
         for shard in sorted(part.committed & set(part.planned)):
             rows = drawn_rows(key[0], shard)
@@ -129,8 +129,8 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
                     rows[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")
                 )
                 _, label = heuristic.heuristic(d, mount, reach, rho, RULES[key[1]])
-            # Only a run alone, or the last of several that have rows, is cut to what is wanted.
-            kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == order[-1] else PER_SHARD
+            # Only the end of the store is cut: that of the last run with rows.
+            kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == with_rows[-1] else PER_SHARD
             ids.append(sample_ids(spec.hash(), shard, np.arange(PER_SHARD))[:kept])
             labels.append(label[:kept])
     return np.concatenate(ids), np.concatenate(labels)
@@ -426,5 +426,7 @@ TestAnyHistory.settings = settings(
     max_examples=EXAMPLES,
     stateful_step_count=STEPS,
     deadline=None,
+    # Tracing every line of a failure takes longer than finding it.
+    phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )
