@@ -33,7 +33,7 @@ def moto_server(log: Path) -> Generator[int]:
         command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
     try:
-        end_s = time.monotonic() + 60
+        end_s = time.monotonic() + 120  # seconds of a busy machine
         while True:
             with suppress(OSError):
                 socket.create_connection(("127.0.0.1", port), 1).close()
