@@ -112,7 +112,7 @@ def _end_event(run: Run, part: str, attempt: str, key: str) -> Event:
 
 def _start_event(run: Run, part: str, attempt: str, key: str) -> Event:
     start = run.ledger.start_of(attempt)
-    if start is None:
+    if start is None or not start.started:  # no worker came to it, or it is not known when: its end says all
         return _NOTHING
     text = f"{part}shard {start.shard} begins on {start.host or 'a host unknown'} ({attempt})"
     return Event(start.started, key, "attempt_begins", text, "", start.shard)

@@ -77,6 +77,20 @@ def test_failures_and_retries_are_told_in_order_of_time(
     assert "Segmentation fault" in events[1]["text"] and "stack" not in events[1]
 
 
+def test_an_attempt_that_no_worker_came_to_has_no_begin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "run", n=20, shards=[0])
+    run.ledger.end(
+        LedgerEntry(
+            attempt="000001-aaaaaaaa-000002", shard=1, outcome="cancelled", cause="the job was stopped",
+            started="", ended=at(3),
+        )
+    )  # fmt: skip
+    (event,) = lines_of(capsys, run.storage.url)
+    assert event["event"] == "attempt_cancelled" and event["at"] == at(3)
+
+
 def test_stacks_and_one_shard(troubled: Path, capsys: pytest.CaptureFixture[str]) -> None:
     events = lines_of(capsys, str(troubled), "--stacks", "--shard", "1")
     assert {e["shard"] for e in events} == {1} and len(events) == 5
