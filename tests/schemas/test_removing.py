@@ -74,6 +74,13 @@ def test_a_commit_that_is_taken_back_leaves_no_copy_that_stands_for_it(
     assert attempt(run, 0, "next")
 
 
+def test_who_loses_a_shard_leaves_no_copy_of_a_commit(tmp_path: Path) -> None:
+    run = make_run(tmp_path, n=20, shards=[0])
+    assert not attempt(run, 0, "late")
+    assert run.storage.exists(commit_copy_key(0, "a-0"))
+    assert not run.storage.exists(commit_copy_key(0, "late"))
+
+
 def test_an_attempt_is_removed_unless_its_shards_commit_may_name_it(tmp_path: Path) -> None:
     run = make_run(tmp_path, n=20, shards=[0])
     write(run, 0, "late")

@@ -1,0 +1,138 @@
+"""What a power cut would take: every write is followed up to the fsync that makes it last."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.fields import SCHEMAS
+from schemas.merging import carry_out, plan_merge
+from schemas.run import Run
+from schemas.sealing import seal, unseal
+from schemas.storage import open_storage
+from tests.faults.crash_points_operations import small_schema
+from tests.made_runs import attempt, make_run, write
+
+
+class Disk:
+    """Which bytes and which names were written since the fsync of their file, or of their folder.
+
+    Names that go are not followed: a draft that comes back after a power cut is garbage.
+    """
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.bytes: set[int] = set()  # inodes of files
+        self.names: set[tuple[int, str]] = set()  # inodes of folders, and what is named in them
+        self.named: Callable[[str], None] = lambda name: None  # hears of every name that is about to be given
+        plain = {name: getattr(os, name) for name in ("write", "fsync", "link", "rename", "mkdir")}
+
+        def write(fd: int, data: Any) -> int:
+            self.bytes.add(os.fstat(fd).st_ino)
+            return plain["write"](fd, data)
+
+        def fsync(fd: int) -> None:
+            plain["fsync"](fd)
+            inode = os.fstat(fd).st_ino
+            self.bytes.discard(inode)
+            self.names -= {name for name in self.names if name[0] == inode}
+
+        def naming(call: str, folder: str) -> Callable[..., None]:
+            def name(*arguments: Any, **options: Any) -> None:
+                at = arguments[0 if call == "mkdir" else 1]
+                self.named(os.fspath(at))
+                plain[call](*arguments, **options)
+                fd = options.get(folder)
+                inode = os.fstat(fd).st_ino if fd is not None else Path(at).parent.stat().st_ino
+                self.names.add((inode, Path(at).name))
+
+            return name
+
+        for call, made in {"write": write, "fsync": fsync}.items():
+            patch.setattr(os, call, made)
+        for call, folder in {"link": "dst_dir_fd", "rename": "dst_dir_fd", "mkdir": "dir_fd"}.items():
+            patch.setattr(os, call, naming(call, folder))
+
+    def lost(self, place: Path) -> set[str]:
+        """Files and folders below a place that a power cut would take, or empty."""
+        found: set[str] = set()
+        for path in sorted(place.rglob("*")):
+            is_named = (path.parent.stat().st_ino, path.name) not in self.names
+            if not is_named or path.stat().st_ino in self.bytes:
+                found.add(str(path.relative_to(place)))
+        return found
+
+    @contextmanager
+    def watched(self, place: Path, name: str) -> Generator[list[set[str]]]:
+        """Gives what would be lost at each moment at which something gets this name."""
+        found: list[set[str]] = []
+
+        def look(given: str) -> None:
+            if given == name:
+                found.append(self.lost(place))
+
+        self.named = look
+        yield found
+        self.named = lambda name: None
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    monkeypatch.setitem(SCHEMAS, "heuristic", small_schema())
+    return Disk(monkeypatch)
+
+
+def test_a_new_name_is_given_to_bytes_that_last_and_lasts_itself(disk: Disk, tmp_path: Path) -> None:
+    place = open_storage(tmp_path / "far" / "away")
+    assert disk.lost(tmp_path) == set()
+    with disk.watched(tmp_path, "new") as lost:
+        place.put_new("a/b/new", b"bytes")
+    assert lost == [{"far/away/a", "far/away/a/b"}] and disk.lost(tmp_path) == set()
+
+
+def test_what_somebody_else_wrote_and_did_not_make_last_is_made_to(disk: Disk, tmp_path: Path) -> None:
+    place = open_storage(tmp_path)
+    place.put("a/b", b"bytes")
+    assert disk.lost(tmp_path) == {"a", "a/b"}
+    assert place.put_new("a/b", b"bytes") and disk.lost(tmp_path) == set()
+    place.put("a/c", b"bytes")
+    place.sync(["a/c"])
+    assert disk.lost(tmp_path) == set()
+
+
+def test_a_shard_is_committed_when_all_that_it_names_lasts(disk: Disk, tmp_path: Path) -> None:
+    run = make_run(tmp_path, 20, shards=[])
+    made = write(run, 0, "a-0")
+    with disk.watched(tmp_path, "000000.json") as lost:
+        assert run.commit(made)
+    assert lost == [{"commits"}]
+    assert attempt(run, 1, "a-1") and disk.lost(tmp_path) == set()
+
+
+def test_a_sealed_store_gets_its_name_when_it_lasts(disk: Disk, tmp_path: Path) -> None:
+    run = make_run(tmp_path, 20)
+    synced, plain = set[int](), os.fsync
+    with disk.watched(tmp_path, str(tmp_path / "data.zarr")) as lost, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda fd: (synced.add(os.fstat(fd).st_ino), plain(fd)))
+        seal(run.storage)
+    assert len(lost) == 1 and {path.count("/") for path in lost[0]} == {0}  # the draft's own name
+    assert disk.lost(tmp_path) == set()
+    metadata = list((tmp_path / "data.zarr").rglob("zarr.json"))
+    assert metadata and {path.stat().st_ino for path in metadata} <= synced
+    unseal(run.storage)
+    assert disk.lost(tmp_path) == set()
+
+
+@pytest.mark.parametrize("size", [1, 2])  # cut, or linked
+def test_merged_shards_are_committed_when_they_last(size: int, disk: Disk, tmp_path: Path) -> None:
+    make_run(tmp_path / "a", 20)
+    make_run(tmp_path / "b", 10, size, shards=[])
+    planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
+    with disk.watched(tmp_path / "out", "000000.json") as lost:
+        carry_out(planned)
+    assert lost == [{"commits"}] and disk.lost(tmp_path / "out") == set()
+    assert list(Run.open(tmp_path / "out").missing()) == []
