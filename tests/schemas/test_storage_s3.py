@@ -261,6 +261,7 @@ def test_addresses_and_settings_that_cannot_be_used(bucket: str, monkeypatch: py
         ("s3://bucket/../x", "has an empty part, or one of dots"),
         ("s3://bucket/a//b", "has an empty part, or one of dots"),
         ("gs://bucket/x", "neither a folder nor an s3:// address"),
+        ("s3:/bucket/x", "does not name a bucket. Give s3://bucket/prefix"),
     ]:
         with pytest.raises(InputError, match=problem) as e:
             open_storage(place)
