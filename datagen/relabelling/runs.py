@@ -23,7 +23,8 @@ from datagen.specifying.manifest import manifest_of
 from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from schemas.errors import InputError
 from schemas.merged import MERGED, part_folder
-from schemas.record_files import encode_record
+from schemas.record_files import MAX_RECORD_BYTES, encode_record
+from schemas.root_records import publish
 from schemas.run import Run
 from schemas.run_records import Merged
 from schemas.sealing import seal
@@ -129,7 +130,10 @@ def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
 
 
 def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
-    if not place.put_new(MERGED, encode_record(Merged(parts=tuple(hashes)))):
+    record = encode_record(Merged(parts=tuple(hashes)))
+    if place.get(MERGED, MAX_RECORD_BYTES) in (None, record):
+        publish(place, MERGED, record)
+    if place.get(MERGED, MAX_RECORD_BYTES) != record:  # also where somebody else was faster
         problem = "other runs were merged here"
         raise InputError(f"{place.url}/{MERGED}", "parts", problem, "Choose another --out")
 

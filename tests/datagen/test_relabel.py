@@ -166,6 +166,7 @@ def test_merged_runs_are_relabelled_part_by_part(
     for name, values in whole.items():
         np.testing.assert_array_equal(values, np.concatenate([arrays[name] for arrays in each]), err_msg=name)
     assert json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])["labels"] == 0
+    assert cli.run(["verify", str(out)]) == 0
 
 
 def test_scenes_that_were_merged_twice_are_labelled_once(source: Path, tmp_path: Path) -> None:
