@@ -9,6 +9,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.merging import carry_out, plan_merge
+from schemas.record_files import encode_record
 from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
 from schemas.storage import Storage
 from tests.made_runs import attempt, make_run, write
@@ -72,6 +73,22 @@ def test_a_commit_that_is_taken_back_leaves_no_copy_that_stands_for_it(
     assert not run.storage.exists(commit_key(0))
     assert not run.storage.exists(commit_copy_key(0, "slow"))
     assert attempt(run, 0, "next")
+
+
+def test_an_attempt_that_dies_in_its_commit_while_its_files_go_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path, shards=[])
+    record, plain = encode_record(write(run, 0, "slow")), Storage.list
+
+    def and_it_commits(storage: Storage, prefix: str) -> Any:
+        storage.put_new(commit_key(0), record)
+        return plain(storage, prefix)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Storage, "list", and_it_commits)
+        assert run.remove_attempt(0, "slow") == "damaged"
+    assert list(run.storage.list(shard_folder(0, "slow"))) == []
 
 
 def test_who_loses_a_shard_leaves_no_copy_of_a_commit(tmp_path: Path) -> None:
