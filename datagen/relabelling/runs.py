@@ -28,6 +28,7 @@ from schemas.root_records import publish
 from schemas.run import Run
 from schemas.run_records import Merged
 from schemas.sealing import seal
+from schemas.shard_ranges import ShardRanges
 from schemas.specification import Specification
 from schemas.storage import Storage
 from workers.labels import load_label_source
@@ -105,8 +106,9 @@ def relabel_all(
     stop = StopRequest()
     with stop_on_signals(stop, interrupt=True):
         for run, (source, _) in zip(done.runs, pairs, strict=True):
-            missing = sorted(set(run.missing()) & set(source.committed()))
-            done.absent += len(set(run.missing()) - set(source.committed()))
+            planned = run.missing()
+            missing = planned.within(ShardRanges.of(source.committed()))
+            done.absent += len(planned) - len(missing)
             done.summaries.append(_relabel_run(run, source, missing, stop, done.flips, json))
     if done.end in ("complete", "failed") and any(run.committed() for run in done.runs):
         seal(place)
