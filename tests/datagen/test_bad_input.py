@@ -62,7 +62,7 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--out {file}/below", ["{file}/below", "Not a directory"]),
     ("--out {foreign}", ["{foreign}", "thesis.tex", "--out"]),
     ("--out {missing}\0", ["not the name of a folder"]),
-    ("--out ftp://example.org/run", ["ftp://example.org/run"]),
+    ("--out ftp://key:secret@example.org/run", ["ftp://...", "s3://"]),
     ("--config {missing}", ["{missing}", "No such file"]),
     ("--config {empty}", ["{empty}", "not a file"]),
     ("--config /dev/zero", ["/dev/zero", "not a file"]),

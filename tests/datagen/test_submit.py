@@ -106,7 +106,7 @@ def test_a_run_with_shards_given_up_says_so_again(copied: Path, capsys: pytest.C
     capsys.readouterr()
     assert cli.run(submit_arguments(copied, N)) == 1
     told = capsys.readouterr()
-    assert "given up" in told.out and "2 shards, [2, 5]" in told.out and "no luck" in told.err
+    assert "given up" in told.out and "2 shards (2, 5)" in told.out and "no luck" in told.err
     assert arrays_of(copied)["label"].shape == (N - 2 * PER_SCENE,)
     shutil.rmtree(copied / "quarantine")  # as the message says
     assert cli.run(submit_arguments(copied, N)) == 0
