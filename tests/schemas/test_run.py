@@ -12,6 +12,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.record_files import signed_json
+from schemas.root_records import copy_key, publish
 from schemas.run import Run
 from schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
 from schemas.storage import open_storage
@@ -268,6 +269,13 @@ def test_attempts_with_bad_names_cannot_be_committed(tmp_path: Path):
     run = make_run(tmp_path, shards=[])
     with pytest.raises(ValueError, match="attempt"):
         commit_of(run, 0, "../x", (FileEntry(path="a", size=0, sha256="0" * 64),))
+
+
+def test_what_a_killed_creator_began_is_completed_as_he_began_it(tmp_path: Path):
+    place = open_storage(tmp_path)
+    place.put(copy_key("plans/1.json"), b"first")
+    publish(place, "plans/1.json", b"second")
+    assert place.get("plans/1.json", 100) == b"first"
 
 
 def test_two_creators_of_one_run_agree(tmp_path: Path):
