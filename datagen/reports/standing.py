@@ -12,7 +12,7 @@ from schemas.merged import open_runs
 from schemas.quarantine import lifted_records
 from schemas.run import Run
 from schemas.run_records import Outcome
-from schemas.sealing import SealedRoot, sealed_root
+from schemas.sealing import SealedPart, SealedRoot, sealed_root
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage
 
@@ -106,13 +106,18 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "lineage": lineage_summary(run),
         # An older seal, of a shorter run or with fewer shards, does not count.
         "sealed": part is not None and part.n == n and absent == part.missing_shards,
-        "sealed_labels": part.n if part else None,
+        "sealed_labels": _sealed_labels(run, part) if part else None,
         "complete": not absent,
     }
     if stacks:
         ends = {cause: run.ledger.end_of(examples[cause]) for cause in common}
         report["stacks"] = {cause: end.stack for cause, end in ends.items() if end is not None and end.stack}
     return report
+
+
+def _sealed_labels(run: Run, part: SealedPart) -> int:
+    """Rows of a run in a store that was sealed without some of its shards."""
+    return part.n - sum(run.layout.rows_wanted(shard, part.n)[1] for shard in part.missing_shards)
 
 
 def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:

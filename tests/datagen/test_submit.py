@@ -170,6 +170,11 @@ def test_status_tells_an_older_seal(
     assert not report["sealed"] and report["sealed_labels"] == N
     assert cli.run(["status", str(grown)]) == 0
     assert "data.zarr is older" in capsys.readouterr().out
+    # Sealed unfinished, it holds no more labels than before.
+    assert cli.run(["seal", str(grown)]) == 0
+    Run.open(grown).grow(3 * N)
+    capsys.readouterr()
+    assert json_of(capsys, ["status", str(grown)])["sealed_labels"] == N
 
 
 def test_the_audit_adds_up(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
