@@ -138,7 +138,7 @@ def test_a_merge_that_was_cut_short_is_finished_by_the_same_command(tmp_path: Pa
     class Killed(Exception): ...
 
     for after in range(0, 12, 2):
-        out = f"out{after}"
+        out = f"0{after}"  # first by name, where it would be taken for the shards' origin
         left = after
 
         def step() -> None:
