@@ -40,6 +40,10 @@ def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
     assert run.ledger.end_of("slow") == account
     end = run.ledger.end_of("lost")
     assert end is not None and end.outcome == "lost"
+    late = account.model_copy(update={"attempt": "lost"})
+    assert run.ledger.end(late) and run.ledger.end_of("lost") == late  # it answers after all
+    assert not run.ledger.end(late.model_copy(update={"outcome": "failed"}))
+    assert run.ledger.end_of("lost") == late
 
 
 def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
