@@ -11,8 +11,10 @@ import pytest
 from schemas.checking import mending
 from schemas.checking.finding import Finding
 from schemas.checking.mending import mend_place
+from schemas.record_files import MAX_RECORD_BYTES, encode_record
+from schemas.run import commit_copy_key, commit_key
 from schemas.run_records import Cost, LedgerEntry
-from tests.made_runs import make_run
+from tests.made_runs import make_run, write
 
 
 def never(*_: Any) -> dict[str, bytes]:
@@ -60,3 +62,14 @@ def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
     mended = mend_place(run.storage, never, 1, others)
     assert mended.records == [] and sorted(mended.changed) == ["gone.txt", "other.txt"]
     assert mended.untouched == files - 2
+
+
+def test_of_several_copies_the_one_of_the_ledgers_winner_restores_a_commit(tmp_path: Path) -> None:
+    run = make_run(tmp_path, 20)
+    for name in ("0-first", "z-last"):  # losers that were killed before they removed theirs
+        run.storage.put(commit_copy_key(1, name), encode_record(write(run, 1, name)))
+    whole = run.storage.get(commit_key(1), MAX_RECORD_BYTES)
+    run.storage.delete([commit_key(1)])
+    mended = mend_place(run.storage, never)
+    assert (mended.records, mended.left) == ([commit_key(1)], [])
+    assert run.storage.get(commit_key(1), MAX_RECORD_BYTES) == whole
