@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,14 @@ def test_what_began_under_a_job_that_is_at_work_stays(tmp_path: Path) -> None:
     time.sleep(0.01)
     found = {piece.key for piece in find_garbage(run.storage, 0, time.time())}
     assert shard_folder(4, "at-work") not in found and shard_folder(1, "late") in found
+
+
+def test_a_silent_job_of_another_machine_may_still_be_at_work(tmp_path: Path) -> None:
+    run, _ = littered(tmp_path)
+    began = (datetime.now(UTC) - timedelta(hours=1)).isoformat()
+    record = JobRecord(id=new_job_id(), command=(), host="elsewhere", pid=1, started=began, address="local")
+    Jobs(run.storage).begin(record)
+    assert find_garbage(run.storage, -1, time.time()) == []
 
 
 def test_a_claim_to_a_lost_commit_record_stays(tmp_path: Path) -> None:
