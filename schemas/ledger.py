@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TypeVar
 
@@ -25,7 +26,9 @@ class Ledger:
 
     def start(self, attempt: str, shard: int) -> None:
         """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
-        record = AttemptStart(attempt=attempt, shard=shard, started=now(), host=platform.node())
+        record = AttemptStart(
+            attempt=attempt, shard=shard, started=now(), host=platform.node(), writer=secrets.token_hex(8)
+        )
         if not self._storage.put_new(start_key(attempt), encode_record(record)):
             place = f"{self._storage.url}/{start_key(attempt)}"
             raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")

@@ -148,6 +148,8 @@ class AttemptStart(_Record):
     shard: int = Field(ge=0)
     started: str
     host: str = ""
+    # Drawn anew for each begin: a create-only put that finds its own bytes counts as its own.
+    writer: str = ""
 
 
 class LedgerEntry(_Record):
