@@ -29,6 +29,7 @@ def test_a_local_cluster_listens_on_loopback_alone_and_asks_for_its_token(
     from ray._private import ray_constants
 
     monkeypatch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", True)  # as where somebody imported Ray before
+    monkeypatch.setenv("PYTHONBREAKPOINT", "ray.util.rpdb._driver_set_trace")  # Ray's own doing
     before = dict(os.environ)
     with ray_cluster(RaySettings(workers=1)) as ray:
         assert dict(os.environ) == before and not (tmp_path / ".ray").exists()
