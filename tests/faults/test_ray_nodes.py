@@ -128,8 +128,8 @@ def test_a_machine_that_does_not_see_the_run_is_named(
 
 
 def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path: Path) -> None:
-    run, slots = make_run(tmp_path / "run", n=12 * 10, shards=()), machines.cluster
-    undisturbed = make_run(tmp_path / "undisturbed", n=12 * 10)
+    run, slots = make_run(tmp_path / "run", n=8 * 10, shards=()), machines.cluster
+    undisturbed = make_run(tmp_path / "undisturbed", n=8 * 10)
     executor = RayExecutor(make_rows, machines.settings, machines.ray)
     gone: list[str] = []
 
@@ -139,20 +139,21 @@ def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path:
             return any((machines.folder / "second" / "tmp" / notes).glob("*.stack"))
 
         def kill_the_second(tally: Tally) -> None:
-            if not gone and tally.committed >= 3 and second_is_at_work():
+            if not gone and tally.committed >= 2 and second_is_at_work():
                 gone.append("second")
                 slots.remove_node(machines.second, allow_graceful=False)
 
         def make_task(order: Order) -> RandomRows:
-            return RandomRows(run.storage.url, 0.3, order.shard, order.attempt, order.deadline_s, notes)
+            # Long enough that the machine is gone before what it is at is done.
+            return RandomRows(run.storage.url, 2.0, order.shard, order.attempt, order.deadline_s, notes)
 
         heard = Heard(on_tick=kill_the_second)
         summary = drive(run.missing(), make_task, executor, RunBooks(run), POLICY, heard, StopRequest())
         executor.close()
-    assert gone and summary.end == "complete" and run.committed() == set(range(12))
+    assert gone and summary.end == "complete" and run.committed() == set(range(8))
     assert close_lost_attempts(run) == 0
     outcomes = [e.outcome for e in run.ledger.ends()]
-    assert outcomes.count("committed") == 12 and set(outcomes) == {"committed", "lost"}
+    assert outcomes.count("committed") == 8 and set(outcomes) == {"committed", "lost"}
     assert run.quarantined() == set()
     assert files_of_shards(run) == files_of_shards(undisturbed)
 
