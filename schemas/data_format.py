@@ -28,6 +28,7 @@ RUN/
   quarantine/<shard>.json        a shard given up: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  one that was given up, and then tried again
   jobs/<job>.json                a driver that began; .state.json says how it is, .stop.json asks it to stop
+  index/<k>.json.gz              heads of settled records: a cache, which may be removed at any time
   lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
 ```
@@ -40,6 +41,8 @@ PLACE/
   parts/<hash>/                  each part a whole run as above, named by 16 digits of its hash
   data.zarr/                     one store over all parts; its `parts` attribute says what is of whom
 ```
+
+Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 
 Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are all
 equally long; the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by
