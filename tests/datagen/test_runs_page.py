@@ -65,7 +65,8 @@ def test_the_page_of_runs(runs: str, tmp_path: Path) -> None:
         for large, small in (SMALL | sizes).items():
             text = text.replace(large, small)
         done = script.run_command(replace(command, lines=(text,)), tmp_path, environment)
-        told = "\n".join(done.output)
+        output = tuple(line.replace(runs, ".") for line in done.output)  # the page was filled in on a folder
+        told = "\n".join(output)
         assert done.exit_code == command.exit_code, f"{text}\n{told}"
-        missing = set(script.labels_of(command.output)) - set(script.labels_of(done.output))
+        missing = set(script.labels_of(command.output)) - set(script.labels_of(output))
         assert not missing, f"{text}\nno longer prints {missing}:\n{told}"
