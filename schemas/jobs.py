@@ -154,8 +154,9 @@ class Jobs:
     def all(self) -> list[Job]:
         """Every job that began here, in order of time."""
         names = (_JOB_FILE.fullmatch(file.key) for file in self._place.list("jobs"))
-        found = (self.get(name[1]) for name in sorted(names, key=lambda n: n[0] if n else "") if name)
-        return [job for job in found if job is not None]
+        found = [job for name in names if name and (job := self.get(name[1])) is not None]
+        # Names tell seconds only, and two jobs may begin within one.
+        return sorted(found, key=lambda job: (job.record.started, job.record.id))
 
     def _passing(self, key: str, model: type[Passing]) -> Passing | None:
         # Replaced too often to be made durable: a power cut may tear it, which is as if it were absent.
