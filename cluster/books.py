@@ -8,6 +8,7 @@ from cluster.guard import utc_now
 from cluster.policy import Trouble
 from schemas.errors import InputError
 from schemas.index import refresh
+from schemas.ledger import end_from_commit, lost_end
 from schemas.run import Run, commit_key
 from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from schemas.shard_ranges import ShardRanges
@@ -84,25 +85,9 @@ def close_lost_attempts(run: Run) -> int:
         if commit is None and start.shard not in quarantined:
             continue
         if commit is not None and commit.attempt == start.attempt:
-            entry = LedgerEntry(
-                attempt=start.attempt,
-                shard=start.shard,
-                outcome="committed",
-                started=start.started,
-                ended=commit.created,
-                cost=commit.cost,
-                host=commit.host,
-            )
+            books.close(end_from_commit(commit, start.started))
         else:
-            entry = LedgerEntry(
-                attempt=start.attempt,
-                shard=start.shard,
-                outcome="lost",
-                cause="it left no end, and its shard was decided without it",
-                started=start.started,
-                ended=utc_now(),
-            )
-        books.close(entry)
+            books.close(lost_end(start, utc_now()))
         closed += 1
     refresh_index(run)
     return closed

@@ -11,10 +11,11 @@ from pydantic import BaseModel
 
 from schemas.errors import InputError
 from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
-from schemas.run_records import AttemptStart, LedgerEntry
+from schemas.run_records import AttemptStart, Commit, LedgerEntry
 from schemas.storage import Storage
 
 MAX_STACK_CHARS = 20_000
+LOST_CAUSE = "it left no end, and its shard was decided without it"
 Record = TypeVar("Record", bound=BaseModel)
 
 
@@ -42,9 +43,7 @@ class Ledger:
         if entry.outcome not in ("committed", "superseded") and not self._storage.exists(
             start_key(entry.attempt)
         ):
-            host = entry.host.name if entry.host else ""
-            start = AttemptStart(attempt=entry.attempt, shard=entry.shard, started=entry.started, host=host)
-            self._storage.put_new(start_key(entry.attempt), encode_record(start))
+            self._storage.put_new(start_key(entry.attempt), encode_record(start_from_end(entry)))
         kept = entry.model_copy(
             update={"stack": entry.stack[-MAX_STACK_CHARS:], "cause": entry.cause[:MAX_STACK_CHARS]}
         )
@@ -94,6 +93,40 @@ class Ledger:
         for key, data in self._storage.get_many(keys, MAX_RECORD_BYTES):
             if data is not None:
                 yield decode_record(f"{self._storage.url}/{key}", data, model)
+
+
+def end_from_commit(commit: Commit, started: str) -> LedgerEntry:
+    """How the attempt of a commit ended, at the commit's cost; `started` is "" where nobody knows it."""
+    return LedgerEntry(
+        attempt=commit.attempt,
+        shard=commit.shard,
+        outcome="committed",
+        started=started,
+        ended=commit.created,
+        cost=commit.cost,
+        host=commit.host,
+    )
+
+
+def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> LedgerEntry:
+    """The end of an attempt that left none, at a cost that nobody knows.
+
+    It is a guess, good once the shard is decided: whoever still runs the attempt may tell the truth.
+    """
+    return LedgerEntry(
+        attempt=start.attempt,
+        shard=start.shard,
+        outcome="lost",
+        cause=cause,
+        started=start.started,
+        ended=ended,
+    )
+
+
+def start_from_end(end: LedgerEntry) -> AttemptStart:
+    """The start record of an attempt as far as its end tells it."""
+    host = end.host.name if end.host else ""
+    return AttemptStart(attempt=end.attempt, shard=end.shard, started=end.started, host=host)
 
 
 def start_key(attempt: str) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from schemas.checking.commits import odd_cost, start_from
+from schemas.checking.commits import odd_cost
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import read
+from schemas.ledger import lost_end, start_from_end
 from schemas.quarantine import name_before
 from schemas.record_files import encode_record, now
 from schemas.run import Run
@@ -62,7 +63,8 @@ def _check_end(
         return
     noted = end.record
     if start.record is None:
-        yield curable(start.key, "account", start.problem, start_from(noted), noted.shard)
+        cure = Restore(encode_record(start_from_end(noted)))
+        yield curable(start.key, "account", start.problem, cure, noted.shard)
     if odd := odd_cost(noted.cost):
         mend = "Look at what wrote it: the record is as it was written"
         yield Finding(end.key, "account", odd, mend, noted.shard)
@@ -83,17 +85,9 @@ def _check_unfinished(
         yield Finding(start.key, "account", start.problem, _GONE)
     elif start.record.shard in committed or start.record.shard in quarantined:
         shard = start.record.shard
-        entry = LedgerEntry(
-            attempt=attempt,
-            shard=shard,
-            outcome="lost",
-            cause="it left no end, and its shard was decided without it",
-            started=start.record.started,
-            ended=now(),
-        )
         problem = "missing, though its shard is decided; what it cost is lost"
         books.without_account += 1
-        cure = Restore(encode_record(entry), is_guess=True)
+        cure = Restore(encode_record(lost_end(start.record, now())), is_guess=True)
         yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
     else:
         books.unfinished += 1

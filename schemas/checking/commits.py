@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import Read, compare, read
-from schemas.ledger import end_key, start_key
+from schemas.ledger import end_from_commit, end_key, start_from_end, start_key
 from schemas.record_files import encode_record
 from schemas.run import Run, commit_copy_key, commit_key
 from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
@@ -85,34 +85,20 @@ def check_account(run: Run, commit: Commit) -> list[Finding]:
             if ours != wanted:
                 problem = f"{field}: is not that of the attempt's commit"
     if problem:
-        entry = LedgerEntry(
-            attempt=commit.attempt,
-            shard=shard,
-            outcome="committed",
-            started=start.record.started if start.record else "",
-            ended=commit.created,
-            cost=commit.cost,
-            host=commit.host,
-        )
-        cure = Restore(encode_record(entry))
+        known = end_from_commit(commit, start.record.started if start.record else "")
+        cure = Restore(encode_record(known))
         findings.append(curable(end.key, "account", f"{problem}; it is known from the commit", cure, shard))
     problem = start.problem
     if start.record is not None and (start.record.attempt, start.record.shard) != (commit.attempt, shard):
         problem = "is not that of this attempt"
     if problem:
-        started = end.record.started if end.record else ""
-        cure = Restore(encode_record(_start(commit.attempt, shard, started, commit.host.name)))
+        known = end_from_commit(commit, end.record.started if end.record else "")
+        cure = Restore(encode_record(start_from_end(known)))
         findings.append(curable(start.key, "account", problem, cure, shard))
     if odd := odd_cost(commit.cost):
         mend = "Look at what wrote it: the record is as it was written"
         findings.append(Finding(commit_key(shard), "account", odd, mend, shard))
     return findings
-
-
-def start_from(end: LedgerEntry) -> Restore:
-    """The start record of an attempt as far as its end tells it."""
-    host = end.host.name if end.host else ""
-    return Restore(encode_record(_start(end.attempt, end.shard, end.started, host)))
 
 
 def odd_cost(cost: Cost | None) -> str:
@@ -127,10 +113,6 @@ def odd_cost(cost: Cost | None) -> str:
         if total > whole * (1 + _ROUNDING) + _ROUNDING_S:
             return f"cost.stage_{name}_s: the stages have {total:g} s, and the whole attempt {whole:g} s"
     return ""
-
-
-def _start(attempt: str, shard: int, started: str, host: str) -> AttemptStart:
-    return AttemptStart(attempt=attempt, shard=shard, started=started, host=host)
 
 
 def _says_committed(run: Run, attempt: str) -> bool:

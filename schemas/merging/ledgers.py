@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from schemas.ledger import end_key, start_key
+from schemas.ledger import LOST_CAUSE, end_from_commit, end_key, lost_end, start_key
 from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
 from schemas.run import commit_key
@@ -18,7 +18,7 @@ from schemas.run_records import AttemptStart, Commit, LedgerEntry
 from schemas.storage import Storage
 
 SPARE_CAUSE = "merged: this shard is held from another attempt"
-LOST_CAUSE = "merged: it left no end, and its shard was decided without it"
+GUESS_CAUSE = f"merged: {LOST_CAUSE}"  # of a guess made here, which gives way to one that was noted
 _AT_ONCE = 256  # attempts whose records are held
 
 
@@ -60,7 +60,7 @@ def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[Uni
                 yield UnitedAttempt(name, start, end)
                 continue
             if start is not None and not ends and (start.shard in union.kept or start.shard in given_up):
-                ends.append(_lost(start))
+                ends.append(lost_end(start, cause=GUESS_CAUSE))
             yield UnitedAttempt(name, start, min(ends, key=_account_first) if ends else None)
 
 
@@ -162,26 +162,13 @@ def _end_of_held(
         "stack": "",
         "cost": union.cost_of(holding, commit),
     }
-    bare = LedgerEntry(
-        attempt=holding.name,
-        shard=holding.shard,
-        outcome="committed",
-        started=start.started if start else "",
-        ended=commit.created,
-        host=commit.host,
-    )
     # What was worked out from the commit comes last: merging again must not prefer it to what was noted.
-    derived = bare.model_copy(update=truth)
+    named = {"attempt": holding.name, "shard": holding.shard}
+    derived = end_from_commit(commit, start.started if start else "").model_copy(update={**named, **truth})
     noted = [end.model_copy(update={**truth, "host": end.host or commit.host}) for end in ends]
     return min([*noted, derived], key=lambda end: (end == derived, encode_record(end)))
 
 
-def _lost(start: AttemptStart) -> LedgerEntry:
-    return LedgerEntry(
-        attempt=start.attempt, shard=start.shard, outcome="lost", cause=LOST_CAUSE, started=start.started
-    )
-
-
 def _account_first(end: LedgerEntry) -> tuple[bool, bool, bytes]:
     """Which of several ends of one attempt says most: one with its cost, and a guess only where all are."""
-    return end.cost is None, end.cause == LOST_CAUSE, encode_record(end)
+    return end.cost is None, end.cause == GUESS_CAUSE, encode_record(end)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cluster.books import RunBooks, close_lost_attempts
+from cluster.books import RunBooks
 from cluster.driver import Order, drive
 from cluster.guard import Meter, Note, guarded, obituary, read_note
 from cluster.inprocess import InProcessExecutor
@@ -17,7 +17,6 @@ from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary
 from cluster.task import JobCannotGoOn, Product
 from schemas.run import Run
-from schemas.run_records import Cost, LedgerEntry
 from tests.cluster.simulated import Heard
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import make_run, write
@@ -78,38 +77,6 @@ def test_a_shard_that_another_driver_committed_is_superseded(tmp_path: Path) -> 
     )
     assert summary.tally.committed == 4 and summary.tally.superseded == 1 and summary.end == "complete"
     assert run.commit_of(2).attempt == "of-another-driver"
-
-
-def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", shards=())
-    for attempt, shard in (("lost-one", 0), ("won-one", 1), ("orphan", 2)):
-        run.ledger.start(attempt, shard)
-    run.commit(write(run, 0, "by-the-next-driver"))
-    run.commit(write(run, 1, "won-one"))
-    # Nobody knows yet whether the orphan will reach its commit.
-    assert close_lost_attempts(run) == 2 and close_lost_attempts(run) == 0
-    assert [start.attempt for start in run.ledger.unfinished()] == ["orphan"]
-    run.commit(write(run, 2, "orphan"))
-    assert close_lost_attempts(run) == 1
-    ended = {e.attempt: e for e in run.ledger.ends()}
-    assert {name: e.outcome for name, e in ended.items()} == {
-        "lost-one": "lost", "won-one": "committed", "orphan": "committed",
-    }  # fmt: skip
-    assert ended["orphan"].cost == run.commit_of(2).cost and ended["lost-one"].cost is None
-
-
-def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Path) -> None:
-    """Two drivers at once: the first to end closes what the other still has in flight."""
-    run = make_run(tmp_path / "run", shards=())
-    run.ledger.start("slow", 0)
-    run.commit(write(run, 0, "fast"))
-    assert close_lost_attempts(run) == 1
-    books, cost = RunBooks(run), Cost(wall_s=7.0, cpu_s=6.0)
-    for seconds in (7.0, 9.0):  # an account stands, whoever comes later
-        told = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=seconds, cpu_s=6))
-        books.close(told)
-    (entry,) = run.ledger.ends()
-    assert (entry.outcome, entry.cost) == ("superseded", cost)
 
 
 def test_the_second_interrupt_breaks_into_the_running_shard(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from schemas.fields import SCHEMAS
 from schemas.lineage import LINEAGE, Lineage, lineage_summary
 from schemas.merged import MERGED, find_scene, open_runs, part_folder, wanted
 from schemas.merging import Result, carry_out, plan_merge
-from schemas.merging.ledgers import LOST_CAUSE, SPARE_CAUSE
+from schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from schemas.record_files import read_record
 from schemas.run import Run
 from schemas.run_records import LedgerEntry, QuarantineRecord
@@ -161,7 +161,7 @@ def test_what_was_known_of_an_attempt_grows_with_its_source(tmp_path: Path):
     out = Run.open(tmp_path / "out")
     late = out.ledger.end_of("late")
     assert late is not None
-    assert (late.outcome, late.cause, late.cost) == ("lost", LOST_CAUSE, None)
+    assert (late.outcome, late.cause, late.cost) == ("lost", GUESS_CAUSE, None)
     cost = run.commit_of(0).cost
     run.ledger.end(LedgerEntry(attempt="late", shard=1, outcome="superseded", cost=cost))
     merge(tmp_path, "ab")
