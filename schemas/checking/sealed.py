@@ -13,7 +13,7 @@ from schemas.errors import InputError
 from schemas.record_files import MAX_RECORD_BYTES
 from schemas.run import Run, shard_folder
 from schemas.run_records import Commit
-from schemas.sealing.contents import MOST_SHARDS, Contents, SealedRun, SealedShard
+from schemas.sealing.contents import MOST_SHARDS, Contents, RowsDigest, SealedRun, SealedShard
 from schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
 from schemas.shard_files import TABLES, chunk_key, rows_per_shard
 from schemas.storage import Storage
@@ -37,7 +37,7 @@ class SealedSlice:
 class SealedTally:
     """What the store must say of itself, gathered shard by shard in their order."""
 
-    digest: object = field(default_factory=sha256)
+    digest: RowsDigest = field(default_factory=RowsDigest)
     shards: list[SealedShard] = field(default_factory=list[SealedShard])
     lost: int = 0  # shards whose commit is gone
     unknown: int = 0  # shards of which there is nothing at all
@@ -49,10 +49,7 @@ class SealedTally:
             return
         scenes, samples = slice_.wanted(shard, run)
         self.shards.append(SealedShard(shard_folder(shard, commit.attempt), scenes, samples))
-        update = self.digest.update  # type: ignore[attr-defined]
-        update(f"{run.manifest.spec_hash} {shard}\n".encode())
-        for entry in sorted(commit.files, key=lambda e: e.path):
-            update(f"{entry.path} {entry.sha256}\n".encode())
+        self.digest.add(run.manifest.spec_hash, commit)
 
 
 def read_root(
@@ -176,8 +173,8 @@ def check_store(
         if (part := slices.get(run.manifest.spec_hash)) is not None
     )
     first = sealed[0].run
-    digest = tally.digest.hexdigest()  # type: ignore[attr-defined]
-    contents = Contents(place, sealed, tuple(tally.shards), (digest,), first.schema, first.layout)
+    digests = (tally.digest.hexdigest(),)
+    contents = Contents(place, sealed, tuple(tally.shards), digests, first.schema, first.layout)
     for path, data in sealed_metadata(contents).items():
         key = f"{SEALED}/{path}"
         try:

@@ -40,6 +40,23 @@ class SealedRun:
     missing_shards: tuple[int, ...]
 
 
+class RowsDigest:
+    """The digest of a store's rows: whose shards they are, and which files hold them, in their order."""
+
+    def __init__(self) -> None:
+        self._digest = sha256()
+
+    def add(self, spec_hash: str, commit: Commit) -> None:
+        """Add the shard of a commit, by a run of this specification."""
+        self._digest.update(f"{spec_hash} {commit.shard}\n".encode())
+        for entry in sorted(commit.files, key=lambda e: e.path):
+            self._digest.update(f"{entry.path} {entry.sha256}\n".encode())
+
+    def hexdigest(self) -> str:
+        """The digest of what was added so far."""
+        return self._digest.hexdigest()
+
+
 @dataclass(frozen=True)
 class Contents:
     """The rows of a store. `digests[k]` is over the bytes of the files of its first k shards."""
@@ -90,7 +107,7 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
         _refuse_other_arrays(first, run)
     sealed: list[SealedRun] = []
     shards: list[SealedShard] = []
-    digest = sha256()
+    digest = RowsDigest()
     digests = [digest.hexdigest()]
     for run in runs:
         n, done = run.n, list[int]()
@@ -103,9 +120,7 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
             shards.append(
                 SealedShard(below + shard_folder(commit.shard, commit.attempt), commit.scenes, commit.samples)
             )
-            digest.update(f"{run.manifest.spec_hash} {commit.shard}\n".encode())
-            for entry in sorted(commit.files, key=lambda e: e.path):
-                digest.update(f"{entry.path} {entry.sha256}\n".encode())
+            digest.add(run.manifest.spec_hash, commit)
             digests.append(digest.hexdigest())
         absent = ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(done))
         if len(absent) > _MOST_MISSING:
