@@ -1,0 +1,90 @@
+"""What every model, baseline and metric is given: clouds, the robots that look at them, and candidates.
+
+Three tables joined by rows, so that a cloud is held once whatever the number of robots and candidates:
+a candidate names its robot, a robot its cloud. Arrays are numpy's as they come from a store, or torch's
+on a model's device (`to_torch`); shapes, units and frames are the same.
+
+Frame "target": world axes (z up) with the origin at the target's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+A = TypeVar("A")  # np.ndarray or torch.Tensor
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Clouds(Generic[A]):
+    """S observed scenes of P points each, of which the first `n_points` count.
+
+    The first 512 (`observation.n_farthest`) points of a stored cloud are in farthest-point order, so
+    that any prefix of them is a farthest-point sample; the rest are in random order.
+    """
+
+    points_m: A  # (S, P, 3) float32, target frame
+    rgb: A  # (S, P, 3) uint8
+    target_mask: A  # (S, P) bool
+    n_points: A  # (S,) int64
+    target_height_m: A  # (S,) float32, of the target's centre above the floor
+    target_radius_m: A  # (S,) float32, of the sphere around its centre that holds the target
+
+    def __len__(self) -> int:
+        return len(self.n_points)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Robots(Generic[A]):
+    """R robots, each with the cloud that it is given."""
+
+    cloud_row: A  # (R,) int64, into Clouds
+    camera_height_m: A  # (R,) float32, of the robot's own camera above the floor
+    base_height_m: A  # (R,) float32, of the arm's mount above the floor
+    arm_reach_m: A  # (R,) float32, d_arm
+
+    def __len__(self) -> int:
+        return len(self.cloud_row)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates(Generic[A]):
+    """N base positions, each of one robot."""
+
+    robot_row: A  # (N,) int64, into Robots
+    base_xy_m: A  # (N, 2) float32, target frame
+
+    def __len__(self) -> int:
+        return len(self.robot_row)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch(Generic[A]):
+    """Candidates with their labels. `extra` holds further columns of the store that were asked for.
+
+    Columns of samples have N rows, columns of scenes S rows; text stays numpy.
+    """
+
+    clouds: Clouds[A]
+    robots: Robots[A]
+    candidates: Candidates[A]
+    label: A  # (N,) int64, 0 or 1
+    sample_id: Array  # (N, 16) uint8, always numpy: names, not numbers
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.sample_id)
+
+
+def mount_distance_m(
+    clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]
+) -> npt.NDArray[np.float64]:
+    """Distance (N,) from each candidate's arm mount (x, y, base height) to the target's centre."""
+    planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64), axis=1)
+    rise_m = clouds.target_height_m[robots.cloud_row] - robots.base_height_m.astype(np.float64)
+    return np.hypot(planar_m, rise_m[candidates.robot_row])
