@@ -135,6 +135,7 @@ def _write(
     """Put the files whose bytes are new and adopt the others; the commit's entries, and bytes put."""
     old, new = shard_folder(before.shard, before.attempt), shard_folder(before.shard, attempt)
     entries: list[FileEntry] = []
+    kept: list[tuple[str, str]] = []
     fresh: dict[str, bytes] = {}
     for entry in before.files:
         data = files.get(entry.path)
@@ -143,9 +144,12 @@ def _write(
         if data is not None and made != entry:
             fresh[f"{new}/{entry.path}"] = data
         else:
-            run.storage.adopt(source.storage, f"{old}/{entry.path}", f"{new}/{entry.path}")
-    run.storage.put_many(fresh)
-    run.storage.sync(f"{new}/{entry.path}" for entry in entries)
+            kept.append((f"{old}/{entry.path}", f"{new}/{entry.path}"))
+    largest = max((entry.size for entry in before.files), default=0)
+    with run.nothing_left_behind(before.shard, attempt):
+        run.storage.adopt_many(source.storage, kept, largest)
+        run.storage.put_many(fresh)
+        run.storage.sync(f"{new}/{entry.path}" for entry in entries)
     return tuple(entries), sum(map(len, fresh.values()))
 
 

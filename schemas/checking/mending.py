@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 
+from schemas.at_once import in_order
 from schemas.checking.finding import Finding, Remake, Reseal, Restore
 from schemas.checking.place import Checked, check_place
 from schemas.checking.roots import open_roots
@@ -244,10 +245,9 @@ def _remade(
         yield from ((*one, make(one)) for one in shards)
         return
     with ThreadPoolExecutor(workers) as pool:
-        for start in range(0, len(shards), workers):  # so many results in memory, and no more
-            group = shards[start : start + workers]
-            for one, files in zip(group, pool.map(make, group), strict=True):
-                yield (*one, files)
+        # So many results in memory, and no more.
+        for one, files in zip(shards, in_order(pool, workers, make, shards), strict=True):
+            yield (*one, files)
 
 
 def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TypeVar
 
+from schemas.at_once import in_order
 from schemas.checking.accounts import Books, check_quarantine, check_rest
 from schemas.checking.commits import check_account, check_commit
 from schemas.checking.finding import Finding
@@ -28,9 +27,6 @@ from schemas.storage import Storage
 
 _THREADS = 4  # hashing and unpacking leave Python's lock
 _REMOTE_THREADS = 16  # requests wait for each other's answers
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass
@@ -98,7 +94,7 @@ def check_place(
             slice_ = slices.get(run.manifest.spec_hash)
             subject = _Subject(place, run, prefix, form_of(run), slice_)
             committed: dict[int, str] = {}
-            for looked in _in_order(pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards):
+            for looked in in_order(pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards):
                 yield from looked.findings
                 if slice_ is not None and looked.shard in slice_.positions:
                     tally.add(run, slice_, looked.shard, looked.commit, bool(looked.findings))
@@ -160,20 +156,3 @@ def _count(checked: Checked, commit: Commit) -> None:
     checked.samples += commit.samples
     checked.books.attempts += 1
     checked.books.committed_wall_s += commit.cost.wall_s
-
-
-def _in_order(
-    pool: ThreadPoolExecutor, most: int, function: Callable[[T], R], items: Iterable[T]
-) -> Iterator[R]:
-    """The function's results in the order of the items, with so many at most that are not yet taken."""
-    waiting: deque[Future[R]] = deque()
-    try:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= most:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()

@@ -5,11 +5,9 @@ Every step skips what is there, so that a merge that was killed is finished by d
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Container, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import groupby
 
 from schemas.errors import InputError
 from schemas.fields import REDRAW_CAUSES
@@ -26,7 +24,6 @@ from schemas.shard_files import encode_shard
 from schemas.storage import Storage
 
 Tick = Callable[[], None]
-_AT_ONCE = 16  # files asked of a server at one time
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,19 +97,12 @@ def _link(union: Union, run: Run, holding: Holding) -> bool:
     source, commit = union.runs[holding.source], union.commit_of(holding)
     source.check_files(commit)
     folder = shard_folder(holding.shard, holding.attempt)
-    sizes = {f"{folder}/{entry.path}": entry.size for entry in commit.files}
-
-    def adopt(key: str) -> None:
-        run.storage.adopt(source.storage, key, key, limit_bytes=sizes[key])
-
+    keys = [f"{folder}/{entry.path}" for entry in commit.files]
+    largest = max((entry.size for entry in commit.files), default=0)
     # Another merge may be at this very attempt, and have committed it.
     with run.nothing_left_behind(holding.shard, holding.attempt):
-        if run.storage.folder is None or source.storage.folder is None:
-            with ThreadPoolExecutor(_AT_ONCE) as pool:
-                deque(pool.map(adopt, sizes), maxlen=0)
-        else:
-            deque(map(adopt, sizes), maxlen=0)
-        run.storage.sync(sizes)
+        run.storage.adopt_many(source.storage, zip(keys, keys, strict=True), largest)
+        run.storage.sync(keys)
     return run.commit(commit)
 
 
@@ -169,12 +159,10 @@ def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) 
             if record is not None:
                 _put(run.storage, key, encode_record(record), key in there)
 
-    count, attempts = 0, united_attempts(union, given_up)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        while some := list(islice(attempts, 16 * _AT_ONCE)):
-            for _ in (map if run.storage.folder is not None else pool.map)(put, some):
-                count += 1
-                tick()
+    count = 0
+    for _ in run.storage.in_order(put, united_attempts(union, given_up)):
+        count += 1
+        tick()
     return count
 
 

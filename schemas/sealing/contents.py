@@ -143,11 +143,7 @@ def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
         run.check_files(commit)
         return commit
 
-    if run.storage.folder is not None:
-        return map(check, commits)
-    from schemas.storage.remote_objects import in_order
-
-    return in_order(check, commits)
+    return run.storage.in_order(check, commits)
 
 
 def _refuse_other_arrays(first: Run, run: Run) -> None:

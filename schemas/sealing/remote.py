@@ -13,7 +13,6 @@ from schemas.sealing.contents import Contents
 from schemas.sealing.metadata import ROOT, SEALED, sealed_root
 from schemas.shard_files import TABLES
 from schemas.storage import Storage
-from schemas.storage.remote_objects import in_order
 
 
 def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
@@ -67,6 +66,5 @@ def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
                 yield source, f"{folder}/{name}"
             there.discard(name)
 
-    for _ in in_order(lambda pair: place.link_or_copy(*pair), missing()):
-        pass
+    place.adopt_many(place, missing())
     return [f"{folder}/{name}" for name in sorted(there)]

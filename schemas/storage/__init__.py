@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from schemas.at_once import in_order
 from schemas.errors import InputError
 from schemas.storage.errors import FileTooLarge, storage_error
 from schemas.storage.local_files import LocalFiles
@@ -25,7 +29,10 @@ __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 # Names without end parts: no way up, no way to the root, nothing that a terminal would act on.
 _KEY = re.compile(r"(?!\.{0,2}(?:/|\Z))(?:[^/\x00-\x1f\x7f\\]+(?:/(?!\.{0,2}(?:/|\Z))|\Z))+")
 
+_AT_ONCE = 16  # requests under way in this process
+
 Result = TypeVar("Result")
+Item = TypeVar("Item")
 
 
 class Storage:
@@ -63,11 +70,7 @@ class Storage:
         """Write many files whole, as `put` does each; remote storage takes several at once."""
         for key in files:
             _checked(self.url, key)
-        if isinstance(self._files, LocalFiles):
-            for key, data in files.items():
-                self.put(key, data)
-        else:
-            self._files.put_many(files)
+        _exhaust(self.in_order(lambda item: self.put(*item), files.items()))
 
     def put_new(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the key exists; False when it does with other bytes.
@@ -94,9 +97,17 @@ class Storage:
 
         Remote storage reads several at once; at most some tens of files are held.
         """
+        return self.in_order(lambda key: (key, self.get(key, limit_bytes)), keys)
+
+    def in_order(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """What `do`, which asks this storage, gives for each item, in their order; the first failure ends it.
+
+        Remote storage is asked several things at once, so that `do` must use none of the verbs for many.
+        None of them is under way any more when the iterator has ended.
+        """
         if isinstance(self._files, LocalFiles):
-            return ((key, self.get(key, limit_bytes)) for key in keys)
-        return self._files.get_many((_checked(self.url, key) for key in keys), limit_bytes)
+            return map(do, items)
+        return in_order(_threads(), _AT_ONCE, do, items)
 
     def exists(self, key: str) -> bool:
         """Whether the file exists."""
@@ -153,6 +164,14 @@ class Storage:
         except FileNotFoundError as e:
             mend = "Restore the file from a copy"
             raise InputError(f"{source.url}/{source_key}", "", "no such file", mend) from e
+
+    def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
+        """Take over many files of another storage, given as (its key, key here), as `adopt` does each.
+
+        Where one of the two is remote, several are under way at once.
+        """
+        asked = source if isinstance(self._files, LocalFiles) else self
+        _exhaust(asked.in_order(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
 
     def sync(self, keys: Iterable[str]) -> None:
         """Make files and the folders that name them survive a power cut.
@@ -240,3 +259,12 @@ def _checked(url: str, key: str) -> str:
         problem = "not the name of a file below the root"
         raise InputError(f"{url}/{key!r}"[:300], "", problem, "Remove what names it")
     return key
+
+
+def _exhaust(results: Iterator[None]) -> None:
+    deque(results, maxlen=0)
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="store")

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
 from datetime import timedelta
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -24,14 +23,12 @@ from schemas.storage.errors import StoreTrouble, store_trouble, too_large
 from schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
 from schemas.storage.stored_file import StoredFile
 
-AT_ONCE = 16  # requests under way for one call
 PATIENCE = 1.5  # timeouts for which a request is repeated, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
 _DELETED_AT_ONCE = 1000  # what S3 takes in one request
 _FAILURES = (BaseError, OSError, ValueError)
 
 Result = TypeVar("Result")
-Item = TypeVar("Item")
 
 
 class RemoteObjects:
@@ -137,15 +134,6 @@ class RemoteObjects:
             raise FileNotFoundError(source_key)
         self.put(key, data)
 
-    def put_many(self, files: Mapping[str, bytes]) -> None:
-        """Write many objects whole, several at once."""
-        for _ in in_order(lambda item: self.put(*item), files.items()):
-            pass
-
-    def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
-        """(key, bytes) of many objects in the order of the keys, read several at once."""
-        return in_order(lambda key: (key, self.get(key, limit_bytes)), keys)
-
     @cached_property
     def _bucket(self) -> Any:
         return self._open("")
@@ -185,28 +173,9 @@ class RemoteObjects:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
 
-def in_order(do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """What `do` gives for each item, in their order, several at a time; the first failure ends it."""
-    left = iter(items)
-    under_way: list[Future[Result]] = []
-    try:
-        under_way += [_threads().submit(do, item) for item in islice(left, AT_ONCE)]
-        while under_way:
-            yield under_way.pop(0).result()
-            under_way += [_threads().submit(do, item) for item in islice(left, 1)]
-    finally:
-        for future in under_way:
-            future.cancel()
-
-
 class _Passing(OSError):
     """Trouble that the client does not take for any."""
 
     def __init__(self, problem: str) -> None:
         self.trouble = StoreTrouble(problem, "Submit again when the store has recovered", passing=True)
         super().__init__(problem)
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(AT_ONCE, thread_name_prefix="store")

@@ -12,6 +12,7 @@ from datagen import cli
 from schemas.merged import open_runs
 from schemas.record_files import encode_record
 from schemas.run import Run, shard_folder
+from schemas.run_records import Commit
 from tests.datagen.forged import forge
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
@@ -248,6 +249,33 @@ def test_a_damaged_shard_is_given_up_and_the_others_are_labelled(
     run = Run.open(out)
     assert run.committed() == set(range(SCENES)) - {3} and run.quarantined() == {3}
     assert "damaged" in run.quarantine_records()[0].causes[-1]
+
+
+@pytest.mark.parametrize("where", ["here", "s3"])
+def test_a_file_that_goes_while_it_is_taken_over_leaves_nothing_half_done(
+    where: str,
+    source: Path,
+    bucket: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torn = tmp_path / "torn"
+    shutil.copytree(source, torn)
+    check = Run.check_files
+
+    def and_then_it_goes(run: Run, commit: Commit) -> None:
+        check(run, commit)
+        if commit.shard == 3 and run.storage.folder == torn:
+            (torn / shard_folder(3, commit.attempt) / "rgb/c.0.0.0").unlink()
+
+    out = str(tmp_path / "run") if where == "here" else f"{bucket}/run"
+    monkeypatch.setattr(Run, "check_files", and_then_it_goes)
+    assert cli.run(["relabel", str(torn), "--out", out, *RULE]) == 1
+    run = Run.open(out)
+    assert run.committed() == set(range(SCENES)) - {3}
+    assert "rgb/c.0.0.0: no such file" in run.quarantine_records()[0].causes[0]
+    assert list(run.storage.list("shards/000003")) == []
 
 
 def test_labels_of_another_version_of_the_code_are_not_mixed(

@@ -55,7 +55,7 @@ class Recorder:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, fail_at: int | None = None) -> None:
         self.changes, self.copied = 0, list[str]()
         self._fail_at = fail_at
-        for name in ("put", "put_many", "delete", "link_or_copy"):
+        for name in ("put", "put_many", "delete", "adopt"):
             monkeypatch.setattr(Storage, name, self._around(name, getattr(Storage, name)))
 
     def _around(self, name, plain):
@@ -63,8 +63,8 @@ class Recorder:
             self.changes += 1
             if self.changes == self._fail_at:
                 raise KeyboardInterrupt
-            if name == "link_or_copy":
-                self.copied.append(arguments[1])
+            if name == "adopt":
+                self.copied.append(arguments[2])
             return plain(storage, *arguments)
 
         return around

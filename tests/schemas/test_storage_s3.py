@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import pytest
 from obstore.exceptions import GenericError
@@ -89,6 +90,31 @@ def test_a_file_is_adopted_from_wherever_it_lies(bucket: str, tmp_path):
             ours.adopt(theirs, "none", "y")
     with pytest.raises(InputError, match="more than the 2"):
         a.adopt(local, "x", "y", limit_bytes=2)
+
+
+@pytest.mark.parametrize(("to", "of"), [("here", "disk"), ("here", "s3"), ("s3", "here"), ("s3", "s3")])
+def test_many_files_are_adopted_or_the_one_that_cannot_be_is_named(
+    to: str, of: str, bucket: str, tmp_path: Path
+):
+    ours, theirs = (
+        open_storage(f"{bucket}/{side}" if kind == "s3" else tmp_path / side)
+        for side, kind in (("ours", to), ("theirs", of))
+    )
+    files = {f"k/{i:02d}": b"%d" % i for i in range(40)}
+    theirs.put_many(files)
+    ours.adopt_many(theirs, ((key, f"taken/{key}") for key in files), limit_bytes=2)
+    assert dict(ours.get_many((f"taken/{key}" for key in files), 2)) == {
+        f"taken/{key}": data for key, data in files.items()
+    }
+    pairs = [(key, f"half/{key}") for key in files]
+    pairs[17] = ("k/none", "half/none")
+    with pytest.raises(InputError, match="k/none: no such file"):
+        ours.adopt_many(theirs, pairs)
+    there = {file.key for file in ours.list("half")}  # and no more to come
+    assert {target for _, target in pairs[:17]} <= there and len(there) < 39
+    ours.adopt_many(theirs, [])
+    with pytest.raises(InputError, match="not the name of a file below the root"):
+        ours.adopt_many(theirs, [("k/00", "../out")])
 
 
 def test_of_racing_writers_exactly_one_wins(behind: Behind):

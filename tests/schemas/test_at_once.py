@@ -1,0 +1,66 @@
+"""Several things at once: in order, so many at a time, and over when they are over."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.at_once import in_order
+
+
+@given(st.integers(0, 30), st.integers(1, 5), st.integers(1, 9))
+def test_results_come_in_order_and_items_are_taken_as_they_are_needed(
+    n: int, threads: int, most: int
+) -> None:
+    taken, given_back = 0, 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for i in range(n):
+            taken += 1
+            assert taken - given_back <= most
+            yield i
+
+    with ThreadPoolExecutor(threads) as pool:
+        for result in in_order(pool, most, lambda i: i * i, items()):
+            assert result == given_back**2
+            given_back += 1
+    assert (taken, given_back) == (n, n)
+
+
+@pytest.mark.parametrize("by", ["failure", "leaving"])
+def test_nothing_is_under_way_when_it_has_ended(by: str) -> None:
+    begun, ended = set[int](), set[int]()
+    second = threading.Event()
+
+    def do(i: int) -> int:
+        begun.add(i)
+        if i == 0:
+            second.wait()
+            if by == "failure":
+                raise ValueError("the first")
+        else:
+            second.set()
+            time.sleep(0.05)
+        ended.add(i)
+        return i
+
+    with ThreadPoolExecutor(2) as pool:
+        results = in_order(pool, 4, do, range(9))
+        if by == "failure":
+            with pytest.raises(ValueError, match="the first"):
+                next(results)
+            assert begun - ended == {0}
+        else:
+            assert next(results) == 0
+            results.close()
+            assert begun == ended
+        before = set(begun)
+        assert list(results) == [] and 1 in before
+    assert begun == before <= {0, 1, 2}
