@@ -91,6 +91,11 @@ def edited(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
     return edit
 
 
+def file_at_the_root(run: Path) -> None:
+    secret = str(run.parent / "outside" / "secret")
+    edited(lambda commit: commit["files"][0].update(path=secret))(run)
+
+
 def with_crc(packed: bytes) -> bytes:
     return packed + google_crc32c.value(packed).to_bytes(4, "little")
 
@@ -216,8 +221,8 @@ HOSTILE: dict[str, Callable[[Path], None]] = {
     "pickles": committed("label/zarr.json", metadata(lambda m: m["codecs"].insert(0, {"name": "pickle"}))),
     "other codecs": committed("label/zarr.json", metadata(lambda m: m.update(codecs=[{"name": "gzip"}]))),
     "deep metadata": committed("label/zarr.json", lambda data: b"[" * 200_000),
-    "file outside": edited(lambda c: c["files"][0].update(path="../../../outside/secret")),
-    "file at the root": edited(lambda c: c["files"][0].update(path="/etc/passwd")),
+    "file outside": edited(lambda c: c["files"][0].update(path="../../../../outside/secret")),
+    "file at the root": file_at_the_root,
     "attempt outside": edited(lambda c: c.update(attempt="../../../outside")),
     "20,000 files": edited(
         lambda c: c.update(files=[{"path": f"x/{i}", "size": 0, "sha256": "0" * 64} for i in range(20_000)])
