@@ -12,7 +12,7 @@ DEMO := build/demo
 help:
 	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
 	@echo "make test    format check, lint, types, layers, tests"
-	@echo "make faults  the full fault campaigns, as tables (about half an hour)"
+	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
 	@echo "make docs    rewrite docs/data-format.md and docs/specification.md from the schemas"
