@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import Literal, get_args
 
 from cluster.task import AttemptReport
 from schemas.run_records import Outcome
 
-End = Literal["complete", "interrupted", "failed", "aborted"]
+End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
 _NAMED = 20  # quarantined shards that the summary lists by number
 
 
@@ -88,3 +88,14 @@ class JobSummary:
     def exit_code(self) -> int:
         """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
         return {"complete": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
+
+    def plus(self, later: JobSummary) -> JobSummary:
+        """Both as one job over several runs, in the worse end, by the cause of the first that ended so."""
+        worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))
+        tally = self.tally.plus(later.tally)
+        return JobSummary(worst.end, worst.cause, tally, self.elapsed_s + later.elapsed_s)
+
+
+def no_work() -> JobSummary:
+    """How a job ends that has nothing to do."""
+    return JobSummary("complete", "", Tally(0), 0.0)

@@ -63,13 +63,11 @@ def relabel(
 
 
 def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
-    labels = sum(summary.tally.labels for summary in done.summaries)
-    positives = sum(summary.tally.positives for summary in done.summaries)
-    remaining = sum(summary.remaining for summary in done.summaries)
+    summary, labels, positives = done.summary, done.summary.tally.labels, done.summary.tally.positives
     report = {
         "run": place.url,
         "source": run,
-        "end": done.end,
+        "end": summary.end,
         "spec_hashes": [r.manifest.spec_hash for r in done.runs],
         "labels": labels,
         "wanted": sum(r.n for r in done.runs),
@@ -92,12 +90,12 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
         if done.absent:
             absent = counted(done.absent, "shard")
             rows.append(("to come", f"{absent} that {run} has not: then relabel again"))
-        print_rows(f"{done.end}: {out}", rows)
-    causes = [s.cause for s in done.summaries if s.end == "aborted"]
-    if causes:
-        raise InputError(out, "", f"cannot go on: {causes[0]}", f"Then again: {again}")
-    if done.end == "failed":
+        print_rows(f"{summary.end}: {out}", rows)
+    if summary.end == "aborted":
+        raise InputError(out, "", f"cannot go on: {summary.cause}", f"Then again: {again}")
+    if summary.end == "failed":
         sys.stderr.write(f"error: {out}: too many shards failed. See: datagen status {shlex.quote(out)}\n")
-    if done.end == "interrupted":
-        sys.stderr.write(f"interrupted with {counted(remaining, 'shard')} to go. Go on with:\n  {again}\n")
-    return max(summary.exit_code for summary in done.summaries)
+    if summary.end == "interrupted":
+        left = counted(summary.remaining, "shard")
+        sys.stderr.write(f"interrupted with {left} to go. Go on with:\n  {again}\n")
+    return summary.exit_code

@@ -22,7 +22,7 @@ from cluster.progress import progress
 from cluster.ray_cluster import RaySettings, ray_cluster
 from cluster.ray_executor import RayExecutor
 from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary, Tally
+from cluster.tally import JobSummary, Tally, no_work
 from cluster.task import ShardTask
 from cluster.watch import Together, Watch
 from datagen.console.printing import counted, listed, print_rows, seconds
@@ -68,7 +68,7 @@ def carry_out(plan: JobPlan) -> int:
     if not _count_missing(plan):
         for work in plan.works:
             close_lost_attempts(work.run)
-        return _finish(plan, _judged(plan, JobSummary("complete", "", Tally(0), 0.0)))
+        return _finish(plan, _judged(plan, no_work()))
     board = open_board(plan)
     try:
         summary = _judged(plan, make_missing(plan, board))
@@ -116,7 +116,7 @@ def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
     missing = [work.run.missing() for work in plan.works]
     placing, stop = plan.placing, StopRequest()
     policy = Policy(max_quarantined_share=placing.max_quarantined)
-    whole = JobSummary("complete", "", Tally(0), 0.0)
+    whole = no_work()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
         executor = _executor(placing, sum(map(len, missing)), stack)
@@ -125,7 +125,7 @@ def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
             if whole.end in ("interrupted", "aborted"):
                 whole = replace(whole, tally=whole.tally.plus(Tally(len(shards))))
             elif shards:
-                whole = _together(whole, _drive(work, shards, executor, policy, board, stop, placing, notes))
+                whole = whole.plus(_drive(work, shards, executor, policy, board, stop, placing, notes))
                 board.add(whole.tally)
     for work in plan.works:
         # What a killed driver left open is closed last: its workers may outlive it and still commit.
@@ -168,13 +168,6 @@ def _drive(
     with progress(per_shard, len(shards), done, True if placing.json else None) as display:
         events = Together([display, Watch(board, stop, per_shard)])
         return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
-
-
-def _together(before: JobSummary, summary: JobSummary) -> JobSummary:
-    """The summary of both, in the end that is worse."""
-    worst = max(before, summary, key=lambda s: ("complete", "failed", "interrupted", "aborted").index(s.end))
-    tally = before.tally.plus(summary.tally)
-    return JobSummary(worst.end, worst.cause, tally, before.elapsed_s + summary.elapsed_s)
 
 
 def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:

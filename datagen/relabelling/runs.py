@@ -16,7 +16,7 @@ from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy
 from cluster.progress import progress
 from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary
+from cluster.tally import JobSummary, no_work
 from cluster.task import Product
 from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
 from datagen.specifying.manifest import manifest_of
@@ -39,15 +39,9 @@ class Relabelled:
     """What a call did, over all runs of the place."""
 
     runs: list[Run] = field(default_factory=list)
-    summaries: list[JobSummary] = field(default_factory=list)
+    summary: JobSummary = field(default_factory=no_work)
     flips: Flips = field(default_factory=Flips)
     absent: int = 0  # planned shards that the source has not
-
-    @property
-    def end(self) -> str:
-        """How it ended: as the worst of its runs."""
-        order = ("complete", "failed", "interrupted", "aborted")
-        return max((s.end for s in self.summaries), key=order.index)
 
 
 def relabelled_specification(
@@ -109,8 +103,8 @@ def relabel_all(
             planned = run.missing()
             missing = planned.within(ShardRanges.of(source.committed()))
             done.absent += len(planned) - len(missing)
-            done.summaries.append(_relabel_run(run, source, missing, stop, done.flips, json))
-    if done.end in ("complete", "failed") and any(run.committed() for run in done.runs):
+            done.summary = done.summary.plus(_relabel_run(run, source, missing, stop, done.flips, json))
+    if done.summary.end in ("complete", "failed") and any(run.committed() for run in done.runs):
         seal(place)
     return done
 

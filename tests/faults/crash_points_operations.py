@@ -274,8 +274,8 @@ def _relabel(folder: Path) -> None:
     source = Run.open(folder / "a")
     spec = relabelled_specification(source, {"heuristic.tau": 0.5})
     done = relabel_all(open_storage(folder / "out"), [source], [spec], json=True)
-    if done.end != "complete":
-        raise InputError(folder / "out", "", done.summaries[0].cause, "Again")  # as the command does
+    if done.summary.end != "complete":
+        raise InputError(folder / "out", "", done.summary.cause, "Again")  # as the command does
 
 
 OPERATIONS = (

@@ -51,7 +51,7 @@ def relabelled(source: Path, out: Path, rule: dict[str, Any]) -> Run:
     run = Run.open(source)
     spec = relabelled_specification(run, {f"heuristic.{name}": value for name, value in rule.items()})
     done = relabel_all(open_storage(out), [run], [spec])
-    assert done.end == "complete"
+    assert done.summary.end == "complete"
     return done.runs[0]
 
 
