@@ -28,6 +28,7 @@ n_farthest = 64
 window_px = 24
 """
 PER_SCENE = 8
+HERE = ("--workers", "0")  # in the calling process
 
 
 def submit_arguments(

@@ -6,6 +6,22 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults.damage_campaign import copy_run
+from tests.small_runs import PER_SCENE, make_small_run
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three scenes in as many shards. Tests only read it."""
+    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 3 * PER_SCENE)
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """The finished run, or the one of that name in the test's file, to be changed; its links are kept."""
+    copy_run(finished, tmp_path / "run")
+    return tmp_path / "run"
+
 
 @pytest.fixture
 def places(tmp_path: Path) -> dict[str, Path]:

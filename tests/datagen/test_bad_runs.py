@@ -19,19 +19,6 @@ from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two scenes. Tests only read it."""
-    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 2 * PER_SCENE)
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """The finished run, to be damaged."""
-    shutil.copytree(finished, tmp_path / "run")
-    return tmp_path / "run"
-
-
 @pytest.mark.parametrize("verb", ["status", "audit", "show"])
 @pytest.mark.parametrize("name", ["missing", "empty", "file", "foreign"])
 def test_a_place_that_is_no_run(
@@ -46,7 +33,7 @@ def test_a_place_that_is_no_run(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--scene", "2", "--out", "{tmp}/a.png"], ["--scene", "2", "0 to 1"]),
+        (["--scene", "3", "--out", "{tmp}/a.png"], ["--scene", "3", "0 to 2"]),
         (["--scene", "-1", "--out", "{tmp}/a.png"], ["--scene", "-1"]),
         (["--scene", "first", "--out", "{tmp}/a.png"], ["--scene", "first"]),
         (["--scene", "9" * 30, "--out", "{tmp}/a.png"], ["--scene"]),
@@ -130,7 +117,7 @@ def test_a_damaged_run(
     damage(copied / key)
     before = _all_but_index(copied)
     arguments = {
-        "submit": submit_arguments(copied, 2 * PER_SCENE),
+        "submit": submit_arguments(copied, 3 * PER_SCENE),
         "show": ["show", str(copied), "--out", str(copied.parent / "a.png")],
     }
     refused(arguments.get(verb, [verb, str(copied)]), capsys, f"{copied}/{key}", *words)

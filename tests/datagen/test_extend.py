@@ -14,6 +14,7 @@ from datagen.extend import shares
 from schemas.merged import open_runs
 from tests.refusals import refused
 from tests.small_runs import (
+    HERE,
     PER_SCENE,
     arrays_of,
     assert_equal_runs,
@@ -23,7 +24,6 @@ from tests.small_runs import (
 )
 
 N, LONG_N = 2 * PER_SCENE, 4 * PER_SCENE
-HERE = ("--workers", "0")
 
 
 @settings(max_examples=300, deadline=None)

@@ -21,20 +21,6 @@ from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, remake
 from tests.made_runs import files_of, make_run, small_spec
-from tests.small_runs import PER_SCENE, make_small_run
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three scenes. Tests only read it."""
-    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 3 * PER_SCENE)
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """The finished run with its links, to be damaged."""
-    copy_run(finished, tmp_path / "run")
-    return tmp_path / "run"
 
 
 def damage(run: Path, pattern: str) -> str:

@@ -19,6 +19,7 @@ from schemas.run import Run
 from schemas.run_records import Manifest, QuarantineRecord
 from tests.refusals import refused
 from tests.small_runs import (
+    HERE,
     PER_SCENE,
     arrays_of,
     assert_equal_runs,
@@ -29,19 +30,12 @@ from tests.small_runs import (
 )
 
 N = 8 * PER_SCENE  # one scene a shard
-HERE = ("--workers", "0")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight shards. Tests only read it."""
     return make_small_run(tmp_path_factory.mktemp("finished") / "run", N)
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    shutil.copytree(finished, tmp_path / "run")
-    return tmp_path / "run"
 
 
 def lose(run: Path, *shards: int) -> None:

@@ -15,10 +15,9 @@ from schemas.jobs import Jobs
 from schemas.run import Run, commit_key
 from schemas.run_records import QuarantineRecord
 from schemas.storage import open_storage
-from tests.small_runs import CONFIG, PER_SCENE, json_of, make_small_run
+from tests.small_runs import CONFIG, HERE, PER_SCENE, json_of, make_small_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-HERE = ("--workers", "0")
 N = 3 * PER_SCENE
 
 

@@ -49,13 +49,6 @@ def finished_long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_small_run(tmp_path_factory.mktemp("long") / "run", LONG_N)
 
 
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """The finished run, to be changed."""
-    shutil.copytree(finished, tmp_path / "run")
-    return tmp_path / "run"
-
-
 def test_stock_readers_read_it_without_a_warning(finished: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -160,21 +153,17 @@ def test_status_counts_what_is_there(finished: Path, capsys: pytest.CaptureFixtu
     assert "64 of 64" in capsys.readouterr().out
 
 
-def test_status_tells_an_older_seal(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    grown = tmp_path / "grown"
-    shutil.copytree(finished, grown)
-    Run.open(grown).grow(2 * N)
-    report = json_of(capsys, ["status", str(grown)])
+def test_status_tells_an_older_seal(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Run.open(copied).grow(2 * N)
+    report = json_of(capsys, ["status", str(copied)])
     assert not report["sealed"] and report["sealed_labels"] == N
-    assert cli.run(["status", str(grown)]) == 0
+    assert cli.run(["status", str(copied)]) == 0
     assert "data.zarr is older" in capsys.readouterr().out
     # Sealed unfinished, it holds no more labels than before.
-    assert cli.run(["seal", str(grown)]) == 0
-    Run.open(grown).grow(3 * N)
+    assert cli.run(["seal", str(copied)]) == 0
+    Run.open(copied).grow(3 * N)
     capsys.readouterr()
-    assert json_of(capsys, ["status", str(grown)])["sealed_labels"] == N
+    assert json_of(capsys, ["status", str(copied)])["sealed_labels"] == N
 
 
 def test_the_audit_adds_up(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

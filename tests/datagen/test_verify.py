@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +14,7 @@ from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from tests.datagen.forged import forge
 from tests.refusals import refused
-from tests.small_runs import PER_SCENE, files_of, make_small_run
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three scenes. Tests only read it."""
-    return make_small_run(tmp_path_factory.mktemp("finished") / "run", 3 * PER_SCENE)
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """The finished run, to be damaged."""
-    shutil.copytree(finished, tmp_path / "run")
-    return tmp_path / "run"
+from tests.small_runs import PER_SCENE, files_of
 
 
 def verified(run: Path, capture: pytest.CaptureFixture[str], code: int, *more: str) -> dict[str, Any]:
