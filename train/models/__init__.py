@@ -1,0 +1,28 @@
+"""Models behind one interface: `score(clouds, candidates, robots) -> logits (N, 2)`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from schemas.errors import InputError, choices
+from train.models.model import Model
+from train.models.shared import SharedModel
+
+MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "shared": SharedModel,
+}
+
+
+def build_model(name: str, config: Mapping[str, Any]) -> Model:
+    """The model of that name with fresh parameters (torch's global generator draws them).
+
+    `config` may leave out what has a default. InputError names an unknown model or field, or a
+    value out of its bounds, so that a foreign checkpoint's configuration can be handed in.
+    """
+    if name not in MODELS:
+        raise InputError("model", name, "no such model", choices(MODELS))
+    return MODELS[name](config)
+
+
+__all__ = ["MODELS", "Model", "build_model"]

@@ -1,0 +1,64 @@
+"""What a model is to everything else: a module with a name, a configuration and `score`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from pydantic import BaseModel, ConfigDict, ValidationError
+from torch import Tensor, nn
+
+from schemas.errors import InputError
+from train.inputs import Candidates, Clouds, Robots
+
+ConfigT = TypeVar("ConfigT", bound="ModelConfig")
+
+
+class ModelConfig(BaseModel):
+    """The sizes and options of a model: frozen, every number bounded, nothing unknown let in."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Model(nn.Module, ABC):
+    """Scores base positions from what a robot sees.
+
+    `config` holds plain values that JSON can hold; with `name` it is all that
+    `train.models.build_model` needs to make the same module again, but for its parameters.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config: dict[str, Any] = config.model_dump(mode="json")
+
+    def score(self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]) -> Tensor:
+        """Logits (N, 2), float32; column 1 is "good". All tensors on the model's device."""
+        return self(clouds, candidates, robots)
+
+    @abstractmethod
+    def forward(
+        self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+    ) -> Tensor:
+        """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) go through it."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+
+def read_config(kind: type[ConfigT], name: str, config: Mapping[str, Any]) -> ConfigT:
+    """`config` as the model's own; InputError names the first field that is wrong."""
+    try:
+        return kind.model_validate(dict(config))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        valid = ", ".join(kind.model_fields)
+        raise InputError(
+            f"model {name}", field, first["msg"].lower(), f"Its configuration holds: {valid}"
+        ) from None
