@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import os
 import socket
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cluster.environment import changed_environment
 from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token, token_environment
 from schemas.errors import InputError
 
@@ -56,7 +57,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         address = _resolved(settings.address)
         wanted = head_environment("") | token_for(address)
         options = {}
-    with _environment(wanted):  # workers inherit it; the caller's own stays as it was
+    with changed_environment(wanted):  # workers inherit it; the caller's own stays as it was
         import ray
         from ray.exceptions import AuthenticationError
 
@@ -194,17 +195,3 @@ def forget_former_token() -> None:
 
     Config.initialize("")  # first: the loader looks up whether there is to be a token
     AuthenticationTokenLoader.instance().reset_cache()
-
-
-@contextmanager
-def _environment(values: Mapping[str, str]) -> Generator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import http.client
-import os
 import time
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
+from cluster.environment import changed_environment
 from cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
 from schemas.errors import InputError
 
@@ -90,7 +90,7 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
     Without `token` the one is given that Ray would find, to a cluster that asks for it. InputError where
     nothing answers there, or not to us.
     """
-    changed = dict.fromkeys(_OVERRIDES)
+    changed: dict[str, str | None] = dict.fromkeys(_OVERRIDES)
     if address.startswith(("http://", "https://")):
         url = address
     else:
@@ -101,9 +101,7 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
             changed |= {} if address == "auto" else token_for(address)
     if not token and (found := known_token()) and (not url or _turns_away(url)):
         token = found[0]
-    before = {name: os.environ.pop(name, None) for name in changed}
-    os.environ.update({name: value for name, value in changed.items() if value is not None})
-    try:
+    with changed_environment(changed):
         from ray.exceptions import RayError
         from ray.job_submission import JobSubmissionClient
 
@@ -113,11 +111,6 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
         except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise InputError("--address", address, first_line(error), _MEND) from error
         return RayJobs(str(client.get_address()), client)
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
 
 
 def _speaks_http(address: str) -> bool:
