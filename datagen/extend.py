@@ -21,6 +21,7 @@ from datagen.jobs.options import (
     Placing,
     Workers,
     absolute_place,
+    refuse_odd_n,
     resumable,
     words_of,
 )
@@ -52,8 +53,7 @@ def extend(
     placing = Placing(workers, address, json, max_quarantined, detach)
     given = Sources(houses, objects, scenes_from)
     placing.refuse_bad()
-    if not 1 <= n <= 10**12:
-        raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+    refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
     if detach and address != "local":
         return detach_job(words, run, placing)

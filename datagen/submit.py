@@ -21,6 +21,7 @@ from datagen.jobs.options import (
     Workers,
     absolute_place,
     absolute_source,
+    refuse_odd_n,
     resumable,
     words_of,
 )
@@ -108,8 +109,7 @@ def submit(
     """
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # refuses an unknown one
-    if not 1 <= n <= 10**12:
-        raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+    refuse_odd_n(n)
     placing = Placing(workers, address, json, max_quarantined, detach)
     placing.refuse_bad()
     said = {

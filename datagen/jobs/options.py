@@ -71,6 +71,12 @@ class Placing:
         return words_of({"--workers": self.workers, "--max-quarantined": share, "--json": self.json})
 
 
+def refuse_odd_n(n: int) -> None:
+    """Raise InputError for a number of labels that no run has."""
+    if not 1 <= n <= 10**12:
+        raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+
+
 def words_of(options: Mapping[str, object]) -> list[str]:
     """Options as words of a command line; None and False say nothing."""
     words: list[str] = []
