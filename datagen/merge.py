@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.cli import EXIT_INTERRUPTED
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.steps import steps
+from datagen.jobs.options import absolute_place, resumable, words_of
 from datagen.reports.accounts import account_for
 from schemas.lineage import lineage_summary
 from schemas.merged import open_runs, wanted
@@ -32,17 +31,13 @@ def merge(
     refused, and so are runs that hold other rows of one scene. Files are linked, not copied, wherever shards
     are of one size. Sources stay as they are. The same command again finishes a merge that was cut short.
     """
-    commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
-    try:
+    words = ["merge", *map(absolute_place, runs), *words_of({"--out": absolute_place(out), "--json": json})]
+    with resumable(words):
+        commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
         with steps("commits read", commits, True if json else None) as step:
             planned = plan_merge(runs, out, step)
         with steps("records written", planned.records, True if json else None) as step:
             result = carry_out(planned, step)
-    except KeyboardInterrupt:
-        sys.stderr.write(
-            f"interrupted. Go on with:\n  {shlex.join(['datagen', 'merge', *runs, '--out', out])}\n"
-        )
-        return EXIT_INTERRUPTED
     report = merge_report(planned, result)
     if json:
         print_json(report)
