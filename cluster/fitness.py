@@ -18,7 +18,7 @@ _SHARED = "Put the run and its sources where every machine has them under the sa
 
 
 @dataclass(frozen=True)
-class Finding:
+class Fitness:
     """Why a machine cannot make shards of the run ("" when it can), and its versions of what matters."""
 
     problem: str
@@ -35,33 +35,33 @@ def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: Sh
     names, probe = sorted(task.spec.engines), f".probe-{secrets.token_hex(8)}"
     run.storage.put_new(probe, b"driver")
     try:
-        found: dict[str, Finding] = ask(look_at, task, probe, names, patience_s=_PATIENCE_S)
+        found: dict[str, Fitness] = ask(look_at, task, probe, names, patience_s=_PATIENCE_S)
     finally:
         run.storage.delete([probe])
     here = versions_of(names)
-    for machine, finding in sorted(found.items()):
+    for machine, fitness in sorted(found.items()):
         place = f"machine {machine}"
-        if finding.problem:
-            raise InputError(place, "", finding.problem, _SHARED)
-        if others := {n: v for n, v in finding.versions.items() if v != here[n]}:
+        if fitness.problem:
+            raise InputError(place, "", fitness.problem, _SHARED)
+        if others := {n: v for n, v in fitness.versions.items() if v != here[n]}:
             name, its = min(others.items())
             problem = f"it has {its or 'none'}, and this machine {here[name]}"
             raise InputError(place, name, problem, "Install the versions of constraints.txt on every machine")
 
 
-def look_at(task: ShardTask, probe: str, names: Iterable[str]) -> Finding:
+def look_at(task: ShardTask, probe: str, names: Iterable[str]) -> Fitness:
     """What this machine, asked by another, can say of itself."""
     versions = versions_of(names)
     try:
         run, _, _ = open_task(task)
         if not run.storage.exists(probe):
-            return Finding(f"{task.run}: another folder has this name there", versions)
+            return Fitness(f"{task.run}: another folder has this name there", versions)
         answer = f"{probe}-{secrets.token_hex(8)}"
         run.storage.put_new(answer, b"seen")
         run.storage.delete([answer])
     except (JobCannotGoOn, InputError) as error:
-        return Finding(" ".join(str(error).split()), versions)
-    return Finding("", versions)
+        return Fitness(" ".join(str(error).split()), versions)
+    return Fitness("", versions)
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:

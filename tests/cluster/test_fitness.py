@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cluster.fitness import Finding, look_at, refuse_unfit_machines, versions_of
+from cluster.fitness import Fitness, look_at, refuse_unfit_machines, versions_of
 from cluster.task import ShardTask
 from schemas.errors import InputError
 from schemas.run import Run
@@ -78,6 +78,6 @@ def test_a_machine_with_other_versions_is_named(run: Run) -> None:
     names = sorted(run.manifest.spec.engines)
     here = versions_of(names)
     assert here["numpy"] and here["scenes"] == ""
-    other = Finding("", {**here, "numpy": "1.0"})
+    other = Fitness("", {**here, "numpy": "1.0"})
     with pytest.raises(InputError, match=r"numpy: it has 1\.0, and this machine .* Install"):
         refuse_unfit_machines(one_machine(finding=other), run, task_of(run))
