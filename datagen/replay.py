@@ -15,7 +15,7 @@ from datagen.console.steps import Step, steps
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
 from datagen.remaking.alone import replay_shard
-from datagen.remaking.scenes import chosen_rows, open_replayer, origin_to_check, what_differs_here
+from datagen.remaking.scenes import chosen_rows, open_replayer, what_differs_here
 from datagen.remaking.shards import Origin, open_origin
 from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
@@ -82,7 +82,7 @@ def replay(
         return replay_shard(run, found, shard, open_origin(found, given), json)
     assert index is not None
     stored = read_scene(found, index)
-    return _compare(run, found, stored, row, origin_to_check(found, given), out, json)
+    return _compare(run, found, stored, row, open_origin(found, given, needs_scenes=False), out, json)
 
 
 def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:

@@ -6,6 +6,7 @@ import secrets
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -91,18 +92,16 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
     from datagen.remaking.deep import deep_findings
-    from datagen.remaking.scenes import origin_to_check
+    from datagen.remaking.shards import open_origin
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))
     shares[: count % len(runs)] += 1
-    mend = "Trust neither it nor its neighbours: find out what made it"
     for run, share in zip(runs, shares.tolist(), strict=True):
-        origin = origin_to_check(run, given)
+        origin = open_origin(run, given, needs_scenes=False)
         folder = run.storage.url.removeprefix(place.url).strip("/")
-        for where, shard, problem in deep_findings(run, share, origin, rng):
-            key = where.removeprefix(f"{run.storage.url}/")
-            yield Finding(f"{folder}/{key}".strip("/"), "deep", problem, mend, shard)
+        for finding in deep_findings(run, share, origin, rng):
+            yield replace(finding, key=f"{folder}/{finding.key}".strip("/"))
 
 
 def finding_row(finding: Finding) -> dict[str, Any]:

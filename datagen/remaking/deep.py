@@ -21,12 +21,12 @@ from datagen.remaking.stages import (
     beyond_tolerance,
     compare_stages,
 )
+from schemas.checking.finding import Finding
 from schemas.errors import InputError
 from schemas.run import Run, shard_folder
 from schemas.scene_rows import read_scenes
 
-Finding = tuple[str, int | None, str]  # (key or place, shard, problem)
-
+_MEND = "Trust neither it nor its neighbours: find out what made it"
 # Candidates of a drawn scene that are labelled where a label is a plan or a trial.
 _TRIED = 4
 
@@ -37,7 +37,8 @@ def deep_findings(run: Run, k: int, origin: Origin, rng: np.random.Generator) ->
     The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
     Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
     tolerances, and of scenes what is drawn before any physics (docs/determinism.md). Scenes of another
-    run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time.
+    run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys of the
+    findings are those below the run's own place.
     """
     shards = sorted(run.committed())
     if not shards or k < 1:
@@ -70,7 +71,8 @@ def _checked(run: Run, scene: int, findings: Iterator[Finding]) -> Iterator[Find
     try:
         yield from findings
     except InputError as error:
-        yield str(error.place), scene // run.layout.scenes_per_shard, f"scene {scene}: {error.problem}"
+        key, problem = str(error.place).removeprefix(f"{run.storage.url}/"), f"scene {scene}: {error.problem}"
+        yield Finding(key, "deep", problem, _MEND, scene // run.layout.scenes_per_shard)
 
 
 def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
@@ -118,4 +120,4 @@ def _of_stages(
 
 def _finding(run: Run, shard: int, scene: int, problem: str, field: str = "label") -> Finding:
     folder = shard_folder(shard, run.commit_of(shard).attempt)
-    return f"{folder}/{field}", shard, f"scene {scene}, {problem}"
+    return Finding(f"{folder}/{field}", "deep", f"scene {scene}, {problem}", _MEND, shard)

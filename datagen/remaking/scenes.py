@@ -10,8 +10,7 @@ from importlib.metadata import PackageNotFoundError
 import numpy as np
 
 from cluster.guard import this_host
-from datagen.remaking.shards import Origin, open_origin
-from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.remaking.shards import Origin, source_of
 from datagen.specifying.specify import label_engines, scene_engines
 from schemas.cost import StageClock
 from schemas.errors import InputError
@@ -23,7 +22,7 @@ from workers.run_shard import Columns, candidate_columns, scene_row
 from workers.scenes.draw import draw_scene
 from workers.scenes.recall import recall_candidates, recall_scene
 from workers.scenes.scene import SettledScene
-from workers.world import World, assemble_world, open_world
+from workers.world import World, assemble_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +75,11 @@ _NO_DRAWING = "the run that drew the scenes is not there any more"
 _MEND = "Give --scenes-from the run that drew them"
 
 
-def origin_to_check(run: Run, given: Sources = AS_FOUND) -> Origin:
-    """The run's sources as `open_origin` gives them; without the run that drew its scenes where that is gone.
-
-    What is stored is enough to work out labels again. InputError as `open_origin`, also for a
-    `scenes_from` that is given and is not there.
-    """
-    spec, known = run.manifest.spec, run.manifest.sources
-    if given.scenes_from is not None or spec.scenes_from is None or _source_of(run) is not None:
-        return open_origin(run, given)
-    houses = given.houses or known.get("houses", "builtin")
-    objects = given.objects or known.get("objects", "builtin")
-    return Origin(open_world(spec, houses, objects), None)
-
-
 def open_replayer(run: Run, origin: Origin) -> Replayer:
-    """A run opened to make its scenes again, from `origin_to_check` or `open_origin`."""
+    """A run opened to make its scenes again from its origin, where whatever drew them is there."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
-        drawn_by = _source_of(drawn_by)
+        drawn_by = _source_if_there(drawn_by)
     if drawn_by is run:
         return Replayer(run, origin.world, origin.world)
     if drawn_by is None:
@@ -104,16 +89,11 @@ def open_replayer(run: Run, origin: Origin) -> Replayer:
     return Replayer(run, origin.world, drawing)
 
 
-def _source_of(run: Run) -> Run | None:
-    """The run whose scenes this one labelled; None where it is not there."""
-    place = run.manifest.sources.get("scenes_from")
+def _source_if_there(run: Run) -> Run | None:
     try:
-        source = None if not place else Run.open(place)
+        return source_of(run)
     except InputError:
         return None
-    if source is None or source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
-        return None
-    return source
 
 
 def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:

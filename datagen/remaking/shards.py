@@ -21,10 +21,12 @@ class Origin:
     scenes: Run | None  # the run whose scenes are labelled again
 
 
-def open_origin(run: Run, given: Sources = AS_FOUND) -> Origin:
+def open_origin(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> Origin:
     """Open the run's sources: those given, or else where the run found them.
 
-    InputError where they are not there any more, or are not those that the run was made from.
+    InputError where they are not there any more, or are not those that the run was made from. Without
+    `needs_scenes` the run that drew the scenes may be gone, unless it is given: what is stored is enough to
+    work out labels again.
     """
     spec, known = run.manifest.spec, run.manifest.sources
     world = open_world(
@@ -32,14 +34,24 @@ def open_origin(run: Run, given: Sources = AS_FOUND) -> Origin:
     )
     if spec.scenes_from is None:
         return Origin(world, None)
-    place = given.scenes_from or known.get("scenes_from", "")
+    try:
+        return Origin(world, source_of(run, given))
+    except InputError:
+        if needs_scenes or given.scenes_from is not None:
+            raise
+        return Origin(world, None)
+
+
+def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
+    """The run whose scenes this one labelled. InputError where it is not there, or has other scenes."""
+    place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
     mend = "Give --scenes-from the run that this one was started with"
     if not place:
         raise InputError(run.storage.url, "scenes_from", "the run does not say where its scenes lie", mend)
     source = Run.open(place)
-    if source.manifest.spec.scenes_hash != spec.scenes_hash:
+    if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
         raise InputError(place, "spec_hash", "has other scenes than this run", mend)
-    return Origin(world, source)
+    return source
 
 
 def remake(run: Run, shard: int, origin: Origin) -> ShardResult:

@@ -11,7 +11,8 @@ import pytest
 
 from datagen import cli
 from datagen.remaking.deep import deep_findings
-from datagen.remaking.scenes import origin_to_check, what_differs_here
+from datagen.remaking.scenes import what_differs_here
+from datagen.remaking.shards import open_origin
 from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from schemas.merged import open_runs
 from schemas.run import Run
@@ -124,7 +125,7 @@ def test_its_rows_still_follow_from_its_specification(golden: Golden) -> None:
     if not golden.has_its_world:
         pytest.skip("the built-in world is another one since: docs/relabel-and-replay.md")
     for run in open_runs(golden.merged):
-        origin = origin_to_check(run)
+        origin = open_origin(run, needs_scenes=False)
         assert list(deep_findings(run, 6, origin, np.random.default_rng(0))) == []
 
 

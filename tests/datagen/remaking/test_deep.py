@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.remaking.deep import Finding, deep_findings
+from datagen.remaking.deep import deep_findings
 from datagen.remaking.shards import open_origin
+from schemas.checking.finding import Finding
 from schemas.record_files import encode_record
 from schemas.run import Run
 from tests.datagen.forged import forge
@@ -92,9 +93,9 @@ def test_a_forged_row_is_found(
 ) -> None:
     run = forge(source, tmp_path / "run", 2, change)
     found = findings(run)
-    assert any(words in problem for _, _, problem in found), found
-    assert {shard for _, shard, _ in found} == {2}
-    assert all(key.startswith("shards/000002/forged/") for key, _, _ in found)
+    assert any(words in f.problem for f in found), found
+    assert {f.shard for f in found} == {2}
+    assert all(f.key.startswith("shards/000002/forged/") for f in found)
 
 
 def test_poses_that_nothing_can_have_are_a_finding_and_no_crash(source: Path, tmp_path: Path) -> None:
@@ -102,8 +103,8 @@ def test_poses_that_nothing_can_have_are_a_finding_and_no_crash(source: Path, tm
         a["T_world_object"][0, 0, 0, 1] += 0.5
 
     found = findings(forge(source, tmp_path / "run", 1, shear))
-    assert any("holds values that no scene can have" in problem for _, _, problem in found)
-    assert {shard for _, shard, _ in found} == {1}
+    assert any("holds values that no scene can have" in f.problem for f in found), found
+    assert {f.shard for f in found} == {1}
 
 
 def made_elsewhere(run: Run) -> Run:
@@ -127,10 +128,10 @@ def test_runs_of_another_platform_are_held_to_the_stated_tolerances(source: Path
         a["target_px"][6] += 9
 
     found = findings(made_elsewhere(forge(source, tmp_path / "much", 3, too_much)))
-    told = " ".join(problem for _, _, problem in found)
+    told = " ".join(f.problem for f in found)
     for words in ("distance_m differs by 0.0001 m", "label differs by 1", "target_px differs by 9 px"):
         assert words in told, told
-    assert {shard for _, shard, _ in found} == {3}
+    assert {f.shard for f in found} == {3}
 
 
 def test_scenes_that_were_labelled_again_are_drawn_from_where_they_came(source: Path, tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_scenes_that_were_labelled_again_are_drawn_from_where_they_came(source: 
     assert cli.run(again) == 0
     assert findings(Run.open(out)) == []
     run = forge(out, tmp_path / "forged", 1, move_object)
-    assert any("drawn again: settle" in problem for _, _, problem in findings(run))
+    assert any("drawn again: settle" in f.problem for f in findings(run))
 
 
 @needs_sim
@@ -161,4 +162,4 @@ def test_trials_are_planned_and_executed_again(tmp_path: Path, capsys: pytest.Ca
         a["grasps_tried"] += 1
 
     found = findings(forge(out, tmp_path / "forged", 0, other_outcome), 3)
-    assert any("recomputed from stored poses: plan: grasps_tried" in problem for _, _, problem in found)
+    assert any("recomputed from stored poses: plan: grasps_tried" in f.problem for f in found)
