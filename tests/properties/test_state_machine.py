@@ -1,7 +1,6 @@
 """Any history of commits, crashes, resumes, merges and mends leaves what a plain dictionary says.
 
-The model knows for each place which scenes of which specification are committed, how many samples are
-wanted, what is in quarantine and what is sealed. After every step the place says the same.
+After every step each place says what the model (state_model.py) says.
 """
 
 from __future__ import annotations
@@ -9,8 +8,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -27,130 +25,35 @@ from datagen.relabelling.runs import relabel_all, relabelled_specification
 from schemas.checking.mending import mend_place
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
-from schemas.fields import SCHEMAS, sized_schema
+from schemas.fields import SCHEMAS
 from schemas.garbage import find_garbage, sweep
-from schemas.identity import sample_ids
 from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
 from schemas.quarantine import lift_quarantine
 from schemas.record_files import now
 from schemas.run import Run, commit_key, shard_folder
-from schemas.run_records import Layout, QuarantineRecord
+from schemas.run_records import QuarantineRecord
 from schemas.sealing import SEALED, seal, unseal
-from schemas.shard_files import encode_shard
-from schemas.specification import HeuristicParams, Specification
+from schemas.specification import HeuristicParams
 from schemas.storage import open_storage
-from tests.made_runs import attempt, manifest_of, small_spec, tables_of, write
-from workers.labels import heuristic, load_label_source
-
-LAYOUT = Layout(scenes_per_shard=1, candidates_per_scene=2)
-PER_SHARD = LAYOUT.samples_per_shard
-SHARDS_AT_MOST = 5
-PLACES_AT_MOST = 5
-RULES = {"": HeuristicParams(), "near": HeuristicParams(mu=0.3), "far": HeuristicParams(mu=0.9, tau=0.2)}
-EXAMPLES, STEPS = 200, 50
-
-# Every column would cost four times the time and show nothing more of the protocol.
-_KEPT = {
-    "scene_index", "redraws", "house_id", "points_m",
-    "sample_id", "sample_scene_index", "candidate_index", "arm_reach_m", "distance_m", "mount_distance_m",
-    "visibility", "heuristic_score", "label", "label_version",
-}  # fmt: skip
-SMALL = replace(
-    SCHEMAS["heuristic"],
-    scene_fields=tuple(f for f in SCHEMAS["heuristic"].scene_fields if f.name in _KEPT),
-    sample_fields=tuple(f for f in SCHEMAS["heuristic"].sample_fields if f.name in _KEPT),
+from tests.made_runs import attempt, manifest_of, write
+from tests.properties.state_model import (
+    LAYOUT,
+    PER_SHARD,
+    RULES,
+    SMALL,
+    SPECS,
+    Part,
+    Place,
+    expected_rows,
+    files_of_shard,
+    specification,
+    united,
 )
 
-
-@dataclass(frozen=True)
-class Part:
-    """What the model knows of one run: its specification is named by a seed and a rule."""
-
-    n: int
-    committed: frozenset[int] = frozenset()
-    quarantined: frozenset[int] = frozenset()
-
-    @property
-    def planned(self) -> range:
-        return range(-(-self.n // PER_SHARD))
-
-    @property
-    def missing(self) -> list[int]:
-        return sorted(set(self.planned) - self.committed - self.quarantined)
-
-
-@dataclass
-class Place:
-    """A folder, and what it must hold. `sealed` is what the store was laid over."""
-
-    folder: Path
-    parts: dict[tuple[int, str], Part]
-    sealed: dict[tuple[int, str], Part] | None = None
-
-    @property
-    def rule(self) -> str:
-        return next(iter(self.parts))[1]
-
-
-# Specifications by seed and rule; those of relabelled runs come from the program.
-SPECS: dict[tuple[int, str], Specification] = {}
-
-
-def specification(seed: int, rule_name: str) -> Specification:
-    """The drawn run of a seed, or that run relabelled by another rule."""
-    if not rule_name and (seed, "") not in SPECS:
-        SPECS[seed, ""] = small_spec(seed, engines={"labels": str(load_label_source("heuristic").version)})
-    return SPECS[seed, rule_name]
-
-
-def united(one: Part, other: Part) -> Part:
-    """What a merge of two runs of one specification holds."""
-    committed = one.committed | other.committed
-    return Part(max(one.n, other.n), committed, (one.quarantined | other.quarantined) - committed)
-
-
-def changed_fields(params: HeuristicParams) -> dict[str, Any]:
-    return params.model_dump(exclude_defaults=True)
-
-
-def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
-    """(ids, labels) that a store over these parts must hold, from the drawn rows alone."""
-    ids, labels = [], []
-    order = sorted(sealed, key=lambda key: specification(*key).hash())
-    with_rows = [key for key in order if sealed[key].committed & set(sealed[key].planned)]
-    for key in with_rows:
-        spec, part = specification(*key), sealed[key]
-        for shard in sorted(part.committed & set(part.planned)):
-            rows = drawn_rows(key[0], shard)
-            label = rows["label"]
-            if key[1]:
-                d, mount, reach, rho = (
-                    rows[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")
-                )
-                _, label = heuristic.heuristic(d, mount, reach, rho, RULES[key[1]])
-            # Only the end of the store is cut: that of the last run with rows.
-            kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == with_rows[-1] else PER_SHARD
-            ids.append(sample_ids(spec.hash(), shard, np.arange(PER_SHARD))[:kept])
-            labels.append(label[:kept])
-    return np.concatenate(ids), np.concatenate(labels)
-
-
-@cache
-def drawn_rows(seed: int, shard: int) -> Any:
-    spec = specification(seed, "")
-    return tables_of(sized_schema("heuristic", spec), LAYOUT, seed, shard, spec.hash())[1]
-
-
-def files_of_shard(run: Run, shard: int) -> dict[str, bytes]:
-    """The files of a shard as its attempt wrote them, made from the seed and the rule again."""
-    spec = run.manifest.spec
-    scenes, samples = tables_of(run.schema, LAYOUT, spec.seed, shard, run.manifest.spec_hash)
-    if spec.scenes_from is not None:
-        distances = (samples[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility"))
-        samples["heuristic_score"], samples["label"] = heuristic.heuristic(*distances, spec.heuristic)
-        samples["label_version"][:] = heuristic.VERSION
-    return encode_shard(run.schema, LAYOUT, run.manifest.spec_hash, scenes, samples)
+SHARDS_AT_MOST = 5
+PLACES_AT_MOST = 5
+EXAMPLES, STEPS = 200, 50
 
 
 def findings(place: Place) -> list[Any]:
@@ -162,6 +65,10 @@ def findings(place: Place) -> list[Any]:
 def close_all(place: Place) -> None:
     for run in open_runs(place.folder):
         close_lost_attempts(run)
+
+
+def changed_fields(params: HeuristicParams) -> dict[str, Any]:
+    return params.model_dump(exclude_defaults=True)
 
 
 class AnyHistory(RuleBasedStateMachine):
