@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -143,12 +141,10 @@ def _relabel_run(
         return relabel_shard(run, source, task, meter, flips)
 
     def make_task(order: Order) -> RelabelTask:
-        return RelabelTask(order.shard, order.attempt, order.deadline_s, order.memory_factor, notes)
+        return RelabelTask(order.shard, order.attempt, order.deadline_s, order.memory_factor)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard
-    with ExitStack() as stack:
-        notes = stack.enter_context(tempfile.TemporaryDirectory(prefix="datagen-notes-"))
-        display = stack.enter_context(progress(per_shard, len(missing), done, True if json else None))
+    with progress(per_shard, len(missing), done, True if json else None) as display:
         books, executor = RunBooks(run), InProcessExecutor(work)
         summary = drive(missing, make_task, executor, books, Policy(), display, stop)
     close_lost_attempts(run)
