@@ -12,10 +12,17 @@ from functools import cached_property, lru_cache
 from math import isfinite
 from typing import Literal, get_args
 
-from pydantic import BaseModel, ConfigDict
-
 from schemas.record_files import compact_record, decode_record
-from schemas.run_records import FORMAT_VERSION, Commit, Cost, Digest, Host, LedgerEntry, Outcome
+from schemas.run_records import (
+    FORMAT_VERSION,
+    Commit,
+    Cost,
+    Digest,
+    Host,
+    LedgerEntry,
+    Outcome,
+    StoredRecord,
+)
 
 _STAGES = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s")
 _COST_FIELDS = set(Cost.model_fields)
@@ -96,18 +103,14 @@ def head_of_end(entry: LedgerEntry) -> EndHead:
     return EndHead(entry.attempt, entry.shard, entry.outcome, entry.cause, entry.cost)
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class _Words(_Record):
+class _Words(StoredRecord):
     """A column of text: its different words, and which of them each row has."""
 
     words: list[str]
     rows: list[int]
 
 
-class _TableFile(_Record):
+class _TableFile(StoredRecord):
     format_version: int = FORMAT_VERSION
     spec_hash: Digest
     kind: Kind

@@ -14,11 +14,11 @@ from datetime import UTC, datetime, timedelta
 from typing import Annotated, Literal, TypeVar
 
 import psutil
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from schemas.errors import InputError
 from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
-from schemas.run_records import FORMAT_VERSION
+from schemas.run_records import FORMAT_VERSION, StoredRecord
 from schemas.storage import Storage
 
 JobId = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{8}$")]
@@ -33,11 +33,7 @@ _JOB_FILE = re.compile(r"jobs/([0-9]{8}T[0-9]{6}-[0-9a-f]{8})\.json")
 Passing = TypeVar("Passing", bound=BaseModel)
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class JobRecord(_Record):
+class JobRecord(StoredRecord):
     """jobs/<id>.json: a driver that began. Written once, create-only."""
 
     format_version: int = FORMAT_VERSION
@@ -51,7 +47,7 @@ class JobRecord(_Record):
     jobs_api: str = ""
 
 
-class JobState(_Record):
+class JobState(StoredRecord):
     """jobs/<id>.state.json: how a driver is, every few seconds, and how it ended."""
 
     format_version: int = FORMAT_VERSION
@@ -72,7 +68,7 @@ class JobState(_Record):
     cause: str = ""
 
 
-class StopOrder(_Record):
+class StopOrder(StoredRecord):
     """jobs/<id>.stop.json: somebody wants the job to stop."""
 
     format_version: int = FORMAT_VERSION

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from itertools import groupby
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from schemas.record_files import encode_record, read_record
 from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION
+from schemas.run_records import FORMAT_VERSION, StoredRecord
 
 LINEAGE = "lineage.json"
 _Shard = Annotated[int, Field(ge=0, le=10**18)]
@@ -29,10 +29,8 @@ class Origin(NamedTuple):
     code_version: str
 
 
-class LineageSource(BaseModel):
+class LineageSource(StoredRecord):
     """One origin and the shards that come from it, as ranges of first and last."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     address: str
     created: str
@@ -41,10 +39,8 @@ class LineageSource(BaseModel):
     shards: tuple[tuple[_Shard, _Shard], ...]
 
 
-class Lineage(BaseModel):
+class Lineage(StoredRecord):
     """lineage.json: the origins of a run that was merged, in order of their addresses."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: int = FORMAT_VERSION
     sources: tuple[LineageSource, ...]

@@ -23,11 +23,13 @@ Outcome = Literal[
 ]
 
 
-class _Record(BaseModel):
+class StoredRecord(BaseModel):
+    """What is read back from disk: it never changes in memory, and what it does not know is refused."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Layout(_Record):
+class Layout(StoredRecord):
     """How scenes are cut into shards. Fixed for a run, and without influence on any sample."""
 
     scenes_per_shard: int = Field(ge=1, le=100_000)
@@ -47,7 +49,7 @@ class Layout(_Record):
         return -(-samples // self.candidates_per_scene), samples
 
 
-class Manifest(_Record):
+class Manifest(StoredRecord):
     """manifest.json: what the run is. Written once, create-only."""
 
     format_version: int = FORMAT_VERSION
@@ -64,21 +66,21 @@ class Manifest(_Record):
     sources: dict[str, str] = Field(default_factory=dict)
 
 
-class Plan(_Record):
+class Plan(StoredRecord):
     """plans/<k>.json: how many samples are wanted. The newest counts; a run only grows."""
 
     n: int = Field(ge=1, le=10**12)
     created: str
 
 
-class Merged(_Record):
+class Merged(StoredRecord):
     """merged.json: a run made of others, each whole below parts/, in the order of their rows."""
 
     format_version: int = FORMAT_VERSION
     parts: tuple[Digest, ...] = Field(min_length=2)  # specification hashes, ascending
 
 
-class FileEntry(_Record):
+class FileEntry(StoredRecord):
     """One file of a committed attempt, relative to the attempt's folder."""
 
     path: FilePath
@@ -86,7 +88,7 @@ class FileEntry(_Record):
     sha256: Digest
 
 
-class Cost(_Record):
+class Cost(StoredRecord):
     """What one attempt cost. `gpu_s` stays empty where no GPU was used."""
 
     wall_s: float = Field(ge=0)
@@ -98,7 +100,7 @@ class Cost(_Record):
     written_bytes: int = 0
 
 
-class Host(_Record):
+class Host(StoredRecord):
     """Fingerprint of the machine that ran an attempt."""
 
     name: str
@@ -109,7 +111,7 @@ class Host(_Record):
     pid: int = 0
 
 
-class Commit(_Record):
+class Commit(StoredRecord):
     """commits/<shard>.json: written last and create-only; readers trust nothing else."""
 
     format_version: int = FORMAT_VERSION
@@ -140,7 +142,7 @@ def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, 
     return None
 
 
-class AttemptStart(_Record):
+class AttemptStart(StoredRecord):
     """ledger/<attempt>.start.json: an attempt that began; without an end it was lost."""
 
     format_version: int = FORMAT_VERSION
@@ -152,7 +154,7 @@ class AttemptStart(_Record):
     writer: str = ""
 
 
-class LedgerEntry(_Record):
+class LedgerEntry(StoredRecord):
     """ledger/<attempt>.json: how one attempt ended, and what it cost."""
 
     format_version: int = FORMAT_VERSION
@@ -167,7 +169,7 @@ class LedgerEntry(_Record):
     host: Host | None = None
 
 
-class QuarantineRecord(_Record):
+class QuarantineRecord(StoredRecord):
     """quarantine/<shard>.json: a shard given up, with all that is needed to run it alone."""
 
     format_version: int = FORMAT_VERSION
