@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError, choices
+from schemas.keys import shard_folder
 from schemas.merged import open_runs
-from schemas.run import Run, shard_folder
+from schemas.run import Run
 from schemas.shard_reading import ShardPlace, StoredArray, committed_place, read_metadata
 from schemas.storage import open_storage
 from train.sealed import is_sealed_store, open_sealed
@@ -76,6 +77,7 @@ class SampleReader:
     ) -> None:
         if not places:
             raise InputError("training data", "", "no run is named", "Name at least one run's folder")
+        self._places = list(places)
         self._shards: list[tuple[int, ShardPlace, Mapping[str, StoredArray]]] = []
         self.fields: dict[str, StoredArray] = {}
         needed = list(dict.fromkeys([*scene_fields, *sample_fields, "scene_index", "sample_scene_index"]))
@@ -98,6 +100,10 @@ class SampleReader:
     def units(self) -> dict[str, str]:
         """Unit of every field of a batch, "" for names."""
         return {name: str(array.attributes.get("units", "")) for name, array in self.fields.items()}
+
+    def dimension(self, name: str) -> str:
+        """`scene` or `sample`: the table that holds a field. InputError where no run stores it."""
+        return next(iter(_open(self._places[0], [name])))[1][name].dims[0]
 
     def epoch(
         self,
