@@ -30,6 +30,18 @@ def inverse(T: F64) -> F64:
     return out
 
 
+def is_pose(T: F64, rounding: float = 1e-5) -> bool:
+    """Whether a matrix (4, 4) turns and moves and does nothing else; no for NaN and for mirrors.
+
+    `rounding` bounds the entries of R R^T - I: engines and files give rotations as float32.
+    """
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
+        return False
+    R = T[:3, :3]
+    turns = np.allclose(R @ R.T, np.eye(3), rtol=0, atol=rounding) and float(np.linalg.det(R)) > 0
+    return turns and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+
+
 def quaternion_wxyz(R: F64) -> F64:
     """Unit quaternion (4,), scalar first, of a rotation matrix (3, 3).
 

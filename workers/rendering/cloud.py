@@ -82,16 +82,25 @@ def observe_cloud(
         masks.append(values.body[near] == target_body)
         count += int(near.sum())
 
-    n, size = min(count, params.n_points), params.n_points
-    chosen = np.concatenate(points)[:n]
-    first = farthest_points(chosen, min(params.n_farthest, n))
+    return stored_cloud(np.concatenate(points), np.concatenate(colours), np.concatenate(masks), params)
+
+
+def stored_cloud(
+    points_m: F32, rgb: U8, target_mask: npt.NDArray[np.bool_], params: ObservationParams
+) -> Cloud:
+    """The first `n_points` of points (N, 3) around the target, as a scene stores them.
+
+    `n_farthest` of them come first, in farthest-point order; the others keep the order they came in.
+    """
+    n, size = min(len(points_m), params.n_points), params.n_points
+    first = farthest_points(points_m[:n], min(params.n_farthest, n))
     rest = np.ones(n, np.bool_)
     rest[first] = False
     rows = np.concatenate([first, np.flatnonzero(rest)])
     cloud = Cloud(np.zeros((size, 3), np.float16), np.zeros((size, 3), np.uint8), np.zeros(size, np.bool_), n)
-    cloud.points_m[:n] = chosen[rows]
-    cloud.rgb[:n] = np.concatenate(colours)[:n][rows]
-    cloud.target_mask[:n] = np.concatenate(masks)[:n][rows]
+    cloud.points_m[:n] = points_m[rows]
+    cloud.rgb[:n] = rgb[rows]
+    cloud.target_mask[:n] = target_mask[rows]
     return cloud
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from schemas.errors import InputError
 from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64
+from workers.geometry.transforms import is_pose
 from workers.objects.model import ObjectModel
 from workers.rendering.frame import Camera, Stage
 from workers.rendering.rays import RayStage
@@ -68,8 +69,8 @@ def recall_scene(world: World, record: Record) -> RecalledScene:
     for name, sound in (
         ("scene_index", index >= 0),
         ("retry", retry >= 0),
-        ("T_world_object", all(map(_is_pose, T_world_object))),
-        ("T_world_camera", _is_pose(T_world_camera)),
+        ("T_world_object", all(map(_is_placed, T_world_object))),
+        ("T_world_camera", _is_placed(T_world_camera)),
         ("intrinsics_px", bool(np.isfinite([cx, cy]).all()) and 0 < fx < 1e6 and 0 < fy < 1e6),
         ("image_size_px", 0 < width <= 4096 and 0 < height <= 4096),
         ("target_center_m", np.allclose(centre_m, T_world_object[0, :3, 3], rtol=0, atol=_ROUNDING)),
@@ -113,13 +114,9 @@ def recall_candidates(columns: Record, scene: RecalledScene) -> Candidates:
     )
 
 
-def _is_pose(T: F64) -> bool:
+def _is_placed(T: F64) -> bool:
     """Whether a matrix (4, 4) turns and moves, within the size of a house, and does nothing else."""
-    if not (np.isfinite(T).all() and np.abs(T[:3, 3]).max() <= _EXTENT_M):
-        return False
-    R = T[:3, :3]
-    turns = np.allclose(R @ R.T, np.eye(3), rtol=0, atol=_ROUNDING) and float(np.linalg.det(R)) > 0
-    return turns and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+    return is_pose(T, _ROUNDING) and bool(np.abs(T[:3, 3]).max() <= _EXTENT_M)
 
 
 def _within(values: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
