@@ -1,0 +1,185 @@
+"""A checkpoint: one file with a model's weights, where they come from, and all that training goes on from.
+
+On disk it is a file of `torch.save` with one flat dictionary: `head`, a JSON text, and tensors under
+`weights/` (the best epoch's) and `resume/` (the last step's model and optimiser). Numbers that are no
+tensors lie in the JSON, which holds a float to its last bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from torch import Tensor
+
+from schemas.errors import InputError
+from train.models import Model, build_model
+from train.training.inert import MAX_BYTES, refuse_foreign
+
+FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
+_MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
+
+
+@dataclass(frozen=True)
+class CheckpointHead:
+    """What a checkpoint says of itself. Everything in it is plain data."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    model: str
+    model_config: dict[str, Any]
+    stage: str  # stage1, stage2 or sim-only
+    options: dict[str, Any]  # of training, resolved
+    data: tuple[dict[str, Any], ...]  # a run each: `SampleStream.origin()`
+    val_data: tuple[dict[str, Any], ...]
+    house_ids: tuple[str, ...]  # trained on, by the checkpoint that this one began from too
+    object_digests: tuple[str, ...]  # the same of objects
+    val_house_ids: tuple[str, ...]  # decided which epoch is the best
+    cost: dict[str, float]  # label_cpu_s, train_cpu_s, train_wall_s; what it began from is not in it
+    versions: dict[str, str]
+    history: tuple[dict[str, Any], ...]  # an epoch each
+    step: int = 0  # optimiser's steps behind the last weights
+    epoch: int = 0  # whole epochs behind them
+    best_epoch: int | None = None  # whose weights `load_model` gives, counted from 1; None before the first
+    finished: bool = False
+    init: dict[str, Any] | None = None  # digest, stage and cost of the checkpoint that it began from
+    digest: str = field(default="", compare=False)  # sha256 of the file; set by reading
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A whole checkpoint: `weights` of the best epoch; `resume` and `loop` of the last step."""
+
+    head: CheckpointHead
+    weights: dict[str, Tensor]
+    resume: dict[str, Tensor] = field(default_factory=dict)
+    loop: dict[str, Any] = field(default_factory=dict)
+
+
+_HEAD = TypeAdapter(CheckpointHead)
+
+
+def load_model(path: str | Path, device: str | torch.device = "cpu") -> tuple[Model, CheckpointHead]:
+    """The model of a checkpoint with its best weights, in evaluation mode, and what is known of it.
+
+    InputError, one line, for what is missing, cut, foreign, of a newer format or does not fit its model.
+    """
+    checkpoint = read_checkpoint(path)
+    head = checkpoint.head
+    with torch.random.fork_rng(devices=[]):  # fresh parameters are drawn only to be replaced
+        model = build_model(head.model, head.model_config)
+    put_weights(model, checkpoint.weights, str(path))
+    return model.to(device).eval(), head
+
+
+def put_weights(model: Model, weights: Mapping[str, Tensor], place: str) -> None:
+    """Replace all of a model's parameters and buffers. InputError where names, shapes or dtypes differ."""
+    wanted = model.state_dict()
+    for name in sorted(wanted.keys() ^ weights.keys()):
+        problem = "the model has no such weights" if name in weights else "the checkpoint lacks it"
+        raise InputError(place, name, problem, _MEND)
+    for name, tensor in wanted.items():
+        ours, theirs = (tuple(tensor.shape), tensor.dtype), (tuple(weights[name].shape), weights[name].dtype)
+        if ours != theirs:
+            problem = f"{theirs[1]} {theirs[0]}, where the model has {ours[1]} {ours[0]}"
+            raise InputError(place, name, problem, _MEND)
+    model.load_state_dict(weights)
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """All of a checkpoint, on the CPU. InputError as `load_model`; memory is bounded by the file's size."""
+    place, data = str(path), _read(Path(path))
+    refuse_foreign(place, data)
+    try:
+        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except (RuntimeError, ValueError, KeyError, EOFError) as e:
+        raise InputError(place, "", f"torch cannot load it ({e})", _MEND) from None
+    text = stored.pop("head", None)
+    document = _document(place, text)
+    try:
+        head = replace(_HEAD.validate_python(document["head"]), digest=hashlib.sha256(data).hexdigest())
+        loop = dict(document["loop"])
+    except (ValidationError, KeyError, TypeError, ValueError) as e:
+        first = e.errors()[0] if isinstance(e, ValidationError) else None
+        where = ".".join(str(part) for part in first["loc"]) if first else "head"
+        problem = first["msg"].lower() if first else f"incomplete ({e})"
+        raise InputError(place, where, problem, _MEND) from None
+    tensors = {name: value for name, value in stored.items() if isinstance(value, Tensor)}
+    return Checkpoint(head, _below("weights/", tensors), _below("resume/", tensors), loop)
+
+
+def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Replace the file as a whole: after a crash at any point it is the old one or the new one."""
+    path = Path(path)
+    document = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "head": {k: v for k, v in asdict(checkpoint.head).items() if k != "digest"},
+        "loop": checkpoint.loop,
+    }
+    stored: dict[str, Any] = {"head": json.dumps(document, allow_nan=False)}
+    stored |= {f"weights/{k}": _own(v) for k, v in checkpoint.weights.items()}
+    stored |= {f"resume/{k}": _own(v) for k, v in checkpoint.resume.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".{path.name}.new")
+    try:
+        with open(new, "wb") as file:
+            torch.save(stored, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(new, path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _own(tensor: Tensor) -> Tensor:
+    """A dense copy on the CPU: a view would be saved with all of what it is a view of."""
+    return tensor.detach().cpu().contiguous().clone()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if not path.is_file() and path.exists():
+            raise IsADirectoryError
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_BYTES:
+                problem = f"{size} bytes, and a checkpoint has at most {MAX_BYTES}"
+                raise InputError(path, "", problem, _MEND)
+            return file.read(MAX_BYTES)
+    except FileNotFoundError:
+        raise InputError(path, "", "no such file", "Name a checkpoint that `datagen train` wrote") from None
+    except (IsADirectoryError, NotADirectoryError):
+        raise InputError(path, "", "not a file", "Name a checkpoint that `datagen train` wrote") from None
+
+
+def _document(place: str, text: object) -> dict[str, Any]:
+    try:
+        document: Any = json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(place, "head", "not a checkpoint of this program", _MEND)
+    version = document.get("format_version")
+    if version != FORMAT_VERSION:
+        problem = f"{version!r:.20}, and this program reads {FORMAT_VERSION}"
+        raise InputError(place, "format_version", problem, "Use the version of the program that wrote it")
+    return document
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
