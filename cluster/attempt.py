@@ -11,7 +11,8 @@ from functools import lru_cache
 from cluster.guard import Meter, this_host, utc_now
 from cluster.task import JobCannotGoOn, Product, ShardTask
 from schemas.errors import InputError
-from schemas.run import Run, commit_key
+from schemas.keys import commit_key
+from schemas.run import Run
 from schemas.run_records import Commit
 from schemas.scene_rows import read_scenes
 from schemas.shard_files import encode_shard

@@ -8,8 +8,9 @@ from cluster.guard import utc_now
 from cluster.policy import Trouble
 from schemas.errors import InputError
 from schemas.index import refresh
+from schemas.keys import commit_key
 from schemas.ledger import end_from_commit, lost_end
-from schemas.run import Run, commit_key
+from schemas.run import Run
 from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from schemas.shard_ranges import ShardRanges
 

@@ -31,7 +31,7 @@ from datagen.specifying.specify import layout_of, specify
 from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from schemas.cost import StageClock
 from schemas.errors import InputError
-from schemas.merged import MERGED
+from schemas.keys import MERGED
 from schemas.run import Run
 from schemas.run_records import Layout
 from schemas.storage import open_storage

@@ -29,8 +29,9 @@ from typing import Literal
 from schemas.errors import InputError
 from schemas.index import unreadable_files
 from schemas.jobs import Jobs
+from schemas.keys import REMOVING, commit_copy_key, commit_key
 from schemas.merged import open_runs
-from schemas.run import REMOVING, Run, commit_copy_key, commit_key
+from schemas.run import Run
 from schemas.storage import Storage, StoredFile
 
 Seen = Callable[[int, int], None]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
+from schemas.keys import MERGED, part_folder
 from schemas.record_files import read_record
 from schemas.run import Run
 from schemas.run_records import FORMAT_VERSION, Merged
 from schemas.storage import Storage, open_storage
-
-MERGED = "merged.json"
 
 
 def open_runs(place: Storage | Path | str) -> list[Run]:
@@ -32,11 +31,6 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
             "Use the version of the program that made the run",
         )
     return [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
-
-
-def part_folder(spec_hash: str) -> str:
-    """Folder of the part with this specification."""
-    return f"parts/{spec_hash[:16]}"
 
 
 @dataclass(frozen=True)

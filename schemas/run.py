@@ -15,6 +15,7 @@ from typing import Literal
 
 from schemas.errors import InputError
 from schemas.fields import RecordSchema, sized_schema
+from schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from schemas.ledger import MAX_STACK_CHARS, Ledger
 from schemas.record_files import (
     MAX_RECORD_BYTES,
@@ -40,8 +41,6 @@ from schemas.storage import Storage, open_storage
 from schemas.storage.errors import StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
-# The mark in the folder of an attempt that is being removed.
-REMOVING = "removing"
 # What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
 Removal = Literal["removed", "spared", "damaged"]
 _MOST_PLANS = 10**9
@@ -86,9 +85,9 @@ class Run:
         storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
         manifest = read_record(storage, "manifest.json", Manifest)
         if manifest is None:
-            merged = read_record(storage, "merged.json", Merged)
+            merged = read_record(storage, MERGED, Merged)
             if merged is not None:
-                parts = ", ".join(f"{storage.url}/parts/{part[:16]}" for part in merged.parts[:3])
+                parts = ", ".join(f"{storage.url}/{part_folder(part)}" for part in merged.parts[:3])
                 more = f" or another of {len(merged.parts)}" if len(merged.parts) > 3 else ""
                 problem = f"holds {len(merged.parts)} merged runs, and one is needed here"
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
@@ -344,18 +343,3 @@ class Run:
             # Only names that this program gives: not drafts, and not "7.json" for "000007.json".
             if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
                 yield found.group(1), file.stamp
-
-
-def shard_folder(shard: int, attempt: str) -> str:
-    """Key of the folder of one attempt at a shard."""
-    return f"shards/{shard:06d}/{attempt}"
-
-
-def commit_key(shard: int) -> str:
-    """Key of a shard's commit record."""
-    return f"commits/{shard:06d}.json"
-
-
-def commit_copy_key(shard: int, attempt: str) -> str:
-    """Key of the copy of a commit record in its attempt's folder."""
-    return f"{shard_folder(shard, attempt)}/commit.json"

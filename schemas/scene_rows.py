@@ -8,7 +8,8 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.fields import SceneRows
-from schemas.run import Run, shard_folder
+from schemas.keys import shard_folder
+from schemas.run import Run
 from schemas.shard_reading import Array, committed_place, read_metadata
 
 

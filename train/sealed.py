@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError, choices
-from schemas.merged import MERGED
+from schemas.keys import MERGED
 from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, read_metadata
 from schemas.storage import open_storage
 

@@ -18,8 +18,9 @@ from pathlib import Path
 
 from schemas.heads import head_of_commit
 from schemas.index import Heads, refresh
+from schemas.keys import commit_key
 from schemas.record_files import encode_record, now
-from schemas.run import Run, commit_key
+from schemas.run import Run
 from schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
 from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of

@@ -20,7 +20,7 @@ from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from schemas.errors import InputError
-from schemas.merged import MERGED, part_folder
+from schemas.keys import MERGED, part_folder
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.root_records import publish
 from schemas.run import Run

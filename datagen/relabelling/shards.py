@@ -13,7 +13,8 @@ from cluster.guard import Meter, this_host, utc_now
 from cluster.task import Product
 from schemas.cost import StageClock
 from schemas.identity import sample_ids
-from schemas.run import Run, shard_folder
+from schemas.keys import shard_folder
+from schemas.run import Run
 from schemas.run_records import Commit, FileEntry
 from schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
 from schemas.shard_reading import committed_place, read_metadata

@@ -23,7 +23,8 @@ from datagen.remaking.stages import (
 )
 from schemas.checking.finding import Finding
 from schemas.errors import InputError
-from schemas.run import Run, shard_folder
+from schemas.keys import shard_folder
+from schemas.run import Run
 from schemas.scene_rows import read_scenes
 
 _MEND = "Trust neither it nor its neighbours: find out what made it"

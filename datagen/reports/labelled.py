@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from datagen.reports.agreement import ROWS, Labelled
-from schemas.run import Run, shard_folder
+from schemas.keys import shard_folder
+from schemas.run import Run
 from schemas.shard_reading import Array, committed_place, read_metadata
 
 _COLUMNS = {

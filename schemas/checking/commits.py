@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import Read, compare, read
+from schemas.keys import commit_copy_key, commit_key
 from schemas.ledger import end_from_commit, end_key, start_from_end, start_key
 from schemas.record_files import encode_record
-from schemas.run import Run, commit_copy_key, commit_key
+from schemas.run import Run
 from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
 from schemas.storage import StoredFile
 

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import compare, read, sound
 from schemas.errors import InputError
+from schemas.keys import MERGED, part_folder
 from schemas.lineage import LINEAGE, Lineage
-from schemas.merged import MERGED, part_folder
 from schemas.record_files import encode_record
 from schemas.root_records import copy_key
 from schemas.run import Run

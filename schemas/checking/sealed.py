@@ -10,8 +10,9 @@ from hashlib import sha256
 from schemas.checking.finding import Finding, Reseal, curable
 from schemas.checking.shards import ShardForm, same_json
 from schemas.errors import InputError
+from schemas.keys import shard_folder
 from schemas.record_files import MAX_RECORD_BYTES
-from schemas.run import Run, shard_folder
+from schemas.run import Run
 from schemas.run_records import Commit
 from schemas.sealing.contents import MOST_SHARDS, Contents, RowsDigest, SealedRun, SealedShard
 from schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root

@@ -15,7 +15,8 @@ from schemas.checking.finding import Finding, Remake, curable
 from schemas.errors import InputError
 from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
 from schemas.identity import sample_ids
-from schemas.run import Run, shard_folder
+from schemas.keys import commit_key, shard_folder
+from schemas.run import Run
 from schemas.run_records import Commit, FileEntry
 from schemas.shard_files import (
     MAX_TEXT_BYTES,
@@ -85,7 +86,7 @@ def check_shard(
     entries = {entry.path: entry for entry in commit.files}
     if odd := sorted(form.paths ^ entries.keys()):
         problem = f"files: lacks or adds {len(odd)} files, first {odd[0]}"
-        yield Finding(f"commits/{commit.shard:06d}.json", "rows", problem, _WRITTEN_SO, commit.shard)
+        yield Finding(commit_key(commit.shard), "rows", problem, _WRITTEN_SO, commit.shard)
     for key in listed:
         path = key.removeprefix(f"{folder}/")
         if path != key and path not in entries and path != "commit.json" and not path.endswith(".part"):

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
-from schemas.merged import MERGED, open_runs, part_folder, wanted
+from schemas.keys import MERGED, part_folder
+from schemas.merged import open_runs, wanted
 from schemas.merging.plan import Union, plan_union, refuse_incompatible
 from schemas.merging.resharding import common_layout
 from schemas.merging.writing import Written, begin_union, replace_record, write_union

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from schemas.errors import InputError
 from schemas.fields import RecordSchema, SceneRows
-from schemas.run import Run, shard_folder
+from schemas.keys import shard_folder
+from schemas.run import Run
 from schemas.scene_rows import read_scenes
 
 

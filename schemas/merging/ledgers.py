@@ -10,10 +10,10 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
+from schemas.keys import commit_key
 from schemas.ledger import LOST_CAUSE, end_from_commit, end_key, lost_end, start_key
 from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
-from schemas.run import commit_key
 from schemas.run_records import AttemptStart, Commit, LedgerEntry
 from schemas.storage import Storage
 

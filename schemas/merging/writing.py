@@ -11,13 +11,14 @@ from itertools import groupby
 
 from schemas.errors import InputError
 from schemas.fields import REDRAW_CAUSES
+from schemas.keys import shard_folder
 from schemas.ledger import end_key, start_key
 from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
 from schemas.merging.ledgers import UnitedAttempt, united_attempts
 from schemas.merging.plan import Holding, Union
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.root_records import copy_key, publish
-from schemas.run import Run, shard_folder
+from schemas.run import Run
 from schemas.run_records import Commit, QuarantineRecord
 from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard

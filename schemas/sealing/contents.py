@@ -8,8 +8,9 @@ from hashlib import sha256
 
 from schemas.errors import InputError
 from schemas.fields import Field, RecordSchema, Table
-from schemas.merged import open_runs, part_folder
-from schemas.run import Run, shard_folder
+from schemas.keys import part_folder, shard_folder
+from schemas.merged import open_runs
+from schemas.run import Run
 from schemas.run_records import Commit, Layout
 from schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
 from schemas.shard_ranges import ShardRanges

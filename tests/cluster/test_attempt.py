@@ -13,7 +13,8 @@ from cluster import attempt
 from cluster.attempt import run_attempt
 from cluster.guard import Meter, guarded
 from cluster.task import JobCannotGoOn, ShardTask
-from schemas.run import Run, commit_copy_key, commit_key, shard_folder
+from schemas.keys import commit_copy_key, commit_key, shard_folder
+from schemas.run import Run
 from schemas.run_records import Layout
 from schemas.specification import CandidateParams, ObservationParams, SceneParams, Source, Specification
 from tests.made_runs import make_run, small_spec

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from schemas.keys import commit_copy_key, commit_key, shard_folder
 from schemas.record_files import encode_record
-from schemas.run import Run, commit_copy_key, commit_key, shard_folder
+from schemas.run import Run
 from schemas.shard_files import encode_shard
 from schemas.shard_reading import committed_place, read_metadata
 

@@ -20,9 +20,10 @@ from schemas.errors import InputError
 from schemas.garbage import find_garbage, sweep
 from schemas.index import index_files, refresh
 from schemas.jobs import JobRecord, Jobs, new_job_id
+from schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
 from schemas.merged import open_runs
 from schemas.record_files import now
-from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
+from schemas.run import Run
 from schemas.sealing import seal
 from schemas.storage import Storage, StoredFile, open_storage
 from tests.made_runs import attempt, files_of, make_run, small_spec, write

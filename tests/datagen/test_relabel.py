@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from schemas.keys import shard_folder
 from schemas.merged import open_runs
 from schemas.record_files import encode_record
-from schemas.run import Run, shard_folder
+from schemas.run import Run
 from schemas.run_records import Commit
 from tests.datagen.forged import forge
 from tests.refusals import refused

@@ -13,7 +13,7 @@ import zarr
 from datagen import cli
 from schemas.checking.mending import mend_place
 from schemas.errors import InputError
-from schemas.merged import MERGED, part_folder
+from schemas.keys import MERGED, part_folder
 from schemas.record_files import encode_record, signed_json
 from schemas.run import Run
 from schemas.run_records import Merged

@@ -12,7 +12,8 @@ import pytest
 
 from datagen import cli
 from schemas.jobs import Jobs
-from schemas.run import Run, commit_key
+from schemas.keys import commit_key
+from schemas.run import Run
 from schemas.run_records import QuarantineRecord
 from schemas.storage import open_storage
 from tests.small_runs import CONFIG, HERE, PER_SCENE, json_of, make_small_run

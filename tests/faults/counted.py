@@ -25,7 +25,8 @@ from cluster.stop import StopRequest
 from cluster.task import Product
 from datagen.reports.accounts import account_for
 from schemas.cost import StageClock
-from schemas.run import Run, commit_key
+from schemas.keys import commit_key
+from schemas.run import Run
 from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard

@@ -18,7 +18,8 @@ from schemas.errors import InputError
 from schemas.fields import SCHEMAS, RecordSchema
 from schemas.garbage import find_garbage
 from schemas.index import closed_ends, committed_heads
-from schemas.merged import MERGED, open_runs, part_folder
+from schemas.keys import MERGED, part_folder
+from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
 from schemas.record_files import encode_record
 from schemas.root_records import publish

@@ -19,7 +19,8 @@ from cluster.policy import Policy
 from cluster.stop import StopRequest
 from cluster.task import Product
 from schemas.errors import InputError
-from schemas.run import Run, commit_copy_key, shard_folder
+from schemas.keys import commit_copy_key, shard_folder
+from schemas.run import Run
 from schemas.run_records import Layout
 from schemas.sealing import seal
 from schemas.storage import open_storage

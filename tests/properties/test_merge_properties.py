@@ -21,9 +21,10 @@ from datagen.reports.accounts import Books, account_for
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
+from schemas.keys import shard_folder
 from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
-from schemas.run import Run, shard_folder
+from schemas.run import Run
 from schemas.run_records import Cost, LedgerEntry, QuarantineRecord
 from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard

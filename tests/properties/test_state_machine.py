@@ -27,11 +27,12 @@ from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
 from schemas.garbage import find_garbage, sweep
+from schemas.keys import commit_key, shard_folder
 from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
 from schemas.quarantine import lift_quarantine
 from schemas.record_files import now
-from schemas.run import Run, commit_key, shard_folder
+from schemas.run import Run
 from schemas.run_records import QuarantineRecord
 from schemas.sealing import SEALED, seal, unseal
 from schemas.specification import HeuristicParams

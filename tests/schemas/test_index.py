@@ -19,8 +19,9 @@ from datagen.reports.accounts import Books, account_for
 from schemas.errors import InputError
 from schemas.heads import CommitHead, EndHead, head_of_commit, head_of_end
 from schemas.index import closed_ends, committed_heads, index_files, refresh
+from schemas.keys import commit_key
 from schemas.record_files import encode_record
-from schemas.run import Run, commit_key
+from schemas.run import Run
 from schemas.run_records import Commit, Cost, Host, LedgerEntry
 from tests.made_runs import commit_of, make_run
 

@@ -11,8 +11,8 @@ import pytest
 from schemas.checking import mending
 from schemas.checking.finding import Finding
 from schemas.checking.mending import mend_place
+from schemas.keys import commit_copy_key, commit_key
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.run import commit_copy_key, commit_key
 from schemas.run_records import Cost, LedgerEntry
 from tests.made_runs import make_run, write
 

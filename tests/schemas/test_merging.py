@@ -9,8 +9,9 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS
+from schemas.keys import MERGED, part_folder
 from schemas.lineage import LINEAGE, Lineage, lineage_summary
-from schemas.merged import MERGED, find_scene, open_runs, part_folder, wanted
+from schemas.merged import find_scene, open_runs, wanted
 from schemas.merging import Result, carry_out, plan_merge
 from schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from schemas.record_files import read_record

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from schemas.errors import InputError
+from schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
 from schemas.merging import carry_out, plan_merge
 from schemas.record_files import encode_record
-from schemas.run import REMOVING, Run, commit_copy_key, commit_key, shard_folder
+from schemas.run import Run
 from schemas.storage import Storage
 from tests.made_runs import attempt, make_run, write
 

@@ -9,7 +9,8 @@ import pytest
 import zarr
 
 from schemas.errors import InputError
-from schemas.merged import MERGED, open_runs, part_folder
+from schemas.keys import MERGED, part_folder
+from schemas.merged import open_runs
 from schemas.record_files import encode_record
 from schemas.run import Run
 from schemas.run_records import Merged

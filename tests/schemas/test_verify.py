@@ -12,9 +12,9 @@ import pytest
 
 from schemas.checking.finding import Restore
 from schemas.errors import InputError
-from schemas.merged import MERGED, part_folder
+from schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
 from schemas.record_files import encode_record, signed_json
-from schemas.run import Run, commit_copy_key, commit_key
+from schemas.run import Run
 from schemas.run_records import Merged, QuarantineRecord
 from schemas.sealing import seal
 from schemas.storage import open_storage

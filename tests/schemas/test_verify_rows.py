@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from schemas.fields import REDRAW_CAUSES, RecordSchema
-from schemas.run import Run, commit_copy_key, commit_key
+from schemas.keys import commit_copy_key, commit_key
+from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of
