@@ -1,0 +1,222 @@
+"""What is kept of an evaluated run: a few numbers a candidate and a few words a scene, never its clouds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from train.evaluation.metrics import F64, Bools
+from train.inputs import Array, Batch
+from train.scorers import Scorer
+
+F32 = npt.NDArray[np.float32]
+
+# On a whole grid most candidates are far away or stand in a table, which any rule gets right: accuracy says
+# little without the name of the set.
+CANDIDATE_SETS = ("in-range", "clear", "grid")
+# Columns of the store that a batch has to bring along, beside those that scorers ask for.
+EXTRA = (
+    *("base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
+    *("house_id", "object_name", "object_digest", "scene_index"),
+)
+_EXAMPLE_POINTS = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """N candidates of S scenes. `scene` and `robot` number both through all runs."""
+
+    scene: npt.NDArray[np.int64]  # (N,)
+    robot: npt.NDArray[np.int64]  # (N,)
+    label: Bools  # (N,)
+    is_clear: Bools  # (N,)
+    outcome: npt.NDArray[np.uint8]  # (N,) codes of OUTCOMES
+    base_xy_m: F32  # (N, 2), target frame
+    distance_m: F32  # (N,)
+    mount_distance_m: F32  # (N,)
+    reach_m: F32  # (N,)
+    visibility: F32  # (N,)
+    scores: Mapping[str, F64]  # (N,) each
+    house: Array  # (S,) text
+    target: Array  # (S,) text
+    target_digest: Array  # (S,) text
+    run: npt.NDArray[np.int64]  # (S,) which of the places
+    is_grid: Bools  # (S,) whether all cells of a grid are there, for one robot
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    @property
+    def n_scenes(self) -> int:
+        """S, whatever rows are left of them."""
+        return len(self.house)
+
+    @property
+    def is_reachable(self) -> Bools:
+        """Whether (N,) the target is within the arm's reach from its mount: R_in of the paper."""
+        return self.mount_distance_m <= self.reach_m
+
+    def at(self, rows: Bools) -> Columns:
+        """Some of the candidates (N,); the scenes and their numbers stay."""
+        cut = {name: getattr(self, name)[rows] for name in _ROWS}
+        return Columns(
+            **cut,
+            scores={name: score[rows] for name, score in self.scores.items()},
+            **{name: getattr(self, name) for name in _SCENE_COLUMNS},
+        )
+
+    def of_scenes(self, kept: Bools) -> Columns:
+        """Some of the scenes (S,) with all their rows, numbered anew."""
+        rows = kept[self.scene]
+        cut = {name: getattr(self, name)[rows] for name in _ROWS}
+        cut["scene"] = (np.cumsum(kept) - 1)[cut["scene"]]
+        return Columns(
+            **cut,
+            scores={name: score[rows] for name, score in self.scores.items()},
+            **{name: getattr(self, name)[kept] for name in _SCENE_COLUMNS},
+        )
+
+    def is_in(self, candidates: str) -> Bools:
+        """Which (N,) belong to a set of `CANDIDATE_SETS`."""
+        match candidates:
+            case "clear":
+                return self.is_clear
+            case "in-range":
+                return self.is_clear & self.is_reachable
+            case _:
+                return np.ones(len(self), np.bool_)
+
+
+_SCENE_COLUMNS = ("house", "target", "target_digest", "run", "is_grid")
+_ROWS = tuple(f.name for f in fields(Columns) if f.name not in (*_SCENE_COLUMNS, "scores"))
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """A scene that will be drawn: its number, and P of its points with their colours."""
+
+    scene: int
+    points_m: F32  # (P, 3), target frame
+    rgb: npt.NDArray[np.uint8]  # (P, 3)
+    target_mask: Bools  # (P,)
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The columns of a run, scenes to show, and the seconds that each method took to score all of it."""
+
+    columns: Columns
+    examples: tuple[Example, ...]
+    seconds: Mapping[str, float]
+
+
+def gather(
+    places: Sequence[tuple[int, Iterable[Batch[Array]]]],
+    scorers: Sequence[Scorer],
+    rng: np.random.Generator,
+    n_examples: int = 4,
+    seen: Callable[[int], None] = lambda scenes: None,
+) -> Gathered:
+    """Score every candidate of every place by every scorer, a batch at a time.
+
+    A place is (cells of its whole grids, or 0 where it has none; batches with `EXTRA`). Examples are
+    drawn evenly from the scenes with whole grids and a positive. `seen` is told of each batch's scenes.
+    InputError where a score is no number, and where a scene comes twice.
+    """
+    parts: list[dict[str, Any]] = []
+    seconds = dict.fromkeys((s.name for s in scorers), 0.0)
+    kept = _Reservoir(n_examples, rng)
+    known: set[bytes] = set()
+    n_scenes = n_robots = 0
+    for run, (cells, batches) in enumerate(places):
+        for batch in batches:
+            part = _rows(batch, n_scenes, n_robots)
+            for scorer in scorers:
+                started_s = time.perf_counter()
+                part[f"score {scorer.name}"] = _checked(scorer, batch)
+                seconds[scorer.name] += time.perf_counter() - started_s
+            scenes = len(batch.clouds)
+            part |= _scenes(batch, run, cells)
+            _refuse_twice(batch, part["scene"] - n_scenes, known)
+            kept.offer(batch, part, n_scenes)
+            parts.append(part)
+            n_scenes, n_robots = n_scenes + scenes, n_robots + len(batch.robots)
+            seen(scenes)
+    joined = {name: np.concatenate([p.pop(name) for p in parts]) for name in list(parts[0])}
+    scores = {s.name: joined.pop(f"score {s.name}") for s in scorers}
+    return Gathered(Columns(**joined, scores=scores), tuple(kept.examples), seconds)
+
+
+def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, Array]:
+    robot = batch.candidates.robot_row
+    return {
+        "scene": first_scene + batch.robots.cloud_row[robot],
+        "robot": first_robot + robot,
+        "label": batch.label == 1,
+        "is_clear": batch.extra["base_is_clear"].astype(np.bool_),
+        "outcome": batch.extra["outcome"],
+        "base_xy_m": batch.candidates.base_xy_m,
+        "reach_m": batch.robots.arm_reach_m[robot],
+        **{name: batch.extra[name] for name in ("distance_m", "mount_distance_m", "visibility")},
+    }
+
+
+def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
+    n = len(batch.clouds)
+    robots = np.bincount(batch.robots.cloud_row, minlength=n)
+    candidates = np.bincount(batch.robots.cloud_row[batch.candidates.robot_row], minlength=n)
+    return {
+        "house": batch.extra["house_id"],
+        "target": batch.extra["object_name"][:, 0],
+        "target_digest": batch.extra["object_digest"][:, 0],
+        "run": np.full(n, run, np.int64),
+        "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),
+    }
+
+
+def _checked(scorer: Scorer, batch: Batch[Array]) -> F64:
+    score = np.asarray(scorer.score(batch), np.float64)
+    if score.shape != (len(batch),) or np.isnan(score).any():
+        row = int(np.argmax(np.isnan(score))) if score.shape == (len(batch),) else 0
+        problem = f"no score for sample {batch.sample_id[row].tobytes().hex()}"
+        raise InputError(scorer.name, "score", problem, "Train the model again, or leave this method out")
+    return score
+
+
+def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> None:
+    _, first = np.unique(scene_row, return_index=True)
+    for name in (batch.sample_id[row].tobytes() for row in first):
+        if name in known:
+            raise InputError("RUN", "sample_id", f"{name.hex()} comes twice", "Name every run once")
+        known.add(name)
+
+
+class _Reservoir:
+    """As many of the scenes offered as are wanted, each as likely as any other."""
+
+    def __init__(self, wanted: int, rng: np.random.Generator) -> None:
+        self._wanted, self._rng, self._offered = wanted, rng, 0
+        self.examples: list[Example] = []
+
+    def offer(self, batch: Batch[Array], part: Mapping[str, Array], first_scene: int) -> None:
+        positives = np.bincount(part["scene"] - first_scene, part["label"], len(batch.clouds))
+        for row in np.flatnonzero(part["is_grid"] & (positives > 0)):
+            self._offered += 1
+            place = len(self.examples)
+            if place == self._wanted:
+                place = int(self._rng.integers(self._offered))
+            if place < self._wanted:
+                self.examples[place : place + 1] = [_example(batch, int(row), first_scene)]
+
+
+def _example(batch: Batch[Array], row: int, first_scene: int) -> Example:
+    clouds = batch.clouds
+    n = min(int(clouds.n_points[row]), _EXAMPLE_POINTS)
+    points_m, rgb, mask = (a[row, :n].copy() for a in (clouds.points_m, clouds.rgb, clouds.target_mask))
+    return Example(first_scene + row, points_m, rgb, mask)

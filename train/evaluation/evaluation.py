@@ -1,0 +1,229 @@
+"""Methods held against labels: every number of the tables with its interval, as plain values.
+
+Values are None where nothing can be said, and intervals are those of `train.evaluation.bootstrap`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import InputError
+from train.evaluation import metrics
+from train.evaluation.bootstrap import (
+    Estimate,
+    Weights,
+    are_disjoint,
+    resample_weights,
+    resampled_area_under_roc,
+    summed,
+    verdict,
+)
+from train.evaluation.breakdown import breakdown, groups_of
+from train.evaluation.columns import Columns
+from train.evaluation.grids import picks, select
+from train.evaluation.metrics import F64, Bools
+
+_CURVE_POINTS = 200
+# In the order in which they are told; differences are told of each.
+METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
+
+
+@dataclass(frozen=True)
+class Method:
+    """What is evaluated: its name among the scores, and the regime that trained it ("" of a baseline)."""
+
+    name: str
+    threshold: float
+    stage: str = ""
+
+    @property
+    def only_picks(self) -> bool:
+        """Whether it has no threshold, so that its pick among a robot's candidates is its decision."""
+        return bool(np.isnan(self.threshold))
+
+    def says(self, score: F64, columns: Columns) -> F64:
+        """Its decisions (N,) in [0, 1], among exactly these candidates."""
+        if self.only_picks:
+            return picks(score, columns.robot, columns.is_clear)
+        return (score >= self.threshold).astype(np.float64)
+
+    def says_probabilities(self, score: F64) -> bool:
+        """Whether its scores can be read as probabilities of a good label."""
+        return self.threshold == 0.5 and bool(((score >= 0) & (score <= 1)).all())
+
+
+def evaluate_set(
+    columns: Columns,
+    methods: Sequence[Method],
+    candidates: str,
+    weights: Weights,
+    trained_objects: Collection[str] = (),
+) -> dict[str, Any]:
+    """All that is told of one set of candidates; `weights` (B, S) draw the scenes of `columns`.
+
+    InputError where the set is empty, or its labels are all alike.
+    """
+    columns = columns.at(columns.is_in(candidates))
+    n, positives = len(columns), int(columns.label.sum())
+    if not n:
+        mend = "Choose another set, or evaluate more scenes"
+        raise InputError("--candidates", candidates, "no candidate of these runs is in it", mend)
+    if positives in (0, n):
+        problem = f"all {n:,} candidates have the label {int(positives > 0)}, which any constant predicts"
+        raise InputError("--candidates", candidates, problem, "Evaluate a run with labels of both kinds")
+    said = {m.name: m.says(columns.scores[m.name], columns) for m in methods}
+    estimates = {m.name: _estimates(columns, m, said[m.name], weights) for m in methods}
+    groups = groups_of(columns, trained_objects)
+    return {
+        "candidates": candidates,
+        "count": n,
+        "positives": positives,
+        "scenes": len(np.unique(columns.scene)),
+        "in_reach": _class_counts(columns, columns.is_reachable),
+        "out_of_reach": _class_counts(columns, ~columns.is_reachable),
+        "methods": {
+            m.name: {
+                **{name: said_of(e) for name, e in estimates[m.name].items()},
+                **_calibration(columns, m),
+            }
+            for m in methods
+        },
+        "differences": differences(estimates, METRICS),
+        "curves": {m.name: _curves(columns.label, columns.scores[m.name]) for m in methods},
+        "breakdown": [
+            {**row, "methods": {k: _plain(v) for k, v in row["methods"].items()}}
+            for row in breakdown(groups, columns.label, said)
+        ],
+    }
+
+
+def _estimates(columns: Columns, method: Method, said: F64, weights: Weights) -> dict[str, Estimate]:
+    score, true = columns.scores[method.name], columns.label
+    found: dict[str, Estimate] = {}
+
+    def counted(rows: Bools) -> tuple[F64, F64]:
+        per_scene = metrics.confusion(said[rows], true[rows], columns.scene[rows], columns.n_scenes)
+        return per_scene.sum(axis=0), summed(weights, per_scene)
+
+    whole, drawn = counted(np.ones(len(columns), np.bool_))
+    found["accuracy"] = Estimate(float(metrics.accuracy(whole)), metrics.accuracy(drawn))
+    found["balanced_accuracy"] = Estimate(
+        float(metrics.balanced_accuracy(whole)), metrics.balanced_accuracy(drawn)
+    )
+    found["area_under_roc"] = Estimate(
+        metrics.area_under_roc(true, score), resampled_area_under_roc(weights, true, score, columns.scene)
+    )
+    found["best_pick"] = _picked(columns, method, weights)["good"]
+    for name, rows in (("in_reach", columns.is_reachable), ("out_of_reach", ~columns.is_reachable)):
+        whole, drawn = counted(rows)
+        found[f"accuracy_{name}"] = Estimate(float(metrics.accuracy(whole)), metrics.accuracy(drawn))
+    return found
+
+
+def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights) -> dict[str, Any]:
+    """Grid selection: the best clear candidate of each scene; all scenes of `columns` are whole grids."""
+    clear = columns.is_clear
+    positives = np.bincount(columns.scene, columns.label & clear, columns.n_scenes)
+    offered = np.bincount(columns.scene, clear, columns.n_scenes)
+    some = positives > 0
+    estimates = {m.name: _picked(columns, m, weights) for m in methods}
+    return {
+        "scenes": columns.n_scenes,
+        "scenes_without_positive": int((~some).sum()),
+        "clear_per_scene": float(offered.mean()) if columns.n_scenes else None,
+        "positives_per_scene": float(positives[some].mean()) if some.any() else None,
+        "any_clear": float((positives[some] / offered[some]).mean()) if some.any() else None,
+        "methods": {name: {k: said_of(e) for k, e in found.items()} for name, found in estimates.items()},
+        "differences": differences(estimates, ("good",)),
+    }
+
+
+def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Estimate]:
+    """Share of good picks, and mean distance of the others to the nearest good candidate of their robot."""
+    score = columns.scores[method.name]
+    chosen = select(score, columns.label, columns.base_xy_m, columns.robot, columns.is_clear)
+    scene_of = np.zeros(int(columns.robot.max(initial=-1)) + 1, np.int64)
+    scene_of[columns.robot] = columns.scene
+    wrong = 1 - chosen.good
+    parts = np.stack([chosen.good, np.ones_like(wrong), wrong * chosen.missed_m, wrong], axis=1)
+    per_scene = np.zeros((columns.n_scenes, 4))
+    np.add.at(per_scene, scene_of[chosen.group], parts)
+    whole, drawn = per_scene.sum(axis=0), summed(weights, per_scene)
+    return {
+        "good": Estimate(float(_share(whole, 0)), _share(drawn, 0)),
+        "missed_m": Estimate(float(_share(whole, 2)), _share(drawn, 2)),
+    }
+
+
+def _share(sums: F64, first: int) -> F64:
+    part, whole = sums[..., first], sums[..., first + 1]
+    # Shares of tied picks add up to 1 but for their last bits; so do those of wrong ones to 0.
+    return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 1e-9)
+
+
+def differences(
+    estimates: Mapping[str, Mapping[str, Estimate]], names: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Every two methods by each metric: the difference, what can be said of it, and of the two intervals."""
+    return [
+        {
+            "metric": metric,
+            "first": first,
+            "second": second,
+            **said_of(difference := estimates[first][metric].minus(estimates[second][metric])),
+            "verdict": verdict(difference),
+            "disjoint": are_disjoint(estimates[first][metric], estimates[second][metric]),
+        }
+        for metric in names
+        for first, second in combinations(estimates, 2)
+    ]
+
+
+def said_of(estimate: Estimate) -> dict[str, float | None]:
+    """Value and interval as JSON has them."""
+    low, high = estimate.interval()
+    return {"value": _finite(estimate.value), "low": _finite(low), "high": _finite(high)}
+
+
+def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:
+    """The resamples of these scenes; the same for the same number of scenes and seed."""
+    return resample_weights(columns.n_scenes, n_resamples, np.random.default_rng([seed, columns.n_scenes]))
+
+
+def _calibration(columns: Columns, method: Method) -> dict[str, Any]:
+    score, true = columns.scores[method.name], columns.label
+    if method.only_picks or not method.says_probabilities(score):
+        return {"brier": None, "expected_calibration_error": None, "reliability": None}
+    bins = metrics.reliability(true, score)
+    rows = zip(bins.count.tolist(), bins.said.tolist(), bins.true.tolist(), strict=True)
+    return {
+        "brier": metrics.brier(true, score),
+        "expected_calibration_error": bins.expected_error,
+        "reliability": [{"count": c, "said": p, "true": t} for c, p, t in rows],
+    }
+
+
+def _curves(true: Bools, score: F64) -> dict[str, Any]:
+    curves = {"roc": metrics.roc(true, score), "precision_recall": metrics.precision_recall(true, score)}
+    thin = {name: curve.thinned(_CURVE_POINTS) for name, curve in curves.items()}
+    return {
+        "average_precision": metrics.average_precision(true, score),
+        **{name: {"x": c.x.round(6).tolist(), "y": c.y.round(6).tolist()} for name, c in thin.items()},
+    }
+
+
+def _class_counts(columns: Columns, rows: Bools) -> dict[str, int]:
+    return {"count": int(rows.sum()), "positives": int(columns.label[rows].sum())}
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: _finite(value) for name, value in values.items()}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,74 @@
+"""Choosing one of many: the best-scored candidate of each robot, and how far off a wrong one is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from train.evaluation.metrics import F64, Bools, Ints
+
+
+def picks(score: F64, group: Ints, allowed: Bools) -> F64:
+    """Share (N,) of each group's pick: 1 for the best-scored allowed candidate, 0 for others.
+
+    Of k best that no score tells apart each has 1/k: what drawing one of them gives on average. A group
+    without an allowed candidate picks none.
+    """
+    share = np.zeros(len(score))
+    rows = np.flatnonzero(allowed)
+    if not len(rows):
+        return share
+    n_groups = int(group.max()) + 1
+    best = np.full(n_groups, -np.inf)
+    np.maximum.at(best, group[rows], score[rows])
+    top = rows[score[rows] == best[group[rows]]]
+    share[top] = 1 / np.bincount(group[top], minlength=n_groups)[group[top]]
+    return share
+
+
+def nearest_positive_m(base_xy_m: npt.NDArray[np.floating], true: Bools, group: Ints, asked: Bools) -> F64:
+    """Distance (N,) on the floor from each asked candidate to the nearest positive of its group.
+
+    nan for others, and where a group has no positive.
+    """
+    found = np.full(len(true), np.nan)
+    asked_rows, positive_rows = np.flatnonzero(asked), np.flatnonzero(true)
+    positives = positive_rows[np.argsort(group[positive_rows], kind="stable")]
+    starts = np.searchsorted(group[positives], group[asked_rows], "left")
+    ends = np.searchsorted(group[positives], group[asked_rows], "right")
+    xy = base_xy_m.astype(np.float64)
+    for row, start, end in zip(asked_rows, starts, ends, strict=True):
+        if end > start:
+            found[row] = np.linalg.norm(xy[positives[start:end]] - xy[row], axis=1).min()
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What a method picked in each of G groups: its share of good picks, and how far the others missed.
+
+    `missed_m` is the mean distance of the wrong picks, 0 where none was wrong.
+    """
+
+    group: npt.NDArray[np.intp]  # (G,) those with an allowed candidate and a positive
+    good: F64  # (G,)
+    missed_m: F64  # (G,)
+
+
+def select(
+    score: F64, true: Bools, base_xy_m: npt.NDArray[np.floating], group: Ints, allowed: Bools
+) -> Selection:
+    """The picks among allowed candidates (N,), over groups that have a positive among them."""
+    n_groups = int(group.max(initial=-1)) + 1
+    true = true & allowed
+    counted = np.flatnonzero(np.bincount(group[true], minlength=n_groups))
+    share = picks(score, group, allowed & np.isin(group, counted))
+    wrong = (share > 0) & ~true
+    miss_m = np.where(wrong, nearest_positive_m(base_xy_m, true, group, wrong), 0.0)
+    good = np.bincount(group, share * true, n_groups)
+    missed = np.bincount(group, share * wrong, n_groups)
+    distance_m = np.bincount(group, share * miss_m, n_groups)
+    mean_m = np.divide(distance_m, missed, out=np.zeros(n_groups), where=missed > 0)
+    return Selection(counted, good[counted], mean_m[counted])

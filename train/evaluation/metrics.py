@@ -1,0 +1,128 @@
+"""How scores and decisions stand to labels. Arrays are (N,); nan where nothing can be said.
+
+A decision is the share of it that says good: 0 or 1, or 1/k for each of k candidates that a method which
+picks one cannot tell apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Bools = npt.NDArray[np.bool_]
+F64 = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.integer[Any]]
+
+N_BINS = 10
+
+
+def confusion(said: F64, true: Bools, group: Ints, n_groups: int) -> F64:
+    """True and false positives, false and true negatives (n_groups, 4) of decisions in [0, 1], by group."""
+    parts = (said * true, said * ~true, (1 - said) * true, (1 - said) * ~true)
+    return np.stack([np.bincount(group, part, n_groups) for part in parts], axis=1)
+
+
+def accuracy(counts: F64) -> F64:
+    """Share (...) of right decisions, of confusions (..., 4)."""
+    return _ratio(counts[..., 0] + counts[..., 3], counts.sum(axis=-1))
+
+
+def balanced_accuracy(counts: F64) -> F64:
+    """Mean (...) of the shares of positives and of negatives that are found, of confusions (..., 4).
+
+    0.5 for a method that looks at nothing, however rare positives are.
+    """
+    found = _ratio(counts[..., 0], counts[..., 0] + counts[..., 2])
+    refused = _ratio(counts[..., 3], counts[..., 3] + counts[..., 1])
+    return (found + refused) / 2
+
+
+def _ratio(part: F64, whole: F64) -> F64:
+    return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Points (K,) of a curve in order; equal scores give one point, since no threshold parts them."""
+
+    x: F64
+    y: F64
+
+    def thinned(self, most: int) -> Curve:
+        """At most `most` of the points, evenly along the curve, both ends among them."""
+        if len(self.x) <= most:
+            return self
+        along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.x)) + np.abs(np.diff(self.y)))])
+        rows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], most)).clip(max=len(along) - 1))
+        rows[-1] = len(along) - 1
+        return Curve(self.x[rows], self.y[rows])
+
+
+def _steps(true: Bools, score: F64) -> tuple[F64, F64]:
+    """True and false positives (K,) when all from the k-th highest distinct score on are called good."""
+    order = np.argsort(-score, kind="stable")
+    ordered = score[order]  # compared and not subtracted: scores may be infinite
+    last_of_ties = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
+    positives = np.cumsum(true[order])[last_of_ties]
+    return positives.astype(np.float64), (last_of_ties + 1 - positives).astype(np.float64)
+
+
+def roc(true: Bools, score: F64) -> Curve:
+    """Shares of negatives (x) and of positives (y) called good, from none to all. Needs both classes."""
+    positives, negatives = _steps(true, score)
+    return Curve(
+        np.concatenate([[0.0], negatives / negatives[-1]]), np.concatenate([[0.0], positives / positives[-1]])
+    )
+
+
+def area_under_roc(true: Bools, score: F64) -> float:
+    """Chance that a good candidate scores above a bad one, ties counting half; nan with one class."""
+    if not len(true) or true.all() or not true.any():
+        return float("nan")
+    curve = roc(true, score)
+    return float(np.trapezoid(curve.y, curve.x))
+
+
+def precision_recall(true: Bools, score: F64) -> Curve:
+    """Share of positives found (x) and how many of those called good are (y). Needs a positive."""
+    positives, negatives = _steps(true, score)
+    return Curve(positives / positives[-1], positives / (positives + negatives))
+
+
+def average_precision(true: Bools, score: F64) -> float:
+    """Precision at each threshold, weighted by the recall it adds; nan without a positive."""
+    if not true.any():
+        return float("nan")
+    curve = precision_recall(true, score)
+    return float(np.sum(np.diff(curve.x, prepend=0.0) * curve.y))
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Candidates (K,) by bins of the probability that was said: how many, what was said, what was so."""
+
+    count: npt.NDArray[np.int64]
+    said: F64
+    true: F64
+
+    @property
+    def expected_error(self) -> float:
+        """Expected calibration error: mean distance of the said from the true share, by candidate."""
+        return float(np.average(np.abs(self.said - self.true), weights=self.count))
+
+
+def reliability(true: Bools, probability: F64, bins: int = N_BINS) -> Reliability:
+    """Equally wide bins of [0, 1] that hold any; the last holds 1 as well."""
+    row = np.minimum((probability * bins).astype(np.int64), bins - 1)
+    count = np.bincount(row, minlength=bins)
+    held = count > 0
+    said, positives = (np.bincount(row, values, bins)[held] / count[held] for values in (probability, true))
+    return Reliability(count[held], said, positives)
+
+
+def brier(true: Bools, probability: F64) -> float:
+    """Mean squared difference of what was said and what was so."""
+    return float(np.mean((probability - true) ** 2))
