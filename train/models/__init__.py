@@ -7,9 +7,11 @@ from typing import Any
 
 from schemas.errors import InputError, choices
 from train.models.model import Model
+from train.models.paper import PaperModel
 from train.models.shared import SharedModel
 
 MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "paper": PaperModel,
     "shared": SharedModel,
 }
 

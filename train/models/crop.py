@@ -1,0 +1,75 @@
+"""What a robot is given of its cloud: the points within its reach of the target, coloured and shifted.
+
+Every model takes its cloud from here and from nowhere else, so that all see the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from train.inputs import Clouds, Robots
+
+# The colour that marks the target (GBPP, arXiv 2509.11594), of 255.
+TARGET_RGB = (0.0, 77.0, 77.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """K points for each of R robots; rows that are not `valid` are zero and come last.
+
+    Frame: xy is the target frame's; z is counted from the arm's mount instead, upwards.
+    """
+
+    points_m: Tensor  # (R, K, 3) float32
+    rgb: Tensor  # (R, K, 3) float32, 0 to 1, the target in TARGET_RGB
+    target_mask: Tensor  # (R, K) bool
+    valid: Tensor  # (R, K) bool
+    target_rise_m: Tensor  # (R,) float32, of the target's centre above the mount
+
+    def take(self, robot_row: Tensor) -> Crop:
+        """The crops of the given robots."""
+        return Crop(
+            self.points_m[robot_row],
+            self.rgb[robot_row],
+            self.target_mask[robot_row],
+            self.valid[robot_row],
+            self.target_rise_m[robot_row],
+        )
+
+
+def crop_clouds(clouds: Clouds[Tensor], robots: Robots[Tensor], n_points: int) -> Crop:
+    """The first `n_points` stored points of each robot's cloud within `arm_reach_m` of the target, in 3D.
+
+    Stored order: the head of a cloud is in farthest-point order, so that what is taken covers it.
+    Rows beyond a cloud's own `n_points`, and points that are not finite, are never taken.
+    """
+    device = clouds.points_m.device
+    stored = clouds.points_m[robots.cloud_row]  # (R, P, 3)
+    n_stored = stored.shape[1]
+    counts = torch.arange(n_stored, device=device) < clouds.n_points[robots.cloud_row, None]
+    inside = counts & (torch.linalg.vector_norm(stored, dim=2) <= robots.arm_reach_m[:, None])
+    rank = inside.cumsum(1)  # 1 for the first inside
+    # Points that are left out all go to slot 0, which is cut off.
+    slot = torch.where(inside & (rank <= n_points), rank, 0)
+    source = torch.zeros((len(robots), n_points + 1), dtype=torch.int64, device=device)
+    source.scatter_(1, slot, torch.arange(n_stored, device=device).expand(slot.shape))
+    source = source[:, 1:]
+    valid = torch.arange(n_points, device=device) < inside.sum(1, keepdim=True)
+
+    rows = robots.cloud_row[:, None]
+    if n_stored == 0:
+        shape = (len(robots), n_points, 3)
+        points = rgb = torch.zeros(shape, device=device)
+        mask = torch.zeros(shape[:2], dtype=torch.bool, device=device)
+    else:
+        points = clouds.points_m[rows, source]
+        rgb = clouds.rgb[rows, source].to(points.dtype)
+        mask = clouds.target_mask[rows, source] & valid
+    rgb = torch.where(mask[..., None], rgb.new_tensor(TARGET_RGB), rgb) / 255.0
+    rise = clouds.target_height_m[robots.cloud_row] - robots.base_height_m
+    points = points + torch.nn.functional.pad(rise[:, None, None], (2, 0))
+    keep = valid[..., None]
+    return Crop(torch.where(keep, points, 0.0), torch.where(keep, rgb, 0.0), mask, valid, rise)

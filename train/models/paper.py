@@ -1,0 +1,197 @@
+"""The paper's model: each candidate is put into the cloud as points, and PointNet++ reads the whole.
+
+GBPP, arXiv 2509.11594: points (x, y, z, r, g, b) within the arm's reach of the target, z shifted by the
+height of the base, the target in one colour, the candidate as 50 black points at (x, y, 0); PointNet++
+(Qi et al. 2017, arXiv 1706.02413) with three set-abstraction layers; a head 1024 -> 512 -> 256 -> 2 with
+BatchNorm and Dropout. Every candidate costs a pass through the network.
+
+Ours, where the paper is silent:
+
+- z = 0 of the candidate's points is in the shifted frame, so that they lie at the arm's mount.
+- Sizes and radii are those of PointNet++'s single-scale classifier. Lengths stay metric (its clouds were
+  scaled to a unit sphere; ours lie within at most 1 m of the target, so that its radii fit).
+- Colours run from 0 to 1. Nothing but its colour and place tells the candidate from a black object:
+  the six numbers a point leave no room for a mask, and none was added.
+- The 50 points follow the cloud. A ball query takes the first k of a ball, so that they fill what room
+  the surface leaves; they are one point for sampling, which takes it first and then goes through the
+  robot's cloud, whose sample is therefore the same for all candidates and drawn once a robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from train.inputs import Candidates, Clouds, Robots
+from train.models.crop import Crop, crop_clouds
+from train.models.grouping import ball_query, farthest_points, gather_rows
+from train.models.layers import PointMlp, empty_logits
+from train.models.model import Model, ModelConfig, read_config
+
+CANDIDATE_POINTS = 50
+# Candidates that go through the network together where no gradient is kept: some 30 MB each at full size.
+_CHUNK = 8
+
+Width = Annotated[int, Field(ge=1, le=4096)]
+Count = Annotated[int, Field(ge=2, le=8192)]
+Radius = Annotated[float, Field(gt=0, le=10)]
+
+
+class PaperConfig(ModelConfig):
+    """Sizes of PointNet++; the defaults are those of its single-scale classifier."""
+
+    n_points: int = Field(default=2048, ge=1, le=65_536)
+    centroids: tuple[Count, Count] = (512, 128)
+    neighbours: tuple[Width, Width] = (32, 64)
+    radii_m: tuple[Radius, Radius] = (0.2, 0.4)
+    widths: tuple[tuple[Width, ...], tuple[Width, ...], tuple[Width, ...]] = (
+        (64, 64, 128),
+        (128, 128, 256),
+        (256, 512, 1024),
+    )
+    head: tuple[Width, ...] = (512, 256)
+    dropout: float = Field(default=0.5, ge=0, lt=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups:
+    """What grouping is the same for all candidates of a robot: the parts that are of its cloud alone."""
+
+    crop: Crop
+    first: Tensor  # (R, J1 - 1) rows of the cloud: its farthest-point sample
+    first_valid: Tensor  # (R, J1 - 1)
+    near: Tensor  # (R, J1 - 1, k1) rows of the cloud around each
+    near_found: Tensor  # (R, J1 - 1)
+    wide: Tensor  # (R, J2 - 1, k2) rows of `first` around the first J2 - 1 of them
+
+    def take(self, robot_row: Tensor) -> _Groups:
+        """Those of the given robots."""
+        tensors = (self.first, self.first_valid, self.near, self.near_found, self.wide)
+        return _Groups(self.crop.take(robot_row), *(t[robot_row] for t in tensors))
+
+
+class PaperModel(Model):
+    """PointNet++ over cloud and candidate.
+
+    In training all candidates of a batch go through together, because BatchNorm looks at all of them,
+    and keep some 100 MB each at full size; in evaluation memory is bounded.
+    """
+
+    name = "paper"
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        self.sizes = read_config(PaperConfig, self.name, config)
+        super().__init__(self.sizes)
+        first, second, third = self.sizes.widths
+        self.first = PointMlp(3 + 3, first)
+        self.second = PointMlp(3 + first[-1], second)
+        self.third = PointMlp(3 + second[-1], third)
+        layers: list[nn.Module] = []
+        width = third[-1]
+        for narrower in self.sizes.head:
+            layers += [PointMlp(width, (narrower,)), nn.Dropout(self.sizes.dropout)]
+            width = narrower
+        self.head = nn.Sequential(*layers, nn.Linear(width, 2))
+
+    def forward(
+        self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+    ) -> Tensor:
+        """Logits (N, 2)."""
+        if not len(candidates):
+            return empty_logits(candidates.base_xy_m)
+        with torch.no_grad():
+            groups = self._group(crop_clouds(clouds, robots, self.sizes.n_points))
+        chunk = len(candidates) if self.training else _CHUNK
+        logits = [
+            self._score(groups.take(candidates.robot_row[rows]), candidates.base_xy_m[rows])
+            for rows in _slices(len(candidates), chunk)
+        ]
+        return torch.cat(logits).float()
+
+    def _group(self, crop: Crop) -> _Groups:
+        """Robot by robot, so that memory does not grow with their number."""
+        (count, count_wide), (k_near, k_wide) = self.sizes.centroids, self.sizes.neighbours
+        first = farthest_points(crop.points_m, crop.valid, count - 1)
+        first_valid = torch.arange(count - 1, device=first.device) < crop.valid.sum(1, keepdim=True)
+        near, wide = [], []
+        for robot in _slices(len(first), 1):
+            points, valid = crop.points_m[robot], crop.valid[robot]
+            centres = gather_rows(points, first[robot])
+            near.append(ball_query(points, valid, centres, self.sizes.radii_m[0], k_near))
+            wide.append(
+                ball_query(
+                    centres,
+                    first_valid[robot],
+                    centres[:, : count_wide - 1],
+                    self.sizes.radii_m[1],
+                    k_wide,
+                )[0]
+            )
+        return _Groups(
+            crop,
+            first,
+            first_valid,
+            torch.cat([rows for rows, _ in near]),
+            torch.cat([found for _, found in near]),
+            torch.cat(wide),
+        )
+
+    def _score(self, groups: _Groups, base_xy_m: Tensor) -> Tensor:
+        """Logits (C, 2) of C candidates with the groups of their robots."""
+        crop = groups.crop
+        clump = nn.functional.pad(base_xy_m, (0, 1))[:, None]  # (C, 1, 3)
+        points = torch.cat([crop.points_m, clump], dim=1)
+        colours = torch.cat([crop.rgb, torch.zeros_like(clump)], dim=1)
+        centres, rows = self._first_groups(groups, clump)
+        features = self._abstract(self.first, points, colours, centres, rows)
+        wide, rows = self._second_groups(groups, clump, centres)
+        features = self._abstract(self.second, centres, features, wide, rows)
+        features = self.third(torch.cat([wide, features], dim=2)).amax(1)
+        return self.head(features)
+
+    def _first_groups(self, groups: _Groups, clump: Tensor) -> tuple[Tensor, Tensor]:
+        """Centroids (C, J1, 3), the candidate first, and rows of cloud and clump around them."""
+        k, radius = self.sizes.neighbours[0], self.sizes.radii_m[0]
+        crop, n = groups.crop, groups.crop.points_m.shape[1]
+        centres = gather_rows(crop.points_m, groups.first)
+        # What a smaller cloud lacks in centroids is filled with the candidate.
+        centres = torch.where(groups.first_valid[..., None], centres, clump)
+        own, own_found = ball_query(crop.points_m, crop.valid, clump, radius, k)
+        rows = torch.where(groups.first_valid[..., None], groups.near, own)
+        found = torch.where(groups.first_valid, groups.near_found, own_found)
+        rows, found = torch.cat([own, rows], dim=1), torch.cat([own_found, found], dim=1)
+        centres = torch.cat([clump, centres], dim=1)
+        close = (centres - clump).square().sum(2) <= radius**2
+        slot = torch.arange(k, device=rows.device)
+        room = (slot >= found[..., None]) & (slot < found[..., None] + CANDIDATE_POINTS) & close[..., None]
+        rows = torch.where(room, n, rows)
+        # A ball without a surface point is filled up with the candidate.
+        return centres, torch.where((found == 0)[..., None], n, rows)
+
+    def _second_groups(self, groups: _Groups, clump: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+        """Centroids (C, J2, 3) of the second layer, the candidate first, and rows of `centres`."""
+        k, radius = self.sizes.neighbours[1], self.sizes.radii_m[1]
+        wide = centres[:, : groups.wide.shape[1] + 1]
+        everywhere = torch.ones_like(centres[..., 0], dtype=torch.bool)
+        own, _ = ball_query(centres, everywhere, clump, radius, k)
+        close = (wide[:, 1:] - clump).square().sum(2, keepdim=True) <= radius**2
+        others = groups.wide + 1
+        joined = torch.cat([torch.zeros_like(others[..., :1]), others[..., :-1]], dim=2)
+        rows = torch.where(close, joined, others)
+        rows = torch.where(groups.first_valid[:, : rows.shape[1], None], rows, own)
+        return wide, torch.cat([own, rows], dim=1)
+
+    @staticmethod
+    def _abstract(layer: PointMlp, points: Tensor, features: Tensor, centres: Tensor, rows: Tensor) -> Tensor:
+        """Features (C, J, F) of groups: their points relative to the centroid, through `layer`, max."""
+        offsets = gather_rows(points, rows) - centres[:, :, None]
+        return layer(torch.cat([offsets, gather_rows(features, rows)], dim=3)).amax(2)
+
+
+def _slices(n: int, size: int) -> Iterator[slice]:
+    return (slice(start, start + size) for start in range(0, n, size))
