@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from schemas.sealing import SEALED
 from workers.geometry.mesh import F64
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from schemas.fields import OUTCOMES, REDRAW_CAUSES, SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
+from schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
+from schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from schemas.run_records import FORMAT_VERSION
 from schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
 

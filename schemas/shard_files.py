@@ -24,7 +24,8 @@ from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from schemas.errors import InputError
-from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
+from schemas.fields import Field, RecordSchema, Table
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.run_records import Layout
 
 Array = npt.NDArray[Any]

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, sized_schema
+from schemas.fields import Field, RecordSchema, sized_schema
 from schemas.identity import sample_ids
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.record_files import now
 from schemas.run import Run
 from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest

@@ -19,8 +19,9 @@ import numpy as np
 
 from schemas.cost import StageClock
 from schemas.errors import InputError
-from schemas.fields import REDRAW_CAUSES, SceneRows, sized_schema
+from schemas.fields import SceneRows, sized_schema
 from schemas.identity import sample_ids
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates
 from workers.labels import load_label_source

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from datagen.drawing.outcome_colours import LOOKS
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from workers.geometry.mesh import F64
 
 _DOT, _LEGEND_DOT = 34, 70  # areas in points^2

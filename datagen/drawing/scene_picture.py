@@ -19,7 +19,7 @@ from datagen.drawing.floor_plan import (
     draw_scores,
     frame_axes,
 )
-from schemas.fields import REDRAW_CAUSES
+from schemas.outcomes import REDRAW_CAUSES
 from workers.geometry.mesh import F64
 from workers.geometry.planar import convex_hull
 from workers.rendering.frame import Frame

@@ -20,7 +20,7 @@ from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.retrial import Retrial, try_again
 from datagen.drawing.shown import Lines, Shown
 from schemas.errors import InputError
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from workers.labels.trials import arm_of
 from workers.scenes.recall import recall_candidates
 

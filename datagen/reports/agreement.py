@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float32]

@@ -13,9 +13,10 @@ import numpy as np
 
 from schemas.checking.finding import Finding, Remake, curable
 from schemas.errors import InputError
-from schemas.fields import REDRAW_CAUSES, Field, RecordSchema, Table
+from schemas.fields import Field, RecordSchema, Table
 from schemas.identity import sample_ids
 from schemas.keys import commit_key, shard_folder
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.run import Run
 from schemas.run_records import Commit, FileEntry
 from schemas.shard_files import (

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 from schemas.errors import InputError
-from schemas.fields import REDRAW_CAUSES
 from schemas.keys import shard_folder
 from schemas.ledger import end_key, start_key
 from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
 from schemas.merging.ledgers import UnitedAttempt, united_attempts
 from schemas.merging.plan import Holding, Union
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.root_records import copy_key, publish
 from schemas.run import Run

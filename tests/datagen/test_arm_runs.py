@@ -9,7 +9,7 @@ import pytest
 
 from datagen import cli
 from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from schemas.run import Run
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run

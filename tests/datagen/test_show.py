@@ -11,7 +11,7 @@ from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
 from datagen.drawing.outcome_colours import LOOKS
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from schemas.run import Run
 from schemas.scene_rows import read_scene
 from tests.refusals import refused

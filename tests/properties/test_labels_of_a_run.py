@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from schemas.fields import REDRAW_CAUSES
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.run import Run
 from schemas.specification import Specification
 from tests.independent import camera_axes, pixel_counts, score

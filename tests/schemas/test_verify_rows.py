@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.fields import REDRAW_CAUSES, RecordSchema
+from schemas.fields import RecordSchema
 from schemas.keys import commit_copy_key, commit_key
+from schemas.outcomes import REDRAW_CAUSES
 from schemas.run import Run
 from schemas.run_records import LedgerEntry
 from schemas.shard_files import encode_shard

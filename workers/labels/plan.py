@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.cost import StageClock
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from schemas.specification import Specification
 from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64

@@ -14,8 +14,8 @@ import numpy as np
 
 from schemas.cost import StageClock
 from schemas.errors import InputError
-from schemas.fields import OUTCOMES
 from schemas.identity import Stream, generator
+from schemas.outcomes import OUTCOMES
 from schemas.specification import ArmParams, DisturbanceParams, Specification
 from workers.bases.candidates import Candidates
 from workers.bases.clearance import base_clearance_m

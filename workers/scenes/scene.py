@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from schemas.fields import REDRAW_CAUSES
+from schemas.outcomes import REDRAW_CAUSES
 from workers.geometry.mesh import F64
 from workers.houses.house import Surface
 from workers.objects.model import ObjectModel

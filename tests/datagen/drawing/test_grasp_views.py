@@ -8,7 +8,7 @@ import pytest
 from datagen.drawing.arm_picture import best_success, reach_radius_m
 from datagen.drawing.grasp_views import hand_outline, used_grasps
 from datagen.drawing.posed_robot import robot_bodies
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from workers.geometry.transforms import inverse, translation, yaw_pose
 
 pytest.importorskip("pinocchio", reason="needs the extra `sim`")

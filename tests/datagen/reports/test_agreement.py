@@ -23,7 +23,7 @@ from datagen.reports.agreement import (
     outcome_report,
 )
 from datagen.reports.labelled import join_labelled
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 
 CODES = {name: code for code, name in enumerate(OUTCOMES)}
 

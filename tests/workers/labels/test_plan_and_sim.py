@@ -9,7 +9,8 @@ import pytest
 
 from schemas.cost import StageClock
 from schemas.errors import InputError
-from schemas.fields import OUTCOMES, SCHEMAS
+from schemas.fields import SCHEMAS
+from schemas.outcomes import OUTCOMES
 from schemas.specification import (
     ArmParams,
     CandidateParams,

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from tests.workers.motion.tables import (
     BOX_M,
     PARAMS,
