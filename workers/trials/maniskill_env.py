@@ -7,20 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sapien
 import torch
-from mani_skill.agents.base_agent import BaseAgent
-from mani_skill.agents.controllers.pd_joint_pos import (
-    PDJointPosController,
-    PDJointPosControllerConfig,
-    PDJointPosMimicController,
-    PDJointPosMimicControllerConfig,
-)
-from mani_skill.agents.registration import register_agent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.registration import register_env
@@ -36,6 +27,7 @@ from workers.robots.robot import Robot
 from workers.robots.urdf import read_urdf
 from workers.settling.sapien_bodies import sapien_pose
 from workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
+from workers.trials.maniskill_agent import agent_of
 from workers.trials.physics import (
     ARM,
     CARRIER,
@@ -52,14 +44,7 @@ from workers.trials.physics import (
     tune_shape,
 )
 from workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
-from workers.trials.script import (
-    FINGER_DAMPING,
-    FINGER_STIFFNESS,
-    Tick,
-    planned_rise_m,
-    pressing_target_m,
-    script_of,
-)
+from workers.trials.script import Tick, planned_rise_m, pressing_target_m, script_of
 from workers.trials.trial import Disturbance
 
 ENV_ID = "DatagenGrasp-v1"
@@ -78,65 +63,6 @@ class GraspTask:
     @property
     def T_world_true_base(self) -> F64:
         return self.T_world_base @ self.disturbance.T_base_moved
-
-
-class _FromLastTarget(PDJointPosController):
-    """Targets go evenly from the last one to the next; ManiSkill's own start from where the joints are."""
-
-    def set_action(self, action: Any) -> None:
-        start = torch.as_tensor(self._target_qpos).clone()
-        super().set_action(action)
-        self._start_qpos = start
-        self._step_size = (torch.as_tensor(self._target_qpos) - start) / self._sim_steps
-
-
-class _FingersFromLastTarget(_FromLastTarget, PDJointPosMimicController):
-    """One action for both fingers."""
-
-
-@dataclass
-class _ArmConfig(PDJointPosControllerConfig):
-    controller_cls = _FromLastTarget
-
-
-@dataclass
-class _FingersConfig(PDJointPosMimicControllerConfig):
-    controller_cls = _FingersFromLastTarget
-
-
-@lru_cache(maxsize=64)
-def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
-    """A registered ManiSkill agent for a robot, `pd_joint_pos` alone.
-
-    Actions (A + 1,): targets of the arm's joints in radians and of both fingers in metres, as they are.
-    """
-    first, second = robot.finger_joint_names
-
-    class DatagenArm(BaseAgent):
-        uid = f"datagen-{robot.urdf.stem}-{grip_force_n:g}"
-        urdf_path = str(robot.urdf)
-        disable_self_collisions = True
-
-        @property
-        def _controller_configs(self) -> Any:
-            arm = _ArmConfig(
-                list(robot.joint_names), None, None, robot.stiffness, robot.damping, robot.force_limit_n,
-                interpolate=True, normalize_action=False,
-            )  # fmt: skip
-            fingers = _FingersConfig(
-                [first, second],
-                -grip_force_n / FINGER_STIFFNESS,
-                robot.gripper.max_opening_m / 2,
-                FINGER_STIFFNESS,
-                FINGER_DAMPING,
-                grip_force_n,
-                interpolate=True,
-                normalize_action=False,
-                mimic={second: {"joint": first}},  # pyright: ignore[reportArgumentType]
-            )
-            return {"pd_joint_pos": {"arm": arm, "gripper": fingers}}
-
-    return register_agent()(DatagenArm)
 
 
 class _BodyBuilder(ActorBuilder):

@@ -1,0 +1,82 @@
+"""A robot as an agent of ManiSkill, whose joints follow their targets as those of a trial do.
+
+Never imported by a worker: ManiSkill loads torch and every environment it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.pd_joint_pos import (
+    PDJointPosController,
+    PDJointPosControllerConfig,
+    PDJointPosMimicController,
+    PDJointPosMimicControllerConfig,
+)
+from mani_skill.agents.registration import register_agent
+
+from workers.robots.robot import Robot
+from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
+
+
+class _FromLastTarget(PDJointPosController):
+    """Targets go evenly from the last one to the next; ManiSkill's own start from where the joints are."""
+
+    def set_action(self, action: Any) -> None:
+        start = torch.as_tensor(self._target_qpos).clone()
+        super().set_action(action)
+        self._start_qpos = start
+        self._step_size = (torch.as_tensor(self._target_qpos) - start) / self._sim_steps
+
+
+class _FingersFromLastTarget(_FromLastTarget, PDJointPosMimicController):
+    """One action for both fingers."""
+
+
+@dataclass
+class _ArmConfig(PDJointPosControllerConfig):
+    controller_cls = _FromLastTarget
+
+
+@dataclass
+class _FingersConfig(PDJointPosMimicControllerConfig):
+    controller_cls = _FingersFromLastTarget
+
+
+@lru_cache(maxsize=64)
+def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
+    """A registered ManiSkill agent for a robot, `pd_joint_pos` alone.
+
+    Actions (A + 1,): targets of the arm's joints in radians and of both fingers in metres, as they are.
+    """
+    first, second = robot.finger_joint_names
+
+    class DatagenArm(BaseAgent):
+        uid = f"datagen-{robot.urdf.stem}-{grip_force_n:g}"
+        urdf_path = str(robot.urdf)
+        disable_self_collisions = True
+
+        @property
+        def _controller_configs(self) -> Any:
+            arm = _ArmConfig(
+                list(robot.joint_names), None, None, robot.stiffness, robot.damping, robot.force_limit_n,
+                interpolate=True, normalize_action=False,
+            )  # fmt: skip
+            fingers = _FingersConfig(
+                [first, second],
+                -grip_force_n / FINGER_STIFFNESS,
+                robot.gripper.max_opening_m / 2,
+                FINGER_STIFFNESS,
+                FINGER_DAMPING,
+                grip_force_n,
+                interpolate=True,
+                normalize_action=False,
+                mimic={second: {"joint": first}},  # pyright: ignore[reportArgumentType]
+            )
+            return {"pd_joint_pos": {"arm": arm, "gripper": fingers}}
+
+    return register_agent()(DatagenArm)
