@@ -1,4 +1,4 @@
-"""Accuracy by kinds of candidates: by object, by distance, by what is seen, by cause, by what was trained on."""
+"""Accuracy by kinds of candidates: object, distance, what is seen, cause, what was trained on."""
 
 from __future__ import annotations
 

@@ -162,8 +162,7 @@ def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Est
 
 def _share(sums: F64, first: int) -> F64:
     part, whole = sums[..., first], sums[..., first + 1]
-    # Shares of tied picks add up to 1 but for their last bits; so do those of wrong ones to 0.
-    return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 1e-9)
+    return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
 
 
 def differences(

@@ -65,10 +65,10 @@ def select(
     true = true & allowed
     counted = np.flatnonzero(np.bincount(group[true], minlength=n_groups))
     share = picks(score, group, allowed & np.isin(group, counted))
-    wrong = (share > 0) & ~true
+    picked = share > 0
+    wrong = picked & ~true
     miss_m = np.where(wrong, nearest_positive_m(base_xy_m, true, group, wrong), 0.0)
-    good = np.bincount(group, share * true, n_groups)
-    missed = np.bincount(group, share * wrong, n_groups)
-    distance_m = np.bincount(group, share * miss_m, n_groups)
-    mean_m = np.divide(distance_m, missed, out=np.zeros(n_groups), where=missed > 0)
-    return Selection(counted, good[counted], mean_m[counted])
+    # All picks of a group have the same share, so that counts give exact ones.
+    n, n_wrong = (np.bincount(group[rows], minlength=n_groups)[counted] for rows in (picked, wrong))
+    sums_m = np.bincount(group, miss_m, n_groups)[counted]
+    return Selection(counted, (n - n_wrong) / n, sums_m / np.maximum(n_wrong, 1))

@@ -22,7 +22,7 @@ N_BINS = 10
 def confusion(said: F64, true: Bools, group: Ints, n_groups: int) -> F64:
     """True and false positives, false and true negatives (n_groups, 4) of decisions in [0, 1], by group."""
     parts = (said * true, said * ~true, (1 - said) * true, (1 - said) * ~true)
-    return np.stack([np.bincount(group, part, n_groups) for part in parts], axis=1)
+    return np.stack([np.bincount(group, part, n_groups) for part in parts], axis=1).astype(np.float64)
 
 
 def accuracy(counts: F64) -> F64:

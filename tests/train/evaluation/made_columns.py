@@ -1,0 +1,44 @@
+"""Columns of random candidates: metrics care for numbers, not for where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from schemas.fields import OUTCOMES
+from train.evaluation.columns import Columns
+
+
+def make_columns(
+    rng: np.random.Generator,
+    n_scenes: int = 12,
+    per_scene: int = 20,
+    scores: Mapping[str, np.ndarray] | None = None,
+    positive_share: float = 0.3,
+) -> Columns:
+    """Scenes of one robot each; positives are clear and within reach, as simulated ones are."""
+    n = n_scenes * per_scene
+    scene = np.repeat(np.arange(n_scenes), per_scene)
+    is_clear = rng.random(n) < 0.7
+    mount_m = rng.uniform(0, 1.5, n).astype(np.float32)
+    reach_m = np.repeat(rng.uniform(0.5, 1.0, n_scenes).astype(np.float32), per_scene)
+    label = (rng.random(n) < positive_share) & is_clear & (mount_m <= reach_m)
+    return Columns(
+        scene=scene,
+        robot=scene.copy(),
+        label=label,
+        is_clear=is_clear,
+        outcome=np.where(label, 0, rng.integers(1, len(OUTCOMES), n)).astype(np.uint8),
+        base_xy_m=rng.uniform(-1, 1, (n, 2)).astype(np.float32),
+        distance_m=(mount_m * 0.9).astype(np.float32),
+        mount_distance_m=mount_m,
+        reach_m=reach_m,
+        visibility=rng.random(n).astype(np.float32),
+        scores=dict(scores) if scores is not None else {"random": rng.random(n)},
+        house=np.array([f"house-{k % 5}" for k in range(n_scenes)], object),
+        target=np.array([f"object-{k % 3}" for k in range(n_scenes)], object),
+        target_digest=np.array([f"{k % 3}" * 64 for k in range(n_scenes)], object),
+        run=np.zeros(n_scenes, np.int64),
+        is_grid=np.ones(n_scenes, np.bool_),
+    )
