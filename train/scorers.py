@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from train.inputs import Array, Batch
+
+if TYPE_CHECKING:
+    from train.models import Model
 
 
 class Scorer(Protocol):
@@ -26,3 +30,23 @@ class Scorer(Protocol):
     def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
         """Scores (N,) of a batch's candidates; higher is better."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class ModelScorer:
+    """A model in evaluation mode: its probability of label 1."""
+
+    model: Model
+    name: str
+    threshold: float = 0.5
+
+    def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
+        """Probabilities (N,); all of the batch goes through the model at once."""
+        import torch
+
+        from train.tensors import to_torch
+
+        with torch.inference_mode():
+            given = to_torch(batch, self.model.device)
+            logits = self.model.score(given.clouds, given.candidates, given.robots).double()
+            return torch.softmax(logits, dim=1)[:, 1].cpu().numpy()

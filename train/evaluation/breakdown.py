@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from train.evaluation.columns import Columns
 from train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from schemas.fields import OUTCOMES
+from schemas.outcomes import OUTCOMES
 from train.evaluation.columns import Columns
 
 
