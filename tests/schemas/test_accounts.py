@@ -13,7 +13,7 @@ from schemas.ledger import end_from_commit, lost_end
 from schemas.quarantine import lift_quarantine
 from schemas.record_files import decode_record
 from schemas.run import Run, commit_copy_key, commit_key
-from schemas.run_records import AttemptStart, Cost, LedgerEntry, QuarantineRecord
+from schemas.run_records import AttemptStart, Cost, LedgerEntry, Outcome, QuarantineRecord
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import make_run
 from tests.schemas.checked import check, edit, folder_of, found
@@ -142,7 +142,9 @@ def test_attempts_without_an_end_are_lost_once_their_shards_are_decided(run: Run
 
 
 def test_a_shard_that_the_ledger_alone_calls_committed_is_lost(run: Run) -> None:
-    for attempt, shard, outcome in (("other", 1, "committed"), ("x", 2, "failed"), ("gone", 0, "committed")):
+    told: dict[str, tuple[int, Outcome]]
+    told = {"other": (1, "committed"), "x": (2, "failed"), "gone": (0, "committed")}
+    for attempt, (shard, outcome) in told.items():
         run.ledger.start(attempt, shard)
         run.ledger.end(LedgerEntry(attempt=attempt, shard=shard, outcome=outcome, cost=COST))
     _, checked = check(folder_of(run))
