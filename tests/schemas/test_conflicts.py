@@ -116,6 +116,7 @@ def test_only_scenes_that_both_hold_are_compared(tmp_path: Path) -> None:
     apart, other = made(tmp_path / "apart", 0, change(1), 4), made(tmp_path / "other", 0, change(3), 4)
     refuse_different_rows(small, 1, apart, 0)
     refuse_different_rows(apart, 0, small, 1)
+    refuse_different_rows(made(tmp_path / "low", 0), 0, other, 0)
     words = f"label differs, first in sample {sample(small, 1, 5)}, in label"
     told = refusal(small, 1, other, 0)
     assert "small: shard 1: " in told and f"shards/000001/small/{words}" in told
