@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from train.inputs import Clouds, Robots
+from train.models.grouping import first_true
 
 # The colour that marks the target (GBPP, arXiv 2509.11594), of 255.
 TARGET_RGB = (0.0, 77.0, 77.0)
@@ -51,13 +52,7 @@ def crop_clouds(clouds: Clouds[Tensor], robots: Robots[Tensor], n_points: int) -
     n_stored = stored.shape[1]
     counts = torch.arange(n_stored, device=device) < clouds.n_points[robots.cloud_row, None]
     inside = counts & (torch.linalg.vector_norm(stored, dim=2) <= robots.arm_reach_m[:, None])
-    rank = inside.cumsum(1)  # 1 for the first inside
-    # Points that are left out all go to slot 0, which is cut off.
-    slot = torch.where(inside & (rank <= n_points), rank, 0)
-    source = torch.zeros((len(robots), n_points + 1), dtype=torch.int64, device=device)
-    source.scatter_(1, slot, torch.arange(n_stored, device=device).expand(slot.shape))
-    source = source[:, 1:]
-    valid = torch.arange(n_points, device=device) < inside.sum(1, keepdim=True)
+    source, valid = first_true(inside, n_points)
 
     rows = robots.cloud_row[:, None]
     if n_stored == 0:

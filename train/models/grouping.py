@@ -1,9 +1,23 @@
-"""Farthest-point sampling and ball queries in plain torch, for many clouds at once (Qi et al. 2017)."""
+"""Choosing points in plain torch, for many clouds at once: the first of a kind, the farthest, those near."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+
+def first_true(mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Where the first `count` true entries of (..., K) are: rows (..., count), and which of them there are.
+
+    Rows beyond those found are 0.
+    """
+    rank = mask.cumsum(-1)  # 1 for the first one
+    # All that is left out goes to slot 0, which is cut off.
+    slot = torch.where(mask & (rank <= count), rank, 0)
+    rows = torch.zeros((*mask.shape[:-1], count + 1), dtype=torch.int64, device=mask.device)
+    rows.scatter_(-1, slot, torch.arange(mask.shape[-1], device=mask.device).expand(slot.shape))
+    found = torch.arange(count, device=mask.device) < mask.sum(-1, keepdim=True)
+    return rows[..., 1:], found
 
 
 def farthest_points(points: Tensor, valid: Tensor, count: int) -> Tensor:
@@ -13,12 +27,12 @@ def farthest_points(points: Tensor, valid: Tensor, count: int) -> Tensor:
     rows repeat earlier ones; what they are where nothing is valid means nothing.
     """
     chosen = torch.zeros((len(points), count), dtype=torch.int64, device=points.device)
-    gap = torch.where(valid, torch.inf, -1.0).to(points.dtype)  # (B, M), to the nearest chosen point
+    gap2 = torch.where(valid, torch.inf, -1.0).to(points.dtype)  # (B, M), to the nearest chosen point
     row = chosen[:, :1]
     for k in range(1, count):
         last = points.gather(1, row[..., None].expand(-1, -1, 3))
-        gap = torch.minimum(gap, (points - last).square().sum(2))
-        row = gap.argmax(1, keepdim=True)
+        gap2 = torch.minimum(gap2, (points - last).square().sum(2))
+        row = gap2.argmax(1, keepdim=True)
         chosen[:, k : k + 1] = row
     return chosen
 
@@ -29,18 +43,11 @@ def ball_query(
     """The first `count` valid rows of each cloud (B, M, 3) within `radius` of its centres (B, J, 3).
 
     Returns rows (B, J, count), filled up with the first one found (0 where none is), and how many
-    were found (B, J), at most `count`.
+    were found (B, J), at most `count`. PointNet++ (Qi et al. 2017) groups so.
     """
     gap2 = (centres[:, :, None] - points[:, None]).square().sum(3)  # (B, J, M)
-    inside = valid[:, None] & (gap2 <= radius**2)
-    rank = inside.cumsum(2)
-    slot = torch.where(inside & (rank <= count), rank, 0)
-    rows = torch.zeros((*gap2.shape[:2], count + 1), dtype=torch.int64, device=points.device)
-    rows.scatter_(2, slot, torch.arange(points.shape[1], device=points.device).expand(slot.shape))
-    found = inside.sum(2).clamp(max=count)
-    rows = rows[..., 1:]
-    spare = torch.arange(count, device=points.device) >= found[..., None]
-    return torch.where(spare, rows[..., :1], rows), found
+    rows, found = first_true(valid[:, None] & (gap2 <= radius**2), count)
+    return torch.where(found, rows, rows[..., :1]), found.sum(2)
 
 
 def gather_rows(values: Tensor, rows: Tensor) -> Tensor:

@@ -40,6 +40,7 @@ _CHUNK = 8
 Width = Annotated[int, Field(ge=1, le=4096)]
 Count = Annotated[int, Field(ge=2, le=8192)]
 Radius = Annotated[float, Field(gt=0, le=10)]
+Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
 
 
 class PaperConfig(ModelConfig):
@@ -49,12 +50,12 @@ class PaperConfig(ModelConfig):
     centroids: tuple[Count, Count] = (512, 128)
     neighbours: tuple[Width, Width] = (32, 64)
     radii_m: tuple[Radius, Radius] = (0.2, 0.4)
-    widths: tuple[tuple[Width, ...], tuple[Width, ...], tuple[Width, ...]] = (
+    widths: tuple[Widths, Widths, Widths] = (
         (64, 64, 128),
         (128, 128, 256),
         (256, 512, 1024),
     )
-    head: tuple[Width, ...] = (512, 256)
+    head: Widths = (512, 256)
     dropout: float = Field(default=0.5, ge=0, lt=1)
 
 

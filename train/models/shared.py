@@ -1,44 +1,195 @@
-"""Encodes what a robot sees once, and scores all its candidates on that encoding."""
+"""Encodes what a robot sees once, and scores all its candidates on that encoding.
+
+The cloud becomes some 160 tokens: places on the target, near it and further away, with the shape of what is
+around them (`train.models.tokens`). A candidate sees each token from its own frame: what has a direction is
+turned into the frame, and offsets from its line of sight and from its arm's way are added
+(`train.models.frames`). A first layer over all of that is linear, so that the part that belongs to the
+token is worked out once for all candidates, and the part that turns is a product with (1, cos, sin, cos 2,
+sin 2) of the frame's angle:
+
+    token_kj = relu(A f_j + turn_k(V f_j) + B g_kj + C s_k)
+
+then a small layer, and the maximum and the mean over each kind of token, joined with the candidate's
+scalars s_k. The logits do not change when cloud and candidates are turned together about the vertical.
+
+The computation is the same in training and in evaluation (LayerNorm, no BatchNorm).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from train.inputs import Candidates, Clouds, Robots
+from train.models.crop import crop_clouds
+from train.models.frames import N_PAIR_FEATURES, N_SCALARS, Frames, frames_of, pair_features, target_features
+from train.models.layers import empty_logits, mlp
 from train.models.model import Model, ModelConfig, read_config
+from train.models.tiles import tiles
+from train.models.tokens import (
+    N_KINDS,
+    TARGET_NUMBERS,
+    TARGET_TENSORS,
+    TARGET_VECTORS,
+    Tokens,
+    token_sizes,
+    tokens_of,
+)
+
+# Candidates that are worked on together: their tokens stay in a core's cache. A GPU wants more at once.
+_TILE_CPU, _TILE_CUDA = 64, 4096
+# Height of an unknown camera above the mount: the difference of the middles of both ranges in the paper.
+_CAMERA_ABOVE_MOUNT_M = 0.4
+_MIN_REACH_M = 0.05
+
+Width = Annotated[int, Field(ge=1, le=1024)]
+Count = Annotated[int, Field(ge=1, le=1024)]
+Scale = Annotated[float, Field(gt=0, le=10)]
 
 
 class SharedConfig(ModelConfig):
-    """Sizes of the shared model."""
+    """Sizes and inputs of the shared model.
 
-    width: int = Field(default=128, ge=4, le=1024)
+    `camera`: "given", or "unknown" for what `paper` sees, which knows the robot's mount and not its camera.
+    """
+
+    n_points: int = Field(default=2048, ge=1, le=65_536)
+    tokens: tuple[Count, Count, Count] = (32, 64, 64)  # on the target, near it, further away
+    near_m: float = Field(default=0.25, gt=0, le=10)
+    scales_m: tuple[Scale, ...] = Field(default=(0.03, 0.08, 0.2), min_length=1, max_length=8)
+    width: Width = 64
+    embedding: Width = 128
+    head: tuple[Width, ...] = Field(default=(128, 64), max_length=8)
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+    camera: Literal["given", "unknown"] = "given"
 
 
 class SharedModel(Model):
-    """Scalars of candidate and robot through an MLP."""
+    """Tokens of a robot's cloud, read from each candidate's frame."""
 
     name = "shared"
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        sizes = read_config(SharedConfig, self.name, config)
-        super().__init__(sizes)
-        w = sizes.width
-        self.head = nn.Sequential(nn.Linear(6, w), nn.ReLU(), nn.Linear(w, w), nn.ReLU(), nn.Linear(w, 2))
+        self.sizes = read_config(SharedConfig, self.name, config)
+        super().__init__(self.sizes)
+        width, embedding = self.sizes.width, self.sizes.embedding
+        token = token_sizes(len(self.sizes.scales_m))
+        n_scalars = N_SCALARS + TARGET_NUMBERS + 2 * (TARGET_VECTORS + TARGET_TENSORS)
+        self.token = nn.Sequential(
+            nn.Linear(token.numbers, width),
+            nn.LayerNorm(width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+        )
+        self.vectors = nn.Linear(2 * token.vectors, width, bias=False)
+        self.tensors = nn.Linear(2 * token.tensors, width, bias=False)
+        self.gates = nn.Linear(width, token.vectors + token.tensors)
+        self.pair = nn.Linear(N_PAIR_FEATURES, width, bias=False)
+        self.condition = nn.Linear(n_scalars, width, bias=False)
+        self.seen = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        self.pooled = nn.Linear(2 * N_KINDS * width, embedding)
+        self.scalars = nn.Sequential(nn.Linear(n_scalars, 64), nn.ReLU(), nn.Linear(64, embedding))
+        self.head = nn.Sequential(
+            nn.LayerNorm(2 * embedding),
+            nn.ReLU(),
+            nn.Dropout(self.sizes.dropout),
+            mlp(2 * embedding, self.sizes.head, 2),
+        )
 
     def forward(
         self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
     ) -> Tensor:
         """Logits (N, 2)."""
-        robot = candidates.robot_row
-        cloud = robots.cloud_row[robot]
-        planar_m = torch.linalg.vector_norm(candidates.base_xy_m, dim=1)
-        rise_m = clouds.target_height_m[cloud] - robots.base_height_m[robot]
-        reach_m = robots.arm_reach_m[robot]
-        camera_m = robots.camera_height_m[robot] - clouds.target_height_m[cloud]
-        scalars = [planar_m, rise_m, reach_m, torch.hypot(planar_m, rise_m) / reach_m, camera_m]
-        return self.head(torch.stack([*scalars, clouds.target_radius_m[cloud]], dim=1))
+        if not len(candidates):
+            return empty_logits(candidates.base_xy_m)
+        return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
+
+    def encode(self, clouds: Clouds[Tensor], robots: Robots[Tensor]) -> Tokens:
+        """What of the clouds is the same for all candidates; it has no parameters, so it can be kept."""
+        with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
+            crop = crop_clouds(clouds, robots, self.sizes.n_points)
+            return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
+
+    def score_tokens(
+        self, tokens: Tokens, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+    ) -> Tensor:
+        """Logits (N, 2) from what `encode` gave for the same clouds and robots."""
+        with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
+            frames = self._frames(tokens, clouds, candidates, robots)
+            target = target_features(frames, tokens, candidates.robot_row)
+            scalars = torch.cat([frames.scalars(), target], dim=1)
+        steered = self._steered(tokens)
+        condition = self.condition(scalars)
+        tile = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
+        cut = tiles(candidates.robot_row, tile)
+        pooled = [
+            self._pool(
+                steered[robot],
+                frames.take(rows),
+                condition[rows],
+                tokens.centres_m[robot],
+                tokens.valid[robot],
+            )
+            for robot, rows in cut
+        ]
+        rows = torch.cat([rows.flatten() for _, rows in cut])
+        seen = self.pooled(torch.cat([p.flatten(0, 1) for p in pooled])[torch.argsort(rows)])
+        return self.head(torch.cat([seen, self.scalars(scalars)], dim=1)).float()
+
+    def _frames(
+        self, tokens: Tokens, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+    ) -> Frames:
+        rise_m = tokens.target_rise_m
+        if self.sizes.camera == "given":
+            camera_rise_m = robots.camera_height_m - clouds.target_height_m[robots.cloud_row]
+        else:
+            camera_rise_m = _CAMERA_ABOVE_MOUNT_M - rise_m
+        row = candidates.robot_row
+        reach_m = robots.arm_reach_m.clamp(min=_MIN_REACH_M)
+        of_robots = (t[row] for t in (rise_m, camera_rise_m, reach_m, tokens.target_radius_m))
+        return frames_of(candidates.base_xy_m, *of_robots)
+
+    def _steered(self, tokens: Tokens) -> Tensor:
+        """(R, 5, J, W): what `Frames.steering` is multiplied with to give the tokens' linear part."""
+        hidden = self.token[:-1](tokens.numbers)
+        gates = 2 * torch.sigmoid(self.gates(hidden))[..., None]
+        n_vectors = tokens.vectors.shape[2]
+        vectors = tokens.vectors * gates[:, :, :n_vectors]
+        tensors = tokens.tensors * gates[:, :, n_vectors:]
+        return torch.stack(
+            [self.token[-1](hidden), *_turning(self.vectors, vectors), *_turning(self.tensors, tensors)],
+            dim=1,
+        )
+
+    def _pool(
+        self, steered: Tensor, frames: Frames, condition: Tensor, centres_m: Tensor, valid: Tensor
+    ) -> Tensor:
+        """(r, c, F) of c candidates each of r robots."""
+        r, _, j, w = steered.shape
+        linear = torch.bmm(frames.steering(), steered.flatten(2)).view(r, -1, j, w)
+        pairs = pair_features(frames, centres_m[:, None])
+        features = torch.relu(linear + self.pair(pairs) + condition[:, :, None])
+        features = self.seen(features) * valid[:, None, :, None]
+        parts: list[Tensor] = []
+        for of_kind, there in zip(
+            features.split(self.sizes.tokens, dim=2), valid.split(self.sizes.tokens, dim=1), strict=True
+        ):
+            n = there.sum(1).clamp(min=1)[:, None, None]
+            parts += [of_kind.amax(2), of_kind.sum(2) / n]
+        return torch.cat(parts, dim=2)
+
+
+def _turning(layer: nn.Linear, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    """What of `layer` on turned pairs (R, J, n, 2) is multiplied with cos and sin of the frame's angle.
+
+    A pair (x, y) is (x cos + y sin, y cos - x sin) in the frame; the layer's weight has its columns so.
+    """
+    along, left = layer.weight.chunk(2, dim=1)
+    x, y = pairs.unbind(-1)
+    return x @ along.T + y @ left.T, y @ along.T - x @ left.T
