@@ -50,3 +50,10 @@ class ModelScorer:
             given = to_torch(batch, self.model.device)
             logits = self.model.score(given.clouds, given.candidates, given.robots).double()
             return torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
+
+
+def use_threads(n: int) -> None:
+    """Let torch compute on n threads from now on, in all of this process."""
+    import torch
+
+    torch.set_num_threads(n)

@@ -1,0 +1,138 @@
+"""`datagen evaluate`: models and baselines held against simulated labels, beside the paper's numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from datagen.console.options import AsJson
+from datagen.console.printing import print_json, print_rows
+from datagen.console.steps import counting
+from datagen.console.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+
+_MOST_RESAMPLES = 100_000
+
+
+def evaluate(
+    places: Annotated[
+        list[str],
+        Parameter(negative=(), help="Checkpoints of `datagen train`, and runs of sim (or plan) labels."),
+    ],
+    *,
+    candidates: Annotated[
+        list[Literal["grid", "clear", "in-range"]] | None,
+        Parameter(
+            negative=(), help="Sets of candidates to tell of; again for more [all that the runs hold]."
+        ),
+    ] = None,
+    fit: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Runs in validation houses, on which baselines are fitted."),
+    ] = None,
+    baselines: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Which baselines stand beside the models, or none [all that can]."),
+    ] = None,
+    detector: Annotated[
+        Path | None, Parameter(help="Folder of a zero-shot object detector, for the baseline with one.")
+    ] = None,
+    bootstrap: Annotated[
+        int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
+    ] = 1000,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of resamples and of the scenes shown.")] = 0,
+    allow_seen_houses: Annotated[
+        bool, Parameter(negative=(), help="Tell apart of houses that were trained on, instead of refusing.")
+    ] = False,
+    threads: Annotated[
+        int | None, WHOLE_NUMBER, Parameter(help="Threads that models compute on [torch's choice].")
+    ] = None,
+    html: Annotated[Path | None, Parameter(help="Write a page with tables, curves and grids.")] = None,
+    json: AsJson = False,
+) -> int:
+    """How good models are, beside baselines and the paper: accuracy, reach, grid selection, calibration.
+
+    Methods are compared over named sets of candidates (grid: all cells; clear: where the base fits; in-range:
+    those within the arm's reach too), with intervals by resampling scenes. Files are checkpoints, folders
+    and s3:// addresses runs. A house that a model was trained on is refused.
+    """
+    # Imported here: other verbs wait neither for these nor for torch.
+    import numpy as np
+
+    from datagen.evaluating.contestants import open_models
+    from datagen.evaluating.lineup import open_baselines
+    from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
+    from datagen.evaluating.report import evaluation_report
+    from datagen.evaluating.tables import print_evaluation
+    from train.evaluation.columns import gather
+
+    _refuse_odd(bootstrap, seed, threads, html)
+    checkpoints, runs = tell_apart(places)
+    if threads is not None:
+        from train.scorers import use_threads
+
+        use_threads(threads)
+    opened = open_places(runs)
+    sets = sets_of(opened, candidates or [])
+    models = open_models(checkpoints)
+    if not allow_seen_houses:
+        refuse_seen_houses(opened, models)
+    others, fitted_on = open_baselines(baselines, fit or [], detector)
+    if not allow_seen_houses:
+        refuse_seen_houses(opened, [], fitted_on)
+    contestants = [*others, *models]
+    if not contestants:
+        mend = "Name a checkpoint, or leave --baselines out"
+        raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
+    with counting("scenes") as seen:
+        total, done = sum(place.stream.n_scenes for place in opened), 0
+
+        def step(scenes: int) -> None:
+            nonlocal done
+            done += scenes
+            seen(done, total)
+
+        batches = [(place.cells, place.stream.epoch(0)) for place in opened]
+        rng = np.random.default_rng([seed, 0])
+        gathered = gather(batches, [c.scorer for c in contestants], rng, seen=step)
+    houses = fitted_on.union(*(model.houses for model in models))
+    report = evaluation_report(
+        gathered, contestants, opened, sets, seen_houses=houses, fit=fit or [], resamples=bootstrap, seed=seed
+    )
+    if html is not None:
+        from datagen.evaluating.page import page_of
+
+        write_page(html, page_of(report, gathered))
+    if json:
+        print_json(report)
+        return 0
+    print_evaluation(report)
+    if html is not None:
+        print_rows("written", [("page", str(html))])
+    return 0
+
+
+def write_page(path: Path, text: str) -> None:
+    """Replace the file as a whole."""
+    new = path.with_name(f".{path.name}.new")
+    try:
+        new.write_text(text, encoding="utf-8")
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:
+    if not 1 <= bootstrap <= _MOST_RESAMPLES:
+        mend = f"Give 1 to {_MOST_RESAMPLES}; 1000 is usual"
+        raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
+    if seed < 0:
+        raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+    if threads is not None and not 1 <= threads <= 1024:
+        raise InputError("--threads", str(threads), "not a usable number of threads", "Give 1 or more")
+    if html is not None and html.suffix.lower() not in (".html", ".htm"):
+        raise InputError(html, "--html", "is not an .html file", "Give a name that ends in .html")
+    if html is not None and not html.parent.is_dir():
+        raise InputError(html, "--html", "its folder does not exist", "Make the folder first")

@@ -1,0 +1,1 @@
+"""What `datagen evaluate` opens, tells and draws; the numbers come from train.evaluation."""

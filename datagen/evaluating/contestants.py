@@ -1,0 +1,104 @@
+"""Who is evaluated: models by their checkpoints, and baselines."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from schemas.errors import InputError
+from train.evaluation.evaluation import Method
+from train.scorers import ModelScorer, Scorer
+
+if TYPE_CHECKING:
+    from train.training.checkpoints import CheckpointHead
+
+# What a checkpoint's stage is called as a regime of training: stage 2 is the end of two.
+REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
+
+
+@dataclass(frozen=True, eq=False)
+class Contestant:
+    """One method with where it comes from; baselines have neither place nor checkpoint."""
+
+    scorer: Scorer
+    place: str = ""
+    head: CheckpointHead | None = None
+
+    @property
+    def regime(self) -> str:
+        """How the model was trained; "" of a baseline."""
+        return REGIMES.get(self.head.stage, self.head.stage) if self.head else ""
+
+    @property
+    def method(self) -> Method:
+        """As metrics know it."""
+        return Method(self.scorer.name, self.scorer.threshold, self.regime)
+
+    @property
+    def houses(self) -> frozenset[str]:
+        """Houses that it was trained on, or by which its best epoch was chosen."""
+        return frozenset(self.head.house_ids + self.head.val_house_ids) if self.head else frozenset()
+
+    @property
+    def objects(self) -> frozenset[str]:
+        """Digests of the objects that it was trained on."""
+        return frozenset(self.head.object_digests) if self.head else frozenset()
+
+    def record(self) -> dict[str, Any]:
+        """What the report says of it."""
+        base = {
+            "name": self.scorer.name,
+            "regime": self.regime or None,
+            "threshold": None if self.method.only_picks else self.scorer.threshold,
+        }
+        if self.head is None:
+            return {**base, "checkpoint": None}
+        head = self.head
+        return {
+            **base,
+            "checkpoint": {
+                "place": self.place,
+                "sha256": head.digest,
+                "model": head.model,
+                "config": head.model_config,
+                "stage": head.stage,
+                "data": list(head.data),
+                "best_epoch": head.best_epoch,
+                "finished": head.finished,
+                "cost": head.cost,
+                "init": head.init,
+            },
+        }
+
+
+def open_models(places: Sequence[str]) -> list[Contestant]:
+    """The models of these checkpoints, named by their regimes, and by what else tells equal ones apart."""
+    if not places:
+        return []
+    from train.training.checkpoints import load_model
+
+    loaded = [(place, *load_model(place)) for place in places]
+    names = _names([(REGIMES.get(head.stage, head.stage), head.model) for _, _, head in loaded])
+    by_digest: dict[str, str] = {}
+    for place, _, head in loaded:
+        if head.digest in by_digest:
+            raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
+        by_digest[head.digest] = place
+    return [
+        Contestant(ModelScorer(model, name), place, head)
+        for (place, model, head), name in zip(loaded, names, strict=True)
+    ]
+
+
+def _names(known: Sequence[tuple[str, str]]) -> list[str]:
+    """A name for each (regime, model): the regime alone, with the model, or with a number as well."""
+    regimes, both = Counter(regime for regime, _ in known), Counter(known)
+    numbers: Counter[tuple[str, str]] = Counter()
+    names: list[str] = []
+    for regime, model in known:
+        numbers[regime, model] += 1
+        name = regime if regimes[regime] == 1 else f"{regime} {model}"
+        names.append(name if both[regime, model] == 1 else f"{name} {numbers[regime, model]}")
+    return names

@@ -1,0 +1,102 @@
+"""The evaluation as plain values: who, on what, and every number with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from datagen import __version__
+from datagen.evaluating.contestants import Contestant
+from datagen.evaluating.places import Place
+from train.evaluation import paper
+from train.evaluation.bootstrap import LEVEL
+from train.evaluation.columns import Columns, Gathered
+from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+
+UNSEEN, SEEN = "unseen", "seen"
+
+
+def evaluation_report(
+    gathered: Gathered,
+    contestants: Sequence[Contestant],
+    places: Sequence[Place],
+    sets: Sequence[str],
+    *,
+    seen_houses: frozenset[str],
+    fit: Sequence[str],
+    resamples: int,
+    seed: int,
+) -> dict[str, Any]:
+    """All tables and curves. Scenes in houses that somebody was trained on are a part of their own."""
+    columns = gathered.columns
+    methods = [c.method for c in contestants]
+    objects = frozenset[str]().union(*(c.objects for c in contestants))
+    is_seen = np.isin(columns.house.astype(str), np.array(sorted(seen_houses), str))
+    parts = [
+        {
+            "houses": name,
+            **_part(columns.of_scenes(scenes), methods, sets, objects, resamples, seed),
+        }
+        for name, scenes in ((UNSEEN, ~is_seen), (SEEN, is_seen))
+        if scenes.any()
+    ]
+    n = len(columns)
+    return {
+        "datagen": __version__,
+        "paper": paper_record(),
+        "runs": [place.record() for place in places],
+        "fitted_on": list(fit),
+        "methods": [
+            {
+                **c.record(),
+                "seconds": gathered.seconds[c.scorer.name],
+                "seconds_per_600": gathered.seconds[c.scorer.name] * paper.TIMED_CANDIDATES / n,
+            }
+            for c in contestants
+        ],
+        "bootstrap": {"resamples": resamples, "seed": seed, "level": LEVEL, "by": "scene"},
+        "candidates": list(sets),
+        "seen_houses": sorted(set(columns.house[is_seen].tolist())),
+        "parts": parts,
+    }
+
+
+def _part(
+    columns: Columns,
+    methods: Sequence[Method],
+    sets: Sequence[str],
+    objects: frozenset[str],
+    resamples: int,
+    seed: int,
+) -> dict[str, Any]:
+    weights = weights_for(columns, resamples, seed)
+    grids, why = None, None
+    if not columns.is_grid.any():
+        why = "no scene has every cell of its grid for one robot: submit sim with --candidates-per-scene grid"
+    else:
+        whole = columns.of_scenes(columns.is_grid)
+        grids = evaluate_grids(whole, methods, weights_for(whole, resamples, seed))
+        if grids["scenes"] == grids["scenes_without_positive"]:
+            grids, why = None, f"none of {grids['scenes']} whole grids has a good candidate"
+    return {
+        "scenes": columns.n_scenes,
+        "house_count": len(set(columns.house.tolist())),
+        "candidates": len(columns),
+        "sets": {name: evaluate_set(columns, methods, name, weights, objects) for name in sets},
+        "grids": grids,
+        "no_grids": why,
+    }
+
+
+def paper_record() -> dict[str, Any]:
+    """The paper's own numbers, as the report holds them."""
+    return {
+        "source": paper.SOURCE,
+        "accuracy": dict(paper.ACCURACY),
+        "accuracy_out_of_reach": paper.ACCURACY_OUT_OF_REACH,
+        "grid_selection": paper.GRID_SELECTION,
+        "grid_miss_m": paper.GRID_MISS_M,
+        "seconds_per_600": paper.TIMED_S,
+    }

@@ -1,0 +1,83 @@
+"""Numbers of an evaluation as people read them, on a terminal and on a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+METRIC_WORDS = {
+    "accuracy": "accuracy",
+    "balanced_accuracy": "balanced accuracy",
+    "area_under_roc": "AUC",
+    "best_pick": "best pick good",
+    "good": "good picks",
+}
+SET_WORDS = {
+    "in-range": "clear and within reach",
+    "clear": "clear",
+    "grid": "all cells, also where the base collides",
+}
+
+
+def percent(value: float | None) -> str:
+    """0.8413 as 84.1."""
+    return "-" if value is None else f"{100 * value:.1f}"
+
+
+def with_interval(estimate: Mapping[str, float | None]) -> str:
+    """Percent with its interval: 84.1 [82.0, 86.2]."""
+    if estimate["value"] is None:
+        return "-"
+    return f"{percent(estimate['value'])} [{percent(estimate['low'])}, {percent(estimate['high'])}]"
+
+
+def metres_with_interval(estimate: Mapping[str, float | None]) -> str:
+    """Metres with their interval: 0.24 [0.20, 0.31]."""
+    if estimate["value"] is None:
+        return "-"
+    low, high = (f"{e:.2f}" if (e := estimate[k]) is not None else "-" for k in ("low", "high"))
+    return f"{estimate['value']:.2f} [{low}, {high}]"
+
+
+def method_label(record: Mapping[str, Any]) -> str:
+    """A method's name, with a mark where it has no threshold."""
+    return record["name"] + (" *" if record["threshold"] is None else "")
+
+
+def paper_accuracy(record: Mapping[str, Any], paper: Mapping[str, Any]) -> float | None:
+    """What the paper states for the same method or regime, if it does."""
+    return paper["accuracy"].get(record["regime"] or record["name"])
+
+
+def models_first(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Methods with those that were trained before the baselines."""
+    return sorted(records, key=lambda record: record["regime"] is None)
+
+
+def compared(differences: Sequence[Mapping[str, Any]], metric: str, name: str) -> dict[str, list[str]]:
+    """Whom a method is `above`, `below` and `open` to by a metric; + where the intervals are disjoint too."""
+    found: dict[str, list[str]] = {"above": [], "open": [], "below": []}
+    other_way = {"above": "below", "below": "above", "open": "open"}
+    for d in differences:
+        if d["metric"] != metric or name not in (d["first"], d["second"]):
+            continue
+        is_first = d["first"] == name
+        said = d["verdict"] if is_first else other_way[d["verdict"]]
+        found[said].append((d["second"] if is_first else d["first"]) + ("+" if d["disjoint"] else ""))
+    return found
+
+
+def candidates_line(told: Mapping[str, Any]) -> str:
+    """How large a set is: 1,200 candidates of 80 scenes (clear), 31.0% good."""
+    share = percent(told["positives"] / told["count"])
+    words = SET_WORDS[told["candidates"]]
+    return f"{told['count']:,} candidates of {told['scenes']:,} scenes ({words}), {share}% good"
+
+
+def grids_line(grids: Mapping[str, Any]) -> str:
+    """How many whole grids there are, and what choosing blindly would give."""
+    counted = grids["scenes"] - grids["scenes_without_positive"]
+    return (
+        f"{counted:,} whole grids with a good candidate, {grids['scenes_without_positive']:,} without; "
+        f"of their clear candidates {percent(grids['any_clear'])}% are good"
+    )
