@@ -1,0 +1,108 @@
+"""What every model keeps: order, company and odd clouds make no difference; configurations are checked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from schemas.errors import InputError
+from tests.train.models.made_batches import drawn_tables, small_model
+from train.inputs import Candidates
+from train.models import MODELS, build_model
+
+NAMES = sorted(MODELS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_logits_follow_the_order_of_candidates(name: str):
+    model = small_model(name)
+    clouds, candidates, robots = drawn_tables(1, candidates=40)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    permuted = Candidates(candidates.robot_row[order], candidates.base_xy_m[order])
+    logits = model.score(clouds, candidates, robots)
+    torch.testing.assert_close(model.score(clouds, permuted, robots), logits[order], atol=1e-5, rtol=1e-5)
+    assert logits.dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_a_candidate_is_scored_the_same_alone(name: str):
+    model = small_model(name)
+    clouds, candidates, robots = drawn_tables(2, candidates=70)
+    logits = model.score(clouds, candidates, robots)
+    for row in (0, 33, 69):
+        one = Candidates(torch.zeros(1, dtype=torch.int64), candidates.base_xy_m[row : row + 1])
+        robot = candidates.robot_row[row : row + 1]
+        alone = replace(
+            robots,
+            cloud_row=torch.zeros(1, dtype=torch.int64),
+            camera_height_m=robots.camera_height_m[robot],
+            base_height_m=robots.base_height_m[robot],
+            arm_reach_m=robots.arm_reach_m[robot],
+        )
+        cloud = robots.cloud_row[robot]
+        seen = replace(clouds, **{k: getattr(clouds, k)[cloud] for k in vars(clouds)})
+        torch.testing.assert_close(model.score(seen, one, alone), logits[[row]], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_odd_clouds_give_finite_logits_and_gradients(name: str):
+    model = small_model(name).train()
+    clouds, candidates, robots = drawn_tables(3, scenes=5, robots=7, candidates=12)
+    clouds.target_mask[2] = False
+    clouds.target_mask[3] = True
+    clouds = replace(clouds, n_points=torch.tensor([0, 1, 96, 96, 2]))
+    candidates.base_xy_m[:2] = 0.0  # right below the target
+    robots.arm_reach_m[4] = 0.0
+    # Robot 6 has no candidate.
+    candidates = replace(candidates, robot_row=torch.arange(12) % 6)
+    logits = model.score(clouds, candidates, robots)
+    assert torch.isfinite(logits).all()
+    torch.nn.functional.cross_entropy(logits, torch.arange(12) % 2).backward()
+    for parameter in model.parameters():
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("sizes", [{"candidates": 0}, {"candidates": 0, "robots": 0}, {"points": 0}])
+@torch.no_grad()
+def test_empty_tables_are_scored(name: str, sizes: dict[str, int]):
+    logits = small_model(name).score(*drawn_tables(0, **{"robots": 3, **sizes}))
+    assert logits.shape == (sizes.get("candidates", 9), 2)
+    assert torch.isfinite(logits).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_configuration_that_went_through_json_builds_the_same_model(name: str):
+    model = small_model(name)
+    again = build_model(model.name, json.loads(json.dumps(model.config)))
+    again.load_state_dict(model.state_dict())
+    again.eval()
+    assert again.config == model.config
+    with torch.no_grad():
+        assert torch.equal(again.score(*drawn_tables(4)), model.score(*drawn_tables(4)))
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "words"),
+    [
+        ("papre", {}, "papre: no such model"),
+        ("shared", {"widht": 4}, "widht"),
+        ("shared", {"width": 10**9}, "width"),
+        ("shared", {"scales_m": [0.1] * 1000}, "scales_m"),
+        ("shared", {"camera": "mine"}, "camera"),
+        ("paper", {"radii_m": [0.2, float("nan")]}, "radii_m.1"),
+        ("paper", {"head": [4096] * 100}, "head"),
+        ("paper", {"dropout": 1.0}, "dropout"),
+    ],
+)
+def test_a_configuration_that_is_not_one_is_named(name: str, config: dict[str, Any], words: str):
+    with pytest.raises(InputError) as error:
+        build_model(name, config)
+    assert words in str(error.value)

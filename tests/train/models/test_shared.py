@@ -1,0 +1,87 @@
+"""The shared model: turning the scene changes nothing, and its pieces put everything in its place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tests.train.models.made_batches import Tables, drawn_tables, small_model
+from train.models import Model
+from train.models.frames import frames_of, pair_features
+from train.models.tiles import tiles
+
+
+def turned_about_z(tables: Tables, angle: float) -> Tables:
+    clouds, candidates, robots = tables
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    points = (clouds.points_m.double() @ turn.T).float()
+    base = (candidates.base_xy_m.double() @ turn[:2, :2].T).float()
+    return replace(clouds, points_m=points), replace(candidates, base_xy_m=base), robots
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return small_model("shared", width=32, embedding=32)
+
+
+@settings(max_examples=25, deadline=None)
+@given(angle=st.floats(-10, 10), seed=st.integers(0, 50))
+@torch.no_grad()
+def test_turning_cloud_and_candidates_together_changes_nothing(model: Model, angle: float, seed: int):
+    tables = drawn_tables(seed)
+    logits, turned = model.score(*tables), model.score(*turned_about_z(tables, angle))
+    torch.testing.assert_close(turned, logits, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_turning_the_candidates_alone_changes_much(model: Model):
+    clouds, candidates, robots = drawn_tables(0)
+    _, elsewhere, _ = turned_about_z((clouds, candidates, robots), 1.0)
+    change = model.score(clouds, elsewhere, robots) - model.score(clouds, candidates, robots)
+    assert float(change.abs().amax()) > 1e-3
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 5), max_size=60), st.integers(1, 12))
+def test_tiles_hold_every_candidate_once_with_its_robot(rows: list[int], size: int):
+    robot_row = torch.tensor(rows, dtype=torch.int64)
+    seen: list[int] = []
+    for robots, held in tiles(robot_row, size):
+        assert held.numel() <= size
+        assert torch.equal(robot_row[held], robots[:, None].expand_as(held))
+        seen += held.flatten().tolist()
+    assert sorted(seen) == list(range(len(rows)))
+
+
+def frame_at(x: float, y: float, rise: float, camera: float) -> Tensor:
+    return frames_of(torch.tensor([[x, y]]), *(torch.tensor([v]) for v in (rise, camera, 0.8, 0.1)))
+
+
+def test_a_place_on_the_line_of_sight_has_no_offset_from_it():
+    # Target at the origin, camera 0.6 m before it and 0.3 m above: half way between them, and beside that.
+    frame = frame_at(0.0, -0.6, 0.2, 0.3)
+    places = torch.tensor([[[0.0, -0.3, 0.15], [-0.1, -0.3, 0.15], [0.0, 0.0, 0.0]]])
+    side, height, before = pair_features(frame, places)[0, :, :3].unbind(1)
+    torch.testing.assert_close(height, torch.zeros(3), atol=1e-5, rtol=0)
+    # 0.1 m to the left (of +y, which is -x) half way is 0.2 m on the target: two of its radii.
+    torch.testing.assert_close(side, torch.tensor([0.0, 2.0, 0.0]), atol=1e-5, rtol=0)
+    half = math.hypot(0.3, 0.15) / 0.1 / 2
+    torch.testing.assert_close(before, torch.tensor([half, half, 0.0]).clamp(max=3), atol=1e-5, rtol=0)
+
+
+def test_distances_from_the_mount_and_from_the_arms_line():
+    # The mount is 0.6 m before the target and 0.2 m below it.
+    frame = frame_at(0.6, 0.0, 0.2, 0.3)
+    places = torch.tensor([[[0.6, 0.0, -0.2], [0.3, 0.0, -0.1], [0.3, 0.05, -0.1], [-0.1, 0.0, 0.0]]])
+    features = pair_features(frame, places)[0]
+    half = math.hypot(0.3, 0.1)
+    want = torch.tensor([0.0, half, math.hypot(half, 0.05), math.hypot(0.7, 0.2)]) / 0.8
+    torch.testing.assert_close(features[:, 5], want, atol=1e-5, rtol=0)
+    torch.testing.assert_close(features[:, 6], 3 * torch.tensor([0.0, 0.0, 0.05, 0.1]), atol=1e-5, rtol=0)
