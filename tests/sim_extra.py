@@ -8,7 +8,5 @@ import pytest
 
 from workers.registry import SIM_MODULES
 
-needs_sim = pytest.mark.skipif(
-    any(find_spec(name) is None for name in (*SIM_MODULES, "sapien")),
-    reason="the extra `sim` is not installed",
-)
+SIM_INSTALLED = all(find_spec(name) is not None for name in (*SIM_MODULES, "sapien"))
+needs_sim = pytest.mark.skipif(not SIM_INSTALLED, reason="the extra `sim` is not installed")

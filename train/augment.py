@@ -1,42 +1,85 @@
 """Changes of a scene as it is read, so that no epoch shows a model the same cloud twice.
 
-Labels and ids never change. Each effect is a frozen dataclass of numbers, off while it is None, and
-draws from a generator of its own: switching one off changes nothing of the others.
+Labels and ids never change. Each effect is a frozen dataclass of numbers, left out while it is None, and
+draws from a generator of its own: switching one off changes nothing of what the others draw. Extra
+columns stay as they are stored, also where the cloud was turned.
+
+What becomes of the farthest-point order (train/inputs.py): rotation and colour keep it. Points that
+vanish leave the others in their order, so that the first m of them lie at least as far from each other
+as the stored rows up to the last of these; random points then follow sooner. Noise moves points and not
+rows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import cos, pi, sin
 
+import numpy as np
+import numpy.typing as npt
 
-@dataclass(frozen=True)
-class Rotation:
-    """The cloud turned about the target's vertical axis, and the candidates with it.
+from schemas.errors import InputError
+from train.batching import View
 
-    The angle is uniform in [-largest_rad, largest_rad].
-    """
-
-    largest_rad: float = 3.141592653589793
+F64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Points moved along the camera's ray by a normal error of std_at_1m_m times depth squared (metres)."""
+    """Points moved along the camera's ray by a normal error of std_at_1m_m times depth squared (metres).
 
-    std_at_1m_m: float = 0.0025
+    That is how the depth of a stereo camera errs: sigma_z = depth^2 sigma_d / (fx baseline) (Khoshelham
+    and Elberink 2012, Sensors 12(2), eq. 10). The default is 0.08 px over 5 cm at fx = 615 px.
+    """
+
+    std_at_1m_m: float = 0.0026
+
+    def __post_init__(self) -> None:
+        _refuse_outside("std_at_1m_m", self.std_at_1m_m, 1)
+
+    def apply(self, view: View, rng: np.random.Generator) -> View:
+        n = view.n_points
+        camera_m, sight_m = _sight_lines(view)
+        depth_m = sight_m @ view.scene.record["T_world_camera"][:3, 2]
+        # Along the ray, an error of depth in proportion to depth is one of the whole length.
+        scale = np.maximum(1 + self.std_at_1m_m * depth_m * rng.standard_normal(n), 0)
+        points_m = view.points_m.copy()
+        points_m[:n] = camera_m + sight_m * scale[:, None]
+        return replace(view, points_m=points_m)
 
 
 @dataclass(frozen=True)
 class DepthHoles:
-    """Round holes in the depth image, as a camera leaves them: points behind one vanish.
+    """Round holes in the depth image, as a camera leaves them: all points behind one vanish.
 
-    Up to `most` holes of half-angles up to `largest_rad`, seen from the camera. A hole that would
-    leave less than `target_kept` of the target's points is not made.
+    0 to `most` holes around points of the cloud, of half-angles up to `largest_rad` as the camera sees
+    them. A hole that would leave less than `target_kept` of the target's points, or none, is not made.
     """
 
     most: int = 4
     largest_rad: float = 0.05
     target_kept: float = 0.5
+
+    def __post_init__(self) -> None:
+        _refuse_outside("most", self.most, 1000)
+        _refuse_outside("largest_rad", self.largest_rad, pi / 2)
+        _refuse_outside("target_kept", self.target_kept, 1)
+
+    def apply(self, view: View, rng: np.random.Generator) -> View:
+        n = view.n_points
+        _, sight_m = _sight_lines(view)
+        toward = sight_m / np.maximum(np.linalg.norm(sight_m, axis=1, keepdims=True), 1e-9)
+        target = view.target_mask[:n]
+        least = max(self.target_kept * np.count_nonzero(target), 1.0)
+        kept = np.ones(n, np.bool_)
+        for _ in range(rng.integers(self.most + 1)):
+            centre, half_rad = toward[rng.integers(n)], rng.uniform(0, self.largest_rad)
+            left = kept & (toward @ centre < cos(half_rad))
+            if not target.any() or np.count_nonzero(left & target) >= least:
+                kept = left if left.any() else kept
+        return _with_rows(view, kept)
 
 
 @dataclass(frozen=True)
@@ -45,13 +88,53 @@ class PointDropout:
 
     largest_share: float = 0.3
 
+    def __post_init__(self) -> None:
+        _refuse_outside("largest_share", self.largest_share, 1)
+
+    def apply(self, view: View, rng: np.random.Generator) -> View:
+        n = view.n_points
+        kept = rng.random(n) >= rng.uniform(0, self.largest_share)
+        target = view.target_mask[:n]
+        if not (kept & target).any():
+            kept[np.argmax(target)] = True  # its first row, or the cloud's where none is the target's
+        return _with_rows(view, kept)
+
 
 @dataclass(frozen=True)
 class ColourJitter:
-    """Colours times one gain for all channels and one for each, uniform in 1 +- these shares."""
+    """Colours times a gain for all channels and a gain for each, uniform in 1 +- these shares."""
 
     brightness: float = 0.2
     channel: float = 0.1
+
+    def __post_init__(self) -> None:
+        _refuse_outside("brightness", self.brightness, 1)
+        _refuse_outside("channel", self.channel, 1)
+
+    def apply(self, view: View, rng: np.random.Generator) -> View:
+        gain = (1 + self.brightness * rng.uniform(-1, 1)) * (1 + self.channel * rng.uniform(-1, 1, 3))
+        rgb = np.clip(np.rint(view.rgb * gain.astype(np.float32)), 0, 255).astype(np.uint8)
+        return replace(view, rgb=rgb)
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """The cloud turned about the vertical axis through the target, and the candidates with it.
+
+    The angle is uniform in [-largest_rad, largest_rad].
+    """
+
+    largest_rad: float = pi
+
+    def __post_init__(self) -> None:
+        _refuse_outside("largest_rad", self.largest_rad, pi)
+
+    def apply(self, view: View, rng: np.random.Generator) -> View:
+        angle = rng.uniform(-self.largest_rad, self.largest_rad)
+        turn = np.array([[cos(angle), sin(angle)], [-sin(angle), cos(angle)]])  # for rows: x' = x R^T
+        points_m = view.points_m.copy()
+        points_m[:, :2] = view.points_m[:, :2] @ turn.astype(np.float32)
+        return replace(view, points_m=points_m, base_xy_m=view.base_xy_m @ turn)
 
 
 @dataclass(frozen=True)
@@ -63,3 +146,41 @@ class Augmentation:
     dropout: PointDropout | None = None
     colour: ColourJitter | None = None
     rotation: Rotation | None = None
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Scene fields that it needs besides a batch's own."""
+        return ("T_world_camera",) if self.noise or self.holes else ()
+
+    def apply(self, view: View, seed: Sequence[int]) -> View:
+        """The view after all chosen effects; the given one stays as it is. `seed` names scene and epoch."""
+        if not view.n_points:
+            return view
+        effects = (self.noise, self.holes, self.dropout, self.colour, self.rotation)
+        for number, effect in enumerate(effects):
+            if effect is not None:
+                view = effect.apply(view, np.random.default_rng([*seed, number]))
+        return view
+
+
+def _sight_lines(view: View) -> tuple[F64, F64]:
+    """The camera's position (3,), and the ways from it to the points (n, 3); target frame."""
+    camera_m = view.scene.record["T_world_camera"][:3, 3] - view.scene.record["target_center_m"]
+    return camera_m, view.points_m[: view.n_points] - camera_m
+
+
+def _with_rows(view: View, kept: Mask) -> View:
+    """The cloud with these of its points (n,), moved up in their order; zeros follow."""
+    rows = np.flatnonzero(kept)
+    if len(rows) == view.n_points:
+        return view
+    cloud = {name: getattr(view, name) for name in ("points_m", "rgb", "target_mask")}
+    moved = {name: np.zeros_like(values) for name, values in cloud.items()}
+    for name, values in cloud.items():
+        moved[name][: len(rows)] = values[rows]
+    return replace(view, n_points=len(rows), **moved)
+
+
+def _refuse_outside(field: str, value: float, most: float) -> None:
+    if not 0 <= value <= most:
+        raise InputError("augmentation", field, f"{value} lies outside 0 to {most:.4g}", "Correct the value")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from schemas.errors import InputError
 from train.inputs import Array, Batch, Candidates, Clouds, Robots
 
 Rows = npt.NDArray[np.intp]
@@ -20,73 +21,134 @@ SAMPLE_FIELDS = ("sample_id", "robot_index", "base_xy_m", *ROBOT_FIELDS, "label"
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A scene as one epoch shows it: its stored rows, the cloud and candidates that are given of them.
+class StoredScene:
+    """One scene's rows: one row of each scene field, and n rows of each sample field."""
 
-    `rows` are the candidates' rows in `samples`, those of one robot together.
+    record: Mapping[str, Any]
+    samples: Mapping[str, Array]  # (n, ...)
+
+    @property
+    def words(self) -> tuple[int, ...]:
+        """What names the scene in a seed: its first sample's id, as four numbers."""
+        return tuple(np.ascontiguousarray(self.samples["sample_id"][0]).view("<u4").tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene as one epoch shows it: the cloud and the candidates that are given of it.
+
+    `rows` are the candidates' rows among the scene's samples, those of one robot together.
     """
 
-    scene: Mapping[str, Any]  # one row of each scene field
-    samples: Mapping[str, Array]  # all its samples, (n, ...)
+    scene: StoredScene
     rows: Rows  # (k,)
-    points_m: npt.NDArray[np.floating[Any]]  # (P, 3), target frame
+    points_m: npt.NDArray[np.float32]  # (P, 3), target frame
     rgb: npt.NDArray[np.uint8]  # (P, 3)
     target_mask: npt.NDArray[np.bool_]  # (P,)
     n_points: int
     base_xy_m: npt.NDArray[np.float64]  # (k, 2), target frame
 
 
-def stored_view(scene: Mapping[str, Any], samples: Mapping[str, Array], rows: Rows) -> View:
+def stored_scenes(
+    place: str,
+    columns: Mapping[str, Array],
+    dims: Mapping[str, str],
+    bounds: npt.NDArray[np.int64],
+    rows: npt.NDArray[np.int64],
+) -> list[StoredScene]:
+    """The wanted scenes of a shard. InputError where a robot's samples disagree about its numbers."""
+    robots = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), columns["robot_index"]
+    order = np.lexsort(robots[::-1])
+    same = (np.diff(robots[0][order]) == 0) & (np.diff(robots[1][order]) == 0)
+    for name in ROBOT_FIELDS:
+        if (np.diff(columns[name][order])[same] != 0).any():
+            problem = "samples of one robot differ in it"
+            raise InputError(place, name, problem, "Mend the run with `datagen repair`")
+    if not np.isin(columns["n_points"], np.arange(columns["points_m"].shape[1] + 1)).all():
+        problem = "not a number of points that a cloud can hold"
+        raise InputError(place, "n_points", problem, "Mend the run with `datagen repair`")
+    scene_columns = {name: columns[name] for name, dim in dims.items() if dim == "scene"}
+    sample_columns = {name: columns[name] for name, dim in dims.items() if dim == "sample"}
+    if 2 * len(rows) < len(bounds) - 1:  # few are wanted: let the shard's arrays go
+        scene_columns = {name: a[rows] for name, a in scene_columns.items()}
+        places = range(len(rows))
+    else:
+        places = rows.tolist()
+    return [
+        StoredScene(
+            {name: a[place] for name, a in scene_columns.items()},
+            {name: a[bounds[row] : bounds[row + 1]] for name, a in sample_columns.items()},
+        )
+        for place, row in zip(places, rows.tolist(), strict=True)
+    ]
+
+
+def stored_view(scene: StoredScene, rows: Rows) -> View:
     """The scene as it is stored."""
-    base_xy_m = samples["base_xy_m"][rows].astype(np.float64) - scene["target_center_m"][:2]
-    cloud = (scene["points_m"], scene["rgb"], scene["target_mask"], int(scene["n_points"]))
-    return View(scene, samples, rows, *cloud, base_xy_m)
+    record = scene.record
+    n_points = int(record["n_points"])
+    return View(
+        scene=scene,
+        rows=rows,
+        points_m=record["points_m"].astype(np.float32),
+        rgb=record["rgb"],
+        target_mask=record["target_mask"],
+        n_points=n_points,
+        base_xy_m=scene.samples["base_xy_m"][rows].astype(np.float64) - record["target_center_m"][:2],
+    )
 
 
 def candidate_rows(
-    robot_index: npt.NDArray[np.integer[Any]], per_robot: int | None, rng: np.random.Generator | None
+    robot_index: npt.NDArray[np.integer[Any]], per_robot: int | None, rng: np.random.Generator
 ) -> Rows:
     """Rows of the candidates, robot by robot in ascending order; of each robot a random `per_robot` at most.
 
     Candidates of one robot keep their stored order.
     """
-    order = np.argsort(robot_index, kind="stable")
-    if per_robot is None or rng is None:
-        return order
-    luck = rng.random(len(order))
-    drawn = np.lexsort([luck, robot_index])
+    if per_robot is None:
+        return np.argsort(robot_index, kind="stable")
+    drawn = np.lexsort([rng.random(len(robot_index)), robot_index])
     ordered = robot_index[drawn]
     rank = np.arange(len(drawn)) - np.searchsorted(ordered, ordered)
-    kept = np.sort(drawn[rank < per_robot])
-    return kept[np.argsort(robot_index[kept], kind="stable")]
+    kept = drawn[rank < per_robot]
+    return kept[np.lexsort([kept, robot_index[kept]])]
 
 
 def make_batch(
     views: Sequence[View], extra_scene: Sequence[str] = (), extra_sample: Sequence[str] = ()
 ) -> Batch[Array]:
     """The scenes as one batch, in their order. Extra columns are given as they are stored."""
-    chosen = [{name: v.samples[name][v.rows] for name in (*SAMPLE_FIELDS, *extra_sample)} for v in views]
-    samples = {name: np.concatenate([c[name] for c in chosen]) for name in chosen[0]}
+
+    def sampled(name: str) -> Array:
+        return _native(np.concatenate([v.scene.samples[name][v.rows] for v in views]))
+
     scene_row = np.repeat(np.arange(len(views)), [len(v.rows) for v in views])
+    robot_index = sampled("robot_index")
     new = np.ones(len(scene_row), np.bool_)
-    new[1:] = (np.diff(scene_row) != 0) | (np.diff(samples["robot_index"]) != 0)
-    first = np.flatnonzero(new)
-    extra = {name: np.stack([np.asarray(v.scene[name]) for v in views]) for name in extra_scene}
+    new[1:] = (np.diff(scene_row) != 0) | (np.diff(robot_index) != 0)
+    records = [v.scene.record for v in views]
     return Batch(
         clouds=Clouds(
-            points_m=np.stack([v.points_m for v in views]).astype(np.float32, copy=False),
+            points_m=np.stack([v.points_m for v in views]),
             rgb=np.stack([v.rgb for v in views]),
             target_mask=np.stack([v.target_mask for v in views]),
             n_points=np.array([v.n_points for v in views], np.int64),
-            target_height_m=np.array([v.scene["target_center_m"][2] for v in views], np.float32),
-            target_radius_m=np.array([v.scene["target_radius_m"] for v in views], np.float32),
+            target_height_m=np.array([r["target_center_m"][2] for r in records], np.float32),
+            target_radius_m=np.array([r["target_radius_m"] for r in records], np.float32),
         ),
-        robots=Robots(scene_row[first].astype(np.int64), *(samples[name][first] for name in ROBOT_FIELDS)),
+        robots=Robots(scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)),
         candidates=Candidates(
-            robot_row=np.cumsum(new) - 1,
+            robot_row=(np.cumsum(new) - 1).astype(np.int64),
             base_xy_m=np.concatenate([v.base_xy_m for v in views]).astype(np.float32),
         ),
-        label=samples["label"].astype(np.int64),
-        sample_id=samples["sample_id"],
-        extra={**extra, **{name: samples[name] for name in extra_sample}},
+        label=sampled("label").astype(np.int64),
+        sample_id=sampled("sample_id"),
+        extra={
+            **{name: _native(np.stack([np.asarray(r[name]) for r in records])) for name in extra_scene},
+            **{name: sampled(name) for name in extra_sample},
+        },
     )
+
+
+def _native(values: Array) -> Array:
+    return values if values.dtype.kind == "O" else values.astype(values.dtype.newbyteorder("="), copy=False)

@@ -2,26 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from schemas.at_once import in_order
 from schemas.errors import InputError
 from train.augment import Augmentation
-from train.batching import SAMPLE_FIELDS, SCENE_FIELDS, candidate_rows, make_batch, stored_view
+from train.batching import (
+    SAMPLE_FIELDS,
+    SCENE_FIELDS,
+    StoredScene,
+    candidate_rows,
+    make_batch,
+    stored_scenes,
+    stored_view,
+)
+from train.epoch_plan import EpochPlan, batches_of, plan_epoch
 from train.inputs import Array, Batch
-from train.reader import SampleReader
+from train.opening import open_parts
+from train.reader import JOIN_FIELDS, load_shard
+from train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
+
+_CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)
+
+
+class _Draw(IntEnum):
+    """Independent streams of an epoch's generators."""
+
+    ORDER = 0
+    CANDIDATES = 1
+    AUGMENT = 2
 
 
 class SampleStream:
     """Epochs of batches from one or many runs, merged or not, sealed or not, local or on S3.
 
-    A batch holds `scenes_per_batch` whole scenes with all their robots and candidates, or with a
-    random `candidates_per_robot` of each robot. `houses` says which houses count (by house_id).
-    `extra` names further columns. Of `world` ranks each gives its own batches, equally many.
-    InputError names what is missing, foreign or damaged.
+    A batch holds `scenes_per_batch` whole scenes (a few less where they do not divide evenly) with all
+    their robots and candidates, or with a random `candidates_per_robot` of each robot. `houses` says
+    which houses count, by house_id. `extra` names further columns of the store. Of `world` ranks each
+    gives batches of its own, equally many, that together are the epoch. With `shuffle`, scenes are
+    shuffled within `buffer_shards` shards; without, they keep their stored order. Two such buffers are
+    in memory at most. docs/training-data.md says what stays the same when what changes.
+
+    InputError names what is missing, foreign or damaged, in the constructor or while reading.
     """
 
     def __init__(
@@ -39,32 +68,35 @@ class SampleStream:
         rank: int = 0,
         world: int = 1,
     ) -> None:
-        self._options = (scenes_per_batch, candidates_per_robot, seed, shuffle, rank, world)
-        probe = SampleReader(places, (), ())
-        tables = {name: probe.dimension(name) for name in extra}
-        self._extra_scene = [name for name in extra if tables[name] == "scene"]
-        self._extra_sample = [name for name in extra if tables[name] == "sample"]
-        reader = SampleReader(
-            places,
-            (*SCENE_FIELDS, "house_id", "object_digest", *self._extra_scene),
-            (*SAMPLE_FIELDS, *self._extra_sample),
-        )
-        self._scenes: list[tuple[dict[str, Any], dict[str, Array]]] = []
-        for shard in reader.shards():
-            for row in range(len(shard["house_id"])):
-                if houses is None or houses(str(shard["house_id"][row])):
-                    mine = shard["scene_row"] == row
-                    scene = {n: shard[n][row] for n, a in reader.fields.items() if a.dims[0] == "scene"}
-                    samples = {n: shard[n][mine] for n, a in reader.fields.items() if a.dims[0] == "sample"}
-                    self._scenes.append((scene, samples))
-        if not self._scenes:
-            raise InputError("training data", "", "no scene is left", "Choose other houses or runs")
+        _refuse_below("scenes_per_batch", scenes_per_batch, 1)
+        _refuse_below("buffer_shards", buffer_shards, 1)
+        _refuse_below("candidates_per_robot", 1 if candidates_per_robot is None else candidates_per_robot, 1)
+        _refuse_below("seed", seed, 0)
+        if not 0 <= rank < world:
+            raise InputError("training data", "rank", f"{rank} of {world}", "Number ranks from 0")
+        self.scenes_per_batch = scenes_per_batch
+        self.candidates_per_robot = candidates_per_robot
+        self.seed = seed
+        self.buffer_shards = buffer_shards
+        self.augment = augment
+        self.shuffle = shuffle
+        self.rank, self.world = rank, world
+
+        needs = augment.fields if augment else ()
+        parts = open_parts(places, list(dict.fromkeys([*_CORE, *TABLE_FIELDS, *extra, *needs])))
+        self._extra = tuple(dict.fromkeys(extra))
+        names = list(dict.fromkeys([*_CORE, *extra, *needs]))
+        self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
+        self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
+        self._scenes = read_scene_table(parts, candidates_per_robot, houses)
+        if len(self._scenes) < world:
+            problem = f"{len(self._scenes)} scenes for {world} ranks"
+            raise InputError(parts[0].place, "", problem, "Name more runs, or train on fewer processes")
 
     @property
     def batches_per_epoch(self) -> int:
         """Batches of one epoch of one rank; the same for all ranks."""
-        scenes_per_batch, _, _, _, _, world = self._options
-        return max(1, -(-len(self._scenes) // (scenes_per_batch * world)))
+        return batches_of(len(self._scenes), self.scenes_per_batch, self.world)
 
     @property
     def n_scenes(self) -> int:
@@ -74,36 +106,111 @@ class SampleStream:
     @property
     def n_samples(self) -> int:
         """Samples of one epoch, of all ranks together."""
-        return sum(len(candidate_rows(s["robot_index"], None, None)) for _, s in self._scenes)
+        return int(self._scenes.samples.sum())
 
-    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
-        """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping."""
-        scenes_per_batch, per_robot, seed, shuffle, rank, world = self._options
-        order = np.arange(len(self._scenes))
-        if shuffle:
-            order = np.random.default_rng([seed, k]).permutation(len(order))
-        mine = order[rank::world]
-        for i in range(skip_batches, self.batches_per_epoch):
-            views = []
-            for scene in mine[i * scenes_per_batch : (i + 1) * scenes_per_batch]:
-                rng = np.random.default_rng([seed, k, int(scene)])
-                rows = candidate_rows(self._scenes[scene][1]["robot_index"], per_robot, rng)
-                views.append(stored_view(*self._scenes[scene], rows))
-            yield make_batch(views, self._extra_scene, self._extra_sample)
+    @property
+    def parts(self) -> Sequence[PartSummary]:
+        """The runs that it reads, with what counts of each."""
+        return self._scenes.parts
 
     def class_counts(self) -> tuple[int, int]:
         """(negatives, positives) of all samples that epochs draw from."""
-        labels = np.concatenate([samples["label"] for _, samples in self._scenes])
-        return int((labels == 0).sum()), int((labels == 1).sum())
+        return sum(p.negatives for p in self.parts), sum(p.positives for p in self.parts)
 
     def house_ids(self) -> set[str]:
         """Houses of its scenes."""
-        return {str(scene["house_id"]) for scene, _ in self._scenes}
+        return set(self._scenes.house_ids)
+
+    def house_digests(self) -> Mapping[str, str]:
+        """Digests of these houses, with the id of each."""
+        return self._scenes.house_of_digest
 
     def object_digests(self) -> set[str]:
         """Digests of all objects in its scenes, targets and clutter."""
-        return {str(d) for scene, _ in self._scenes for d in scene["object_digest"]}
+        return set(self._scenes.object_digests)
 
     def origin(self) -> list[dict[str, Any]]:
-        """What a checkpoint says of its data: specification hash, schema, samples, digest, cost."""
-        return []
+        """What a checkpoint says of its data, a run at a time, in values that JSON can hold.
+
+        `samples_sha256` is over the ids and labels of the samples that count, in stored order: the same
+        for a run, its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run, or
+        is None for a sealed store that came alone.
+        """
+        return [
+            {
+                "spec_hashes": list(summary.part.spec_hashes),
+                "schema": summary.part.schema,
+                "schema_version": summary.part.schema_version,
+                "n_samples": summary.negatives + summary.positives,
+                "n_scenes": summary.scenes,
+                "samples_sha256": summary.samples_sha256,
+                "cost": None if summary.part.cost is None else dict(summary.part.cost),
+            }
+            for summary in self.parts
+        ]
+
+    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
+        """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping.
+
+        The next shards are read in a thread while a batch is used. Close the iterator, or use it up, to
+        end the thread; what is skipped is not read where whole shards are.
+        """
+        _refuse_below("epoch", k, 0)
+        _refuse_below("skip_batches", skip_batches, 0)
+        rng = np.random.default_rng([self.seed, k, _Draw.ORDER]) if self.shuffle else None
+        plan = plan_epoch(
+            self._scenes.shard, self.scenes_per_batch, self.buffer_shards, rng, self.rank, self.world
+        )
+        return self._batches(plan, k, skip_batches)
+
+    def _batches(self, plan: EpochPlan, k: int, skip: int) -> Iterator[Batch[Array]]:
+        if skip >= len(plan.cuts) - 1:
+            return
+        with ThreadPoolExecutor(1, "read-ahead") as pool:
+            loaded = in_order(pool, self.buffer_shards, self._load, self._reads(plan, int(plan.cuts[skip])))
+            try:
+                held: dict[int, StoredScene] = {}
+                for first, past in zip(plan.cuts[skip:-1], plan.cuts[skip + 1 :], strict=True):
+                    wanted = plan.order[first:past].tolist()
+                    while not all(scene in held for scene in wanted):
+                        held.update(next(loaded))
+                    yield self._batch([held.pop(scene) for scene in wanted], k)
+            finally:
+                loaded.close()
+
+    def _reads(self, plan: EpochPlan, start: int) -> list[tuple[int, npt.NDArray[np.int64]]]:
+        """(shard, its scenes that are wanted) from a place of the order on, buffer by buffer."""
+        scenes, buffer = plan.order[start:], plan.buffer[start:]
+        # A buffer's shards are read in the order of their first scenes' numbers: any would do.
+        by_shard = np.lexsort([scenes, self._scenes.shard[scenes], buffer])
+        scenes = scenes[by_shard]
+        shards = self._scenes.shard[scenes]
+        starts = np.flatnonzero(np.diff(shards, prepend=-1))
+        return [(int(shards[i]), some) for i, some in zip(starts, np.split(scenes, starts[1:]), strict=True)]
+
+    def _load(self, wanted: tuple[int, npt.NDArray[np.int64]]) -> dict[int, StoredScene]:
+        shard, scenes = wanted
+        place, arrays = self._shards[shard]
+        columns, bounds = load_shard(place, arrays)
+        where = f"{place.storage.url}/{place.folder}"
+        stored = stored_scenes(where, columns, self._dims, bounds, self._scenes.row[scenes])
+        return dict(zip(scenes.tolist(), stored, strict=True))
+
+    def _batch(self, scenes: Sequence[StoredScene], k: int) -> Batch[Array]:
+        views = []
+        for scene in scenes:
+            rng = np.random.default_rng([self.seed, k, _Draw.CANDIDATES, *scene.words])
+            rows = candidate_rows(scene.samples["robot_index"], self.candidates_per_robot, rng)
+            view = stored_view(scene, rows)
+            if self.augment is not None:
+                view = self.augment.apply(view, (self.seed, k, _Draw.AUGMENT, *scene.words))
+            views.append(view)
+        extra = {
+            dim: [name for name in self._extra if self._dims[name] == dim] for dim in ("scene", "sample")
+        }
+        return make_batch(views, extra["scene"], extra["sample"])
+
+
+def _refuse_below(field: str, value: int, least: int) -> None:
+    if value < least:
+        raise InputError("training data", field, f"{value} is below {least}", f"Ask for {least} or more")

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError, choices
+from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
 from schemas.keys import MERGED
 from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, read_metadata
 from schemas.storage import open_storage
 
 _MEND = "Seal the run again, and copy its data.zarr whole"
+
+
+@dataclass(frozen=True, eq=False)
+class SealedStore:
+    """What the store says of itself, its shards, and the arrays that were asked for."""
+
+    spec_hashes: tuple[str, ...]  # of the runs that it holds
+    schema: str
+    schema_version: int
+    shards: Sequence[ShardPlace]
+    arrays: Mapping[str, StoredArray]
 
 
 def is_sealed_store(place: Path | str) -> bool:
@@ -23,8 +36,11 @@ def is_sealed_store(place: Path | str) -> bool:
     return not storage.exists("manifest.json") and not storage.exists(MERGED)
 
 
-def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlace], dict[str, StoredArray]]:
-    """Its shards and the named arrays. InputError when it is not a sealed store or lacks a field."""
+def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
+    """The store with the named arrays.
+
+    InputError when it is not a sealed store, of a schema that this program does not know, or lacks a field.
+    """
     storage = open_storage(place, probe=False, create=False)
     data = storage.get("zarr.json", 64 * MAX_META_BYTES)
     where = f"{storage.url}/zarr.json"
@@ -36,8 +52,14 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlac
         per_shard = int(attributes["scenes_per_shard"])
         per_scene = int(attributes["candidates_per_scene"])
         stored = list(meta["consolidated_metadata"]["metadata"])
+        schema, version = str(attributes["schema"]), int(attributes["schema_version"])
+        spec_hashes = tuple(str(part["spec_hash"]) for part in attributes.get("parts", [attributes]))
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"not the root of a sealed store ({e})", _MEND) from e
+    if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
+        known = ", ".join(f"{s.name} {OLDEST_SCHEMA_VERSION} to {s.version}" for s in SCHEMAS.values())
+        problem = f"{schema!r} {version}, and this program knows {known}"
+        raise InputError(where, "schema_version", problem, "Use the version of the program that made the run")
     for name in names:
         if name not in stored:
             raise InputError(storage.url, name, "the store has no such field", choices(stored))
@@ -63,4 +85,4 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> tuple[list[ShardPlac
         )
         for i in range(min(-(-n_scenes // per_shard), -(-n_samples // full)))
     ]
-    return shards, arrays
+    return SealedStore(spec_hashes, schema, version, shards, arrays)

@@ -1,14 +1,72 @@
-"""House-disjoint sides of training data: what is judged on was never trained on."""
+"""Sides of training data that share no house: what a model is judged on it was never trained on."""
 
 from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from schemas.errors import InputError
 from train.dataset import SampleStream
 
+# Another salt than that of a run's own split (workers/houses/split.py): the tenth that is held out here
+# is a tenth of a run of that split's training houses too.
+_SALT = b"held-out-houses-1:"
+
+
+@dataclass(frozen=True)
+class HouseSide:
+    """Which houses one side has, by id alone: adding or removing houses moves no other house."""
+
+    held_out: bool
+
+    def __call__(self, house_id: str) -> bool:
+        digest = hashlib.sha256(_SALT + house_id.encode()).digest()
+        return (int.from_bytes(digest[:8], "big") % 10 == 0) == self.held_out
+
+
+def split_by_house(places: Sequence[str | Path], **options: Any) -> tuple[SampleStream, SampleStream]:
+    """One set of runs as (training, validation): nine tenths of the houses, and one tenth, held out.
+
+    `options` are those of SampleStream for training; validation is neither shuffled nor augmented and
+    has all its candidates. InputError where a side has no house.
+    """
+    plain: dict[str, Any] = {"shuffle": False, "augment": None, "candidates_per_robot": None}
+    try:
+        validation = SampleStream(places, **(options | plain), houses=HouseSide(held_out=True))
+        train = SampleStream(places, **options, houses=HouseSide(held_out=False))
+    except InputError as error:
+        if error.field != "house_id":
+            raise
+        mend = "Name a run of other houses for validation, or train on runs of more houses"
+        problem = "a tenth of the houses by their ids leaves one side without any"
+        raise InputError(error.place, "house_id", problem, mend) from error
+    refuse_shared_houses(train, validation)
+    return train, validation
+
 
 def refuse_shared_houses(train: SampleStream, other: SampleStream) -> None:
-    """InputError that names a house of which both have scenes."""
-    shared = sorted(train.house_ids() & other.house_ids())
-    if shared:
-        problem = f"{shared[0]!r} is trained on and judged on ({len(shared)} such houses)"
-        raise InputError("training data", "house_id", problem, "Use runs of different splits")
+    """InputError that names a house of which both have scenes: one of equal id or of equal content."""
+    ours, theirs = train.house_digests(), other.house_digests()
+    shared = {house: house for house in train.house_ids() & other.house_ids()}
+    shared |= {ours[digest]: theirs[digest] for digest in ours.keys() & theirs.keys() if digest}
+    if not shared:
+        return
+    house, twin = min(shared.items())
+    also = "" if house == twin else f" (as {twin!r} there, of equal content)"
+    places = ", ".join(dict.fromkeys(part.part.place for part in other.parts))
+    problem = f"house {house!r} is trained on too{also}, one of {len(shared)} such houses"
+    raise InputError(places, "house_id", problem, "Use runs of other houses, as `submit --split` makes them")
+
+
+def refuse_one_class(stream: SampleStream) -> None:
+    """InputError that names the runs and the class where all labels are alike: nothing can be learned."""
+    counts = stream.class_counts()
+    if all(counts):
+        return
+    places = ", ".join(dict.fromkeys(part.part.place for part in stream.parts))
+    problem = f"all {sum(counts)} labels are {0 if counts[0] else 1}"
+    mend = "Name more runs, or a run with another choice of candidates (`submit --candidates`)"
+    raise InputError(places, "label", problem, mend)

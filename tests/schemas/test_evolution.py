@@ -108,7 +108,7 @@ def test_stores_of_both_versions_are_read_side_by_side(older: Path, tmp_path: Pa
         newer = make_small_run(tmp_path / "run", N, "--seed", "1")
         reader = SampleReader([older, newer])
         assert len(reader) == 2 * N
-        assert sum(len(batch["label"]) for batch in reader.epoch(7)) == 2 * N
+        assert sum(len(shard["label"]) for shard in reader.shards()) == 2 * N
         assert "n_bodies" in read_scene(Run.open(newer), 0).record
         assert "n_bodies" not in read_scene(Run.open(older), 0).record
 

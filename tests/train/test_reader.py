@@ -1,4 +1,4 @@
-"""The reader: every sample once, the same for one seed, and nothing damaged passes."""
+"""The reader of columns: every row as it was committed, and nothing damaged passes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from schemas.run import Run
 from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of, small_spec
-from train.reader import Batch, SampleReader
+from train.reader import Columns, SampleReader
 
 ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
 SAMPLES = ("sample_id", "sample_scene_index", "candidate_index", "distance_m", "label", "label_source")
 
 
-def ids(batches: list[Batch]) -> np.ndarray:
+def ids(batches: list[Columns]) -> np.ndarray:
     return np.concatenate([b["sample_id"] for b in batches])
 
 
@@ -29,49 +29,20 @@ def stored_samples(run: Run) -> dict[str, np.ndarray]:
     return {k: np.concatenate([t[1][k] for t in tables])[: run.n] for k in tables[0][1]}
 
 
-def test_stored_order_gives_the_committed_rows_with_their_scenes(tmp_path: Path):
+def test_shards_are_the_committed_rows_with_their_scenes(tmp_path: Path):
     run = make_run(tmp_path, n=43)
     reader = SampleReader([tmp_path], ALL, SAMPLES)
     assert (len(reader), reader.n_scenes) == (43, 9)
-    batches = list(reader.epoch(10, buffer_shards=2))
-    assert [len(b["label"]) for b in batches] == [10, 10, 10, 10, 3]
+    shards = list(reader.shards())
+    assert [len(s["label"]) for s in shards] == [10, 10, 10, 10, 3]
     truth = stored_samples(run)
     for name in SAMPLES:
-        np.testing.assert_array_equal(np.concatenate([b[name] for b in batches]), truth[name])
-    for b in batches:
-        np.testing.assert_array_equal(b["scene_index"][b["scene_row"]], b["sample_scene_index"])
-        assert b["points_m"].dtype == np.float32
-        assert b["points_m"].shape[1:] == (64, 3)
-
-
-def test_clouds_belong_to_their_samples_across_buffers(tmp_path: Path):
-    run = make_run(tmp_path, n=43)
-    reader = SampleReader([tmp_path], ("points_m",), SAMPLES)
-    clouds: dict[int, np.ndarray] = {}
-    for shard in run.committed():
-        scenes, _ = rows_of(run, shard)
-        clouds |= dict(zip(scenes["scene_index"].tolist(), scenes["points_m"], strict=True))
-    for batch in reader.epoch(7, np.random.default_rng(0), buffer_shards=2):
-        for scene, row in zip(batch["sample_scene_index"], batch["scene_row"], strict=True):
-            np.testing.assert_array_equal(batch["points_m"][row], clouds[scene].astype(np.float32))
-
-
-def test_a_seed_decides_the_order_and_an_epoch_has_every_sample_once(tmp_path: Path):
-    run = make_run(tmp_path, n=60)
-    reader = SampleReader([tmp_path], (), SAMPLES)
-    one, same, other = (
-        ids(list(reader.epoch(8, np.random.default_rng(seed), buffer_shards=3))) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
-    truth = sorted(map(bytes, stored_samples(run)["sample_id"]))
-    assert sorted(map(bytes, one)) == sorted(map(bytes, other)) == truth
-
-
-def test_dropping_the_last_gives_equal_batches(tmp_path: Path):
-    make_run(tmp_path, n=43)
-    sizes = {len(b["label"]) for b in SampleReader([tmp_path]).epoch(8, drop_last=True)}
-    assert sizes == {8}
+        np.testing.assert_array_equal(np.concatenate([s[name] for s in shards]), truth[name])
+    clouds = np.concatenate([rows_of(run, k)[0]["points_m"] for k in sorted(run.committed())])
+    for s in shards:
+        np.testing.assert_array_equal(s["scene_index"][s["scene_row"]], s["sample_scene_index"])
+        assert s["points_m"].dtype == np.float32
+        np.testing.assert_array_equal(s["points_m"], clouds[s["scene_index"]].astype(np.float32))
 
 
 def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
@@ -88,13 +59,10 @@ def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
     )
 
 
-def test_many_runs_are_told_apart(tmp_path: Path):
-    for seed in (1, 2):
-        make_run(tmp_path / str(seed), n=20 * seed, spec=small_spec(seed))
-    reader = SampleReader([tmp_path / "1", tmp_path / "2"])
-    runs = np.concatenate([b["run_row"] for b in reader.epoch(16, np.random.default_rng(0))])
-    assert np.bincount(runs).tolist() == [20, 40]
-    assert reader.units()["distance_m"] == "m"
+def test_fields_have_their_units(tmp_path: Path):
+    make_run(tmp_path, n=20)
+    units = SampleReader([tmp_path], ("house_id",), ("distance_m",)).units()
+    assert units == {"house_id": "", "distance_m": "m"}
 
 
 def test_runs_with_other_clouds_are_not_mixed(tmp_path: Path):
@@ -153,8 +121,6 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     for places, fields, problem in cases:
         with pytest.raises(InputError, match=problem):
             SampleReader(places, **fields)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="below 1"):
-        next(SampleReader([tmp_path / "run"]).epoch(0))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,136 @@
+"""What a stream knows of every scene before it reads a cloud: where it lies, its house, its labels.
+
+Read once, from a few short columns, so that sizes, splits and the order of an epoch need no cloud.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from train.opening import Part
+from train.reader import JOIN_FIELDS, Columns, load_shard
+
+I64 = npt.NDArray[np.int64]
+
+TABLE_FIELDS = (
+    *JOIN_FIELDS,
+    "house_id",
+    "house_digest",
+    "object_digest",
+    "sample_id",
+    "robot_index",
+    "label",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PartSummary:
+    """What counts of one part. `samples_sha256` is over ids and labels of its samples, in stored order."""
+
+    part: Part
+    scenes: int
+    negatives: int
+    positives: int
+    samples_sha256: str
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTable:
+    """One row a scene that counts and has samples, in stored order.
+
+    `shard` is its shard's place among all shards of all parts, `row` its row there, `samples` what an
+    epoch takes of it.
+    """
+
+    shard: I64  # (S,), ascending
+    row: I64  # (S,)
+    samples: I64  # (S,)
+    house_of_digest: Mapping[str, str]  # house_digest -> house_id
+    house_ids: frozenset[str]
+    object_digests: frozenset[str]  # of targets and clutter
+    parts: Sequence[PartSummary]
+
+    def __len__(self) -> int:
+        return len(self.shard)
+
+
+def read_scene_table(
+    parts: Sequence[Part], per_robot: int | None, houses: Callable[[str], bool] | None
+) -> SceneTable:
+    """The scenes of the houses that count. InputError where there is none, or a run is named twice."""
+    _refuse_twins(parts)
+    shard: list[int] = []
+    row: list[int] = []
+    samples: list[int] = []
+    house_of_digest: dict[str, str] = {}
+    house_ids: set[str] = set()
+    objects: set[str] = set()
+    summaries: list[PartSummary] = []
+    number = 0
+    for part in parts:
+        digest, begun = hashlib.sha256(), len(shard)
+        counts = np.zeros(2, np.int64)
+        for place in part.shards:
+            columns, bounds = load_shard(place, {name: part.arrays[name] for name in TABLE_FIELDS})
+            for scene in range(len(bounds) - 1):
+                first, past = bounds[scene], bounds[scene + 1]
+                house = str(columns["house_id"][scene])
+                if first == past or not (houses is None or houses(house)):
+                    continue
+                label = columns["label"][first:past]
+                if label.max() > 1:
+                    where, mend = f"{place.storage.url}/{place.folder}", "Mend the run with `datagen repair`"
+                    raise InputError(where, "label", f"a label of {label.max()}", mend)
+                digest.update(columns["sample_id"][first:past].tobytes())
+                digest.update(label.tobytes())
+                counts += np.bincount(label, minlength=2)
+                shard.append(number)
+                row.append(scene)
+                samples.append(_taken(columns["robot_index"][first:past], per_robot))
+                house_ids.add(house)
+                house_of_digest[str(columns["house_digest"][scene])] = house
+                objects |= _texts(columns, "object_digest", scene)
+            number += 1
+        negatives, positives = counts.tolist()
+        summaries.append(PartSummary(part, len(shard) - begun, negatives, positives, digest.hexdigest()))
+    if not shard:
+        place = ", ".join(dict.fromkeys(part.place for part in parts))
+        problem = "no scene of a house that counts"
+        raise InputError(place, "house_id", problem, "Name more runs, or runs of more houses")
+    return SceneTable(
+        np.array(shard, np.int64),
+        np.array(row, np.int64),
+        np.array(samples, np.int64),
+        house_of_digest,
+        frozenset(house_ids),
+        frozenset(objects),
+        summaries,
+    )
+
+
+def _taken(robot_index: npt.NDArray[np.integer], per_robot: int | None) -> int:
+    if per_robot is None:
+        return len(robot_index)
+    _, counts = np.unique(robot_index, return_counts=True)
+    return int(np.minimum(counts, per_robot).sum())
+
+
+def _texts(columns: Columns, name: str, row: int) -> set[str]:
+    return {str(text) for text in np.atleast_1d(columns[name][row])}
+
+
+def _refuse_twins(parts: Sequence[Part]) -> None:
+    """Two places with one specification hold the same samples, which then would count twice."""
+    seen: dict[str, str] = {}
+    for part in parts:
+        for spec_hash in part.spec_hashes:
+            if spec_hash in seen:
+                problem = f"of one specification with {seen[spec_hash]}, so that samples would come twice"
+                raise InputError(part.place, "", problem, "Name it once, or merge them with `datagen merge`")
+            seen[spec_hash] = part.place
