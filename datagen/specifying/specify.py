@@ -96,7 +96,7 @@ def specify(
 
 def read_fields(config: Path | None) -> dict[str, Any]:
     """The fields that the file sets. Raises InputError for those that are not set there."""
-    fields = _read_config(config) if config else {}
+    fields = read_toml(config) if config else {}
     for reserved in ("label_source", "houses", "objects", "engines", "scenes_from"):
         if reserved in fields:
             raise InputError(
@@ -154,10 +154,12 @@ def scene_engines(spec: Specification) -> dict[str, str]:
     return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 
 
-def _read_config(path: Path) -> dict[str, Any]:
-    mend = "Give a TOML file as docs/specification.md shows it"
+def read_toml(
+    path: Path, option: str = "--config", mend: str = "Give a TOML file as docs/specification.md shows it"
+) -> dict[str, Any]:
+    """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
     if "\0" in str(path) or (path.exists() and not path.is_file()):
-        raise InputError(repr(str(path)), "--config", "is not a file", mend)  # a device has no end
+        raise InputError(repr(str(path)), option, "is not a file", mend)  # a device has no end
     try:
         size = path.stat().st_size
         if size > _MAX_CONFIG_BYTES:

@@ -1,0 +1,178 @@
+"""`datagen train`: a model from labels, stage by stage."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from datagen.console.options import AsJson
+from datagen.console.printing import print_json, print_rows, seconds
+from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.training.options import model_sizes, read_augmentation, share_cores
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from train.training.checkpoints import CheckpointHead
+    from train.training.stages import Job
+
+Whole = Annotated[int | None, WHOLE_NUMBER]
+
+
+def train(
+    stage: Literal["stage1", "stage2", "sim-only"],
+    runs: Annotated[
+        list[str], Parameter(negative=(), help="Runs to learn from, also merged or sealed ones.")
+    ],
+    *,
+    out: Annotated[Path, Parameter(help="The checkpoint's file; the same command on it goes on.")],
+    val: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Runs that decide when to stop [a tenth of the houses is held out]."),
+    ] = None,
+    init: Annotated[Path | None, Parameter(help="stage2: the checkpoint of stage 1 to begin from.")] = None,
+    model: Annotated[Literal["paper", "shared"] | None, Parameter(help="[shared, or that of --init]")] = None,
+    model_config: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Sizes of the model: a TOML file, or field=value, as often as needed."),
+    ] = None,
+    epochs: Annotated[Whole, Parameter(help="[12 in stage1, else 30]")] = None,
+    batch_scenes: Annotated[
+        int, WHOLE_NUMBER, Parameter(help="Whole scenes in a step, of all processes together.")
+    ] = 16,
+    candidates_per_robot: Annotated[
+        Whole, Parameter(help="Take a random so many of each robot's candidates in each epoch [all].")
+    ] = None,
+    lr: Annotated[float | None, Parameter(help="Highest learning rate [0.002; 0.0005 in stage2].")] = None,
+    weight_decay: Annotated[float | None, Parameter(help="[0 in stage1, else 0.01]")] = None,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Decides weights, order and dropout.")] = 0,
+    patience: Annotated[
+        int, WHOLE_NUMBER, Parameter(help="Epochs without a lower validation loss before it stops.")
+    ] = 8,
+    augment: Annotated[
+        str | None,
+        Parameter(help="noise, holes, dropout, colour, rotation, with commas between; or a TOML file."),
+    ] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where the model computes.")] = "auto",
+    processes: Annotated[
+        Whole, Parameter(help="Processes that train together [one a GPU; on CPUs one].")
+    ] = None,
+    threads: Annotated[Whole, Parameter(help="Threads of each process [cores over processes].")] = None,
+    tensorboard: Annotated[str | None, Parameter(help="A folder for TensorBoard's curves.")] = None,
+    json: AsJson = False,
+) -> int:
+    """Train a model and keep it, with all that made it, in one file.
+
+    stage1 learns from heuristic labels by cross-entropy weighted by class; stage2 goes on from it on sim or
+    plan labels by cross-entropy with weight decay; sim-only is stage2 from scratch. It stops when the loss
+    on houses that are not trained on no longer falls, and the best epoch's weights are those that count.
+    Ctrl-C keeps everything; the same command goes on where it stopped.
+    """
+    if not runs:
+        raise InputError("datagen train", "RUN", "no run is named", "Name one or more run folders")
+    each = share_cores(processes, threads)
+    from train.training.checkpoints import read_checkpoint
+    from train.training.devices import choose_device
+    from train.training.options import STAGES, Options
+    from train.training.stages import Job
+
+    chosen = STAGES[stage]
+    _refuse_odd_init(stage, init, chosen.from_checkpoint)
+    began = read_checkpoint(init).head if init else None
+    augmentation, effects = read_augmentation(augment)
+    options = Options(
+        stage=stage,
+        model=model or (began.model if began else "shared"),
+        model_config={**(began.model_config if began else {}), **model_sizes(model_config or ())},
+        epochs=chosen.epochs if epochs is None else epochs,
+        batch_scenes=batch_scenes,
+        candidates_per_robot=candidates_per_robot,
+        lr=chosen.lr if lr is None else lr,
+        weight_decay=chosen.weight_decay if weight_decay is None else weight_decay,
+        seed=seed,
+        patience=patience,
+        augment=effects,
+    )
+    options.refuse_bad()
+    where, n_processes = choose_device(device, processes)
+    job = Job(
+        options,
+        tuple(runs),
+        tuple(val or ()),
+        str(out),
+        augmentation,
+        str(init) if init else None,
+        where,
+        each,
+        tensorboard=tensorboard,
+        json_lines=json,
+    )
+    return _report(out, _train(job, n_processes), json)
+
+
+def _refuse_odd_init(stage: str, init: Path | None, needs_one: bool) -> None:
+    if init is None and needs_one:
+        problem = f"{stage} begins from the weights of stage 1, and no checkpoint is named"
+        raise InputError("datagen train", "--init", problem, "Give --init CKPT, or train sim-only")
+    if init is not None and not needs_one:
+        problem = f"{stage} begins from fresh weights"
+        raise InputError("datagen train", "--init", problem, "Leave it out, or train stage2")
+
+
+def _train(job: Job, processes: int) -> bool:
+    """Whether it came to its end; else it was interrupted."""
+    from train.training.launching import interruptible, train_in_processes
+    from train.training.ranks import Ranks
+    from train.training.stages import train_job
+
+    with interruptible() as stopping:
+        if processes == 1:
+            return train_job(job, Ranks(), stopping)
+        return train_in_processes(train_job, job, processes, job.device, stopping)
+
+
+def _report(out: Path, finished: bool, json: bool) -> int:
+    from train.training.checkpoints import read_checkpoint
+
+    head = read_checkpoint(out).head if out.exists() else None
+    best = head.history[head.best_epoch - 1] if head and head.best_epoch else None
+    if json:
+        print_json(
+            {
+                "out": str(out),
+                "end": "finished" if finished else "interrupted",
+                "digest": head.digest if head else None,
+                "model": head.model if head else None,
+                "epochs": head.epoch if head else 0,
+                "steps": head.step if head else 0,
+                "best": best,
+                "history": head.history if head else (),
+                "cost": head.cost if head else {},
+            }
+        )
+    elif head is not None:
+        print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
+    if finished:
+        return 0
+    again = f"datagen {shlex.join(sys.argv[1:])}"
+    sys.stderr.write(f"interrupted, and nothing is lost. Go on with:\n  {again}\n")
+    return 130
+
+
+def _rows(head: CheckpointHead, best: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    yield "model", f"{head.model}, {head.stage}, sha256 {head.digest[:16]}"
+    yield "trained", f"{head.epoch} epochs, {head.step:,} steps"
+    if best is not None:
+        balanced, auc = best["val_balanced_accuracy"], best["val_auc"]
+        numbers = [f"loss {best['val_loss']:.4f}", f"accuracy {best['val_accuracy']:.4f}"]
+        numbers += [f"balanced {balanced:.4f}"] if balanced is not None else []
+        numbers += [f"AUC {auc:.4f}"] if auc is not None else []
+        yield "validation", f"epoch {head.best_epoch}: {', '.join(numbers)}"
+    wall_s, cpu_s = head.cost.get("train_wall_s", 0.0), head.cost.get("train_cpu_s", 0.0)
+    yield "time", f"{seconds(wall_s)} ({seconds(cpu_s)} of CPU)"
+    if wall_s > 0:
+        yield "data", f"{head.cost.get('data_wait_s', 0.0) / wall_s:.1%} of the time was waited for it"

@@ -1,0 +1,80 @@
+"""Options of `datagen train` that hold more than a number: sizes of a model, augmentation, threads."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from datagen.specifying.specify import read_toml
+from schemas.errors import InputError, choices
+
+if TYPE_CHECKING:
+    from train.augment import Augmentation
+
+_MEND = "Give a TOML file as docs/training.md shows it"
+
+
+def model_sizes(words: Sequence[str]) -> dict[str, Any]:
+    """The fields that files and `field=value` words name; later ones win. Values are read as TOML's."""
+    sizes: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            sizes |= read_toml(Path(word), "--model-config", _MEND)
+            continue
+        try:
+            sizes[name.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except (ValueError, RecursionError):
+            sizes[name.strip()] = text
+    return sizes
+
+
+def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, Any]]:
+    """What `--augment` asks for, by names of effects or in a TOML file, and the same as plain data."""
+    if word is None:
+        return None, {}
+    from train.augment import Augmentation
+
+    kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
+    asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
+    if word.endswith(".toml"):
+        asked = read_toml(Path(word), "--augment", _MEND)
+    effects: dict[str, Any] = {}
+    for name, values in asked.items():
+        if name not in kinds:
+            raise InputError("--augment", name, "no such effect", choices(kinds))
+        known = {f.name for f in fields(kinds[name])}
+        if not isinstance(values, dict) or not values.keys() <= known:
+            raise InputError("--augment", name, "not a section of its numbers", choices(known))
+        try:
+            effects[name] = TypeAdapter(kinds[name]).validate_python(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, (name, *first["loc"])))
+            raise InputError("--augment", where, first["msg"].lower(), _MEND) from None
+    return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
+
+
+def share_cores(processes: int | None, threads: int | None) -> int:
+    """Threads for each process: those asked for, or the cores shared out. Call it before torch is loaded.
+
+    One process that takes all cores has its threads bound to them: unbound, two of them were seen to share
+    a core for minutes. Several processes are left to the system, since each would be bound to the first core.
+    """
+    cores = len(os.sched_getaffinity(0))
+    for option, value in (("--processes", processes), ("--threads", threads)):
+        if value is not None and not 1 <= value <= 1024:
+            raise InputError("datagen train", option, f"{value}", "Give 1 or more, or leave it out")
+    each = threads or max(1, cores // (processes or 1))
+    if (processes or 1) == 1 and each == cores > 1:
+        os.environ.setdefault("OMP_PROC_BIND", "true")
+        os.environ.setdefault("OMP_PLACES", "cores")
+    elif processes is not None and processes > 1:
+        os.environ.setdefault("OMP_NUM_THREADS", str(each))
+    return each

@@ -1,0 +1,119 @@
+"""Processes that train together, and a Ctrl-C that lets them end their step first."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import tempfile
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from schemas.errors import InputError
+from train.training.ranks import Ranks
+
+Stopping = Callable[[], bool]
+# What each process does, importable by name; True when it came to its end.
+Work = Callable[[Any, Ranks, Stopping], bool]
+
+
+@contextmanager
+def interruptible() -> Generator[Stopping]:
+    """Give a function that tells whether Ctrl-C (or SIGTERM) came. A second one ends the block at once."""
+    came = False
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal came
+        came = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def train_in_processes(work: Work, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
+    """Run `work(job, ranks, stopping)` in so many new processes that can reach each other.
+
+    What one of them raises as InputError is raised here, and ends the others; so does the end of this
+    process. Returns whether they came to their end.
+    """
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory(prefix="datagen-train-") as folder:
+        children: list[tuple[Any, Connection]] = []
+        try:
+            for rank in range(processes):
+                here, there = context.Pipe(duplex=False)
+                arguments = (work, job, Ranks(rank, processes), device, folder, there)
+                child = context.Process(target=_child, args=arguments, daemon=True)
+                child.start()
+                there.close()
+                children.append((child, here))
+            return _ends(children, Path(folder), stopping)
+        finally:
+            for child, here in children:
+                child.kill()
+                child.join()
+                here.close()
+
+
+def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: Stopping) -> bool:
+    """Wait for all; an error of one of them is raised."""
+    waiting = {here: child for child, here in children}
+    finished = True
+    while waiting:
+        if stopping():
+            (folder / "stop").touch()
+        ready = wait(list(waiting), timeout=0.2)
+        answers = {here: _answer(here) for here in ready}  # type: ignore[arg-type]
+        # Who lost another process ends without a word; the one that knows why has spoken before.
+        for answer in answers.values():
+            if isinstance(answer, InputError):
+                raise answer
+        for here, answer in answers.items():
+            child = waiting.pop(here)  # type: ignore[arg-type]
+            if answer is None:
+                child.join()
+                problem = f"a process ended with {child.exitcode} and said nothing"
+                mend = "The same command goes on; give it fewer --processes if memory was short"
+                raise InputError("datagen train", "--processes", problem, mend)
+            finished = finished and bool(answer)
+    return finished
+
+
+def _answer(here: Connection) -> bool | InputError | None:
+    try:
+        return here.recv()
+    except EOFError:
+        return None
+
+
+def _child(work: Work, job: Any, ranks: Ranks, device: str, folder: str, there: Connection) -> None:
+    # Ctrl-C reaches the whole group of processes; only the first of them decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    parent, stop = multiprocessing.parent_process(), Path(folder, "stop")
+    if device == "cuda":
+        torch.cuda.set_device(ranks.rank)
+    else:
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # this machine's name may mean nothing to it
+    backend = "nccl" if device == "cuda" else "gloo"
+    dist.init_process_group(
+        backend, init_method=f"file://{folder}/rendezvous", rank=ranks.rank, world_size=ranks.world
+    )
+    try:
+        there.send(work(job, ranks, lambda: stop.exists() or (parent is not None and not parent.is_alive())))
+    except InputError as error:
+        there.send(error)
+    finally:
+        dist.destroy_process_group()

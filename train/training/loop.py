@@ -1,0 +1,215 @@
+"""The loop: batches, steps, validation, early stopping, and a position from which it goes on exactly.
+
+Nothing random has a state that would have to be kept: batches follow from seed and epoch, and what a
+step draws (dropout) from seed, epoch, batch and rank.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NoReturn, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from schemas.errors import InputError
+from train.inputs import Array, Batch
+from train.models import Model
+from train.tensors import to_torch
+from train.training.optimising import rate_at, set_rate
+from train.training.options import Options
+from train.training.ranks import Ranks
+from train.training.validation import validate
+from train.training.watching import Step, Watcher
+
+_STEP_STREAM = 0x57E9  # keeps the draws of steps apart from those of batches
+_IDS_NAMED = 4
+
+
+class Batches(Protocol):
+    """What the loop needs of a `SampleStream`."""
+
+    @property
+    def batches_per_epoch(self) -> int: ...
+
+    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]: ...
+
+
+@dataclass
+class Position:
+    """How far a training is, and what it found."""
+
+    epoch: int = 0  # whole ones
+    batch: int = 0  # done of the epoch under way
+    step: int = 0
+    sums: list[float] = field(default_factory=lambda: [0.0] * 4)  # the epoch's weight, loss, hits, samples
+    history: list[dict[str, Any]] = field(default_factory=list)
+    best_epoch: int | None = None  # with the lowest validation loss, counted from 1
+    best_weights: dict[str, Tensor] = field(default_factory=dict)
+    finished: bool = False
+    cost: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """All that a training works with; `position`, the model and the optimiser change."""
+
+    options: Options
+    model: Model
+    optimiser: torch.optim.Optimizer
+    train: Batches
+    val: Batches
+    class_weights: Tensor  # (2,) float32, on the model's device
+    position: Position
+    ranks: Ranks
+
+
+def run(
+    training: Training,
+    keep: Callable[[], None],
+    watcher: Watcher,
+    stopping: Callable[[], bool] = lambda: False,
+    keep_every_s: float = 300.0,
+) -> bool:
+    """Train from the position on. Whether it came to its end; else it was stopped, and all is kept.
+
+    `keep` is called after each epoch, every `keep_every_s` and when it stops. InputError at a loss or
+    gradient that is no number, before it can reach the weights.
+    """
+    at, clock = training.position, _Clock()
+    logits_of = training.ranks.share_gradients(training.model)
+    training.model.train()
+    kept_s = time.monotonic()
+    while not at.finished:
+        clock.wait_begins()
+        for batch in training.train.epoch(at.epoch, at.batch):
+            clock.wait_ends()
+            seen, stop = _step(training, logits_of, batch, clock, stopping())
+            watcher.step(seen)
+            if stop or time.monotonic() - kept_s >= keep_every_s:
+                keep()
+                kept_s = time.monotonic()
+            if stop:
+                return False
+            clock.wait_begins()
+        _end_epoch(training, clock, watcher)
+        keep()
+    return True
+
+
+def _step(
+    training: Training, logits_of: Callable[..., Tensor], batch: Batch[Array], clock: _Clock, stopping: bool
+) -> tuple[Step, bool]:
+    """A step on the batches of all ranks as if they were one; what it was, and whether any rank stops."""
+    options, at, ranks, device = training.options, training.position, training.ranks, training.model.device
+    torch.manual_seed(_seed(options.seed, at.epoch, at.batch, ranks.rank))
+    given = to_torch(batch, device)
+    with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+        logits = logits_of(given.clouds, given.candidates, given.robots)
+    losses = functional.cross_entropy(logits.float(), given.label, reduction="none")
+    weights = training.class_weights[given.label]
+    loss = (weights * losses).sum()
+    hits = (logits.argmax(dim=1) == given.label).sum()
+    mine = [float(weights.sum()), loss.item(), float(hits), float(len(batch)), *clock.lap(), float(stopping)]
+    *sums, wall_s, cpu_s, wait_s, stop = ranks.total(
+        torch.tensor(mine, dtype=torch.float64, device=device)
+    ).tolist()
+    if not math.isfinite(sums[1]):
+        _refuse("loss", training, batch, ~torch.isfinite(losses))
+    # The mean over ranks of these is the gradient of the weighted mean over all of their samples.
+    (loss * (ranks.world / sums[0])).backward()
+    norm = torch.nn.utils.clip_grad_norm_(training.model.parameters(), options.clip_norm)
+    if not math.isfinite(float(norm)):
+        _refuse("gradient", training, batch, torch.ones_like(losses, dtype=torch.bool))
+    steps = options.epochs * training.train.batches_per_epoch
+    rate = rate_at(at.step, steps, options.lr, options.warmup)
+    set_rate(training.optimiser, rate)
+    training.optimiser.step()
+    training.optimiser.zero_grad(set_to_none=True)
+    at.batch, at.step = at.batch + 1, at.step + 1
+    at.sums = [a + b for a, b in zip(at.sums, sums, strict=True)]
+    _pay(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
+    loss_now = sums[1] / sums[0]
+    times = (wait_s / ranks.world, wall_s / ranks.world)
+    return Step(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
+
+
+def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
+    """Validate, keep the best weights in mind, and decide whether to go on."""
+    at, options = training.position, training.options
+    measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
+    weight, loss, hits, samples = at.sums
+    record = {
+        "epoch": at.epoch + 1,
+        "step": at.step,
+        "loss": loss / weight,
+        "accuracy": hits / samples,
+        **measured,
+    }
+    best = at.best_epoch is None or measured["val_loss"] < at.history[at.best_epoch - 1]["val_loss"]
+    at.history.append(record)
+    at.epoch, at.batch, at.sums = at.epoch + 1, 0, [0.0] * 4
+    if best:
+        at.best_epoch = at.epoch
+        at.best_weights = {k: v.detach().clone() for k, v in training.model.state_dict().items()}
+    worse_for = at.epoch - (at.best_epoch or 0)
+    at.finished = at.epoch >= options.epochs or worse_for >= options.patience
+    wall_s, cpu_s, _ = clock.lap()
+    spent = torch.tensor(
+        [wall_s / training.ranks.world, cpu_s], dtype=torch.float64, device=training.model.device
+    )
+    wall_s, cpu_s = training.ranks.total(spent).tolist()
+    _pay(at, wall_s, cpu_s, 0.0)
+    watcher.epoch(record | {"best": best})
+
+
+def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:
+    """Name the samples; every rank comes here with its own, and all say the same."""
+    rows = bad.cpu().numpy()
+    ids = [bytes(i).hex() for part in training.ranks.gather(batch.sample_id[rows]) for i in part]
+    at = training.position
+    named = ", ".join(ids[:_IDS_NAMED]) + (", ..." if len(ids) > _IDS_NAMED else "")
+    raise InputError(
+        f"training, epoch {at.epoch + 1}, batch {at.batch + 1}",
+        what,
+        f"not a number, at {len(ids)} of its samples: {named}",
+        "Nothing was overwritten. Look at one by `datagen replay`, or give a smaller --lr and a new --out",
+    )
+
+
+def _seed(*numbers: int) -> int:
+    return int(np.random.SeedSequence([_STEP_STREAM, *numbers]).generate_state(1, np.uint64)[0])
+
+
+def _pay(at: Position, wall_s: float, cpu_s: float, wait_s: float) -> None:
+    for name, value in (("train_wall_s", wall_s), ("train_cpu_s", cpu_s), ("data_wait_s", wait_s)):
+        at.cost[name] = at.cost.get(name, 0.0) + value
+
+
+class _Clock:
+    """Wall and CPU seconds of this process since the last lap, and how many it waited for batches."""
+
+    def __init__(self) -> None:
+        self._wall_s, self._cpu_s, self._wait_s, self._began_s = (
+            time.perf_counter(),
+            time.process_time(),
+            0.0,
+            0.0,
+        )
+
+    def wait_begins(self) -> None:
+        self._began_s = time.perf_counter()
+
+    def wait_ends(self) -> None:
+        self._wait_s += time.perf_counter() - self._began_s
+
+    def lap(self) -> tuple[float, float, float]:
+        """Wall, CPU and waiting seconds; all begin again."""
+        wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self._wait_s
+        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
+        return self._wall_s - wall_s, self._cpu_s - cpu_s, wait_s

@@ -1,0 +1,68 @@
+"""What a training is told, and what the three stages are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from schemas.errors import InputError
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One row of the paper's schedule (GBPP, Sec. III-D): which labels, which loss, from which weights."""
+
+    name: str
+    label_sources: tuple[str, ...]
+    weighted: bool  # cross-entropy weighted by class, so that both classes count alike
+    from_checkpoint: bool
+    lr: float
+    weight_decay: float
+    epochs: int
+
+
+# The paper gives the losses and the order; rates, decay and epochs are ours.
+STAGES: dict[str, Stage] = {
+    "stage1": Stage("stage1", ("heuristic",), True, False, 2e-3, 0.0, 12),
+    "stage2": Stage("stage2", ("plan", "sim"), False, True, 5e-4, 1e-2, 30),
+    "sim-only": Stage("sim-only", ("plan", "sim"), False, False, 2e-3, 1e-2, 30),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """All that decides the weights, besides the data and the checkpoint to begin from.
+
+    Where it runs (device, threads, processes) is not among them.
+    """
+
+    stage: str
+    model: str
+    model_config: Mapping[str, Any]
+    epochs: int
+    batch_scenes: int = 16
+    candidates_per_robot: int | None = None  # a random so many of each robot in each epoch; None for all
+    lr: float = 2e-3  # the highest of the schedule
+    weight_decay: float = 0.0  # on matrices alone: not on biases and norms
+    warmup: float = 0.05  # share of the steps in which the rate rises from 0
+    clip_norm: float = 1.0  # of all gradients together
+    seed: int = 0
+    patience: int = 8  # epochs without a lower validation loss
+    augment: Mapping[str, Any] = field(default_factory=dict)  # fields of Augmentation
+
+    def refuse_bad(self) -> None:
+        """InputError for values out of range, by the option's name."""
+        whole = {"epochs": (self.epochs, 1), "batch-scenes": (self.batch_scenes, 1), "seed": (self.seed, 0)}
+        whole |= {"patience": (self.patience, 1), "candidates-per-robot": (self.candidates_per_robot or 1, 1)}
+        for name, (value, low) in whole.items():
+            if value < low:
+                raise InputError("datagen train", f"--{name}", f"{value}", f"Give {low} or more")
+        for name, value, low in (("lr", self.lr, 0), ("weight-decay", self.weight_decay, -1)):
+            if not math.isfinite(value) or value <= low or value < 0:
+                raise InputError("datagen train", f"--{name}", f"{value}", "Give a positive number")
+
+    def document(self) -> dict[str, Any]:
+        """As plain data, without the model, which a checkpoint states by itself."""
+        return {k: v for k, v in asdict(self).items() if k not in ("stage", "model", "model_config")}

@@ -1,0 +1,57 @@
+"""How well a model does on scenes of houses that it does not learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from schemas.errors import InputError
+from train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
+from train.inputs import Array, Batch
+from train.models import Model
+from train.tensors import to_torch
+from train.training.ranks import Ranks
+
+
+def validate(
+    model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks
+) -> dict[str, Any]:
+    """Loss (the stage's own), accuracy, balanced accuracy and AUC over all ranks' batches.
+
+    Numbers that are not defined, with one class alone, are None. InputError where the loss is not a number.
+    """
+    ranks.share_buffers(model)
+    model.eval()
+    ids: list[Array] = []
+    columns: list[Array] = []
+    with torch.inference_mode():
+        for batch in batches:
+            given = to_torch(batch, model.device)
+            logits = model.score(given.clouds, given.candidates, given.robots).double()
+            log_p = torch.log_softmax(logits, dim=1)
+            loss = -log_p.gather(1, given.label[:, None])[:, 0]
+            rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss], dim=1)
+            ids.append(batch.sample_id)
+            columns.append(rows.cpu().numpy())
+    model.train()
+    everyone = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
+    # Ranks that had one batch too few were given samples that another has, too.
+    _, first = np.unique(np.concatenate([i for i, _ in everyone]), axis=0, return_index=True)
+    label, p, loss = np.concatenate([c for _, c in everyone])[np.sort(first)].T
+    weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
+    mean_loss = float(np.average(loss, weights=weight))
+    if not np.isfinite(mean_loss):
+        mend = "Train again with a smaller --lr, or look at the samples with `datagen verify`"
+        raise InputError("validation", "loss", f"{mean_loss} over {len(loss)} samples", mend)
+    counts = confusion((p >= 0.5).astype(np.float64), label == 1, np.zeros(len(p), np.int64), 1)[0]
+    measured = {
+        "val_loss": mean_loss,
+        "val_accuracy": float(accuracy(counts)),
+        "val_balanced_accuracy": float(balanced_accuracy(counts)),
+        "val_auc": area_under_roc(label == 1, p),
+    }
+    return {name: value if np.isfinite(value) else None for name, value in measured.items()}
