@@ -1,0 +1,9 @@
+"""A base pose from a real frame: read it, find the floor and the target, score the places around it."""
+
+from __future__ import annotations
+
+from train.prediction.candidates import RobotSize
+from train.prediction.frames import read_frame, read_place
+from train.prediction.predict import Prediction, load_scorer, predict
+
+__all__ = ["Prediction", "RobotSize", "load_scorer", "predict", "read_frame", "read_place"]

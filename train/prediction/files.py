@@ -1,0 +1,153 @@
+"""Pictures and small JSON documents of a frame, read as if a stranger had written them."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from schemas.errors import InputError
+from workers.geometry.mesh import F32, F64, U8
+from workers.geometry.transforms import is_pose
+from workers.houses.reading import Node, parse_json
+
+MAX_SIDE_PX = 8192
+MAX_PIXELS = 4096 * 4096
+MAX_FILE_BYTES = 256 * 2**20
+_MAX_JSON_BYTES = 2**20
+# The largest entry of R R^T - I: poses travel as text of four or five digits.
+_POSE_ROUNDING = 1e-3
+_EXTENT_M = 1000.0
+# Farther than this no depth camera measures; it is what saturated values look like.
+MAX_DEPTH_M = 20.0
+
+Bools = npt.NDArray[np.bool_]
+
+
+def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
+    """A regular file of at most `most` bytes. InputError for what is missing, larger or no file."""
+    mend = "Give the path of a file that exists"
+    try:
+        if not path.exists():
+            raise InputError(path, "", "no such file", mend)
+        if not path.is_file():
+            raise InputError(path, "", "not a file", mend)
+        with open(path, "rb") as file:
+            data = file.read(most + 1)
+    except ValueError:  # a NUL in the name
+        raise InputError(repr(str(path)), "", "not the name of a file", mend) from None
+    if len(data) > most:
+        raise InputError(path, "", f"more than {most:,} bytes", "Give a smaller file")
+    return data
+
+
+def read_rgb(path: Path) -> U8:
+    """A colour picture (H, W, 3), PNG or JPEG."""
+    return np.asarray(_opened(path, ("PNG", "JPEG"), "RGB"), np.uint8)
+
+
+def read_mask(path: Path) -> Bools:
+    """Where a PNG (H, W) is not black; of one with an alpha channel, the colours count alone."""
+    pixels = np.asarray(_opened(path, ("PNG",), "RGB"))
+    return np.asarray(pixels.any(axis=2), np.bool_)
+
+
+def read_depth(path: Path, depth_scale_m: float) -> F32:
+    """Depth (H, W) along the camera's z axis, of a 16-bit PNG; 0 where nothing was measured."""
+    image = _opened(path, ("PNG",), None)
+    if not image.mode.startswith("I;16"):
+        mend = "Save depth as a 16-bit grey PNG, in steps of --depth-scale (0.001 m unless given)"
+        raise InputError(path, "", f"not a 16-bit depth picture (its mode is {image.mode})", mend)
+    return valid_depth(np.asarray(image).astype(np.float32) * np.float32(depth_scale_m))
+
+
+def valid_depth(depth_m: F32) -> F32:
+    """Depth (H, W) with 0 for what is not finite, not positive or beyond what a depth camera measures."""
+    good = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= MAX_DEPTH_M)
+    return np.where(good, depth_m, np.float32(0)).astype(np.float32)
+
+
+def read_intrinsics(path: Path) -> tuple[float, float, float, float, int, int]:
+    """(fx, fy, cx, cy, width, height) of a JSON object; `ppx` and `ppy` may stand for `cx` and `cy`.
+
+    Pixels are those of the file: cameras and OpenCV put the centre of the first pixel at 0.
+    """
+    node = _document(path)
+    names = {"fx": ("fx",), "fy": ("fy",), "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
+    names |= {"width": ("width",), "height": ("height",)}
+    found = {key: next((n for k in keys if (n := node.find(k))), None) for key, keys in names.items()}
+    missing = [" or ".join(names[key]) for key, value in found.items() if value is None]
+    if missing:
+        mend = "Write fx, fy, cx, cy, width and height, in pixels (ppx and ppy serve for cx and cy)"
+        raise InputError(path, ", ".join(missing), "missing", mend)
+    fx, fy = (_of(found[k]).number(1.0, 1e5) for k in ("fx", "fy"))
+    cx, cy = (_of(found[k]).number(-1e5, 1e5) for k in ("cx", "cy"))
+    width, height = (int(_of(found[k]).number(2, MAX_SIDE_PX)) for k in ("width", "height"))
+    return fx, fy, cx, cy, width, height
+
+
+def read_pose(path: Path) -> F64:
+    """`T_world_camera` (4, 4): the value of that key, or the whole document; rows of four numbers."""
+    node = _document(path)
+    if isinstance(node.value, dict):
+        node = node.get("T_world_camera")
+    rows = [[cell.number(-1e9, 1e9) for cell in row.items(4)] for row in node.items(4)]
+    if [len(row) for row in rows] != [4, 4, 4, 4]:
+        raise node.error("not four rows of four numbers", "Write a 4x4 matrix, row by row.")
+    return checked_pose(np.array(rows), str(path))
+
+
+def checked_pose(T: F64, place: str) -> F64:
+    """The pose with its rotation made exact. InputError for NaN and for what is no rotation."""
+    mend = "Give T_world_camera as 4x4: a rotation, a position in metres, and the row 0 0 0 1"
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(place, "T_world_camera", "not 4x4 finite numbers", mend)
+    if not is_pose(T, _POSE_ROUNDING):
+        raise InputError(place, "T_world_camera", "its left upper 3x3 part is no rotation", mend)
+    if np.abs(T[:3, 3]).max() > _EXTENT_M:
+        raise InputError(place, "T_world_camera", f"farther than {_EXTENT_M:g} m from the origin", mend)
+    # The nearest rotation (Schoenemann 1966), so that rounded text does not stretch the cloud.
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    exact = T.astype(np.float64)
+    exact[:3, :3] = u @ vt
+    return exact
+
+
+def _of(node: Node | None) -> Node:
+    assert node is not None
+    return node
+
+
+def _document(path: Path) -> Node:
+    return parse_json(read_bytes(path, _MAX_JSON_BYTES), str(path))
+
+
+def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
+    """A decoded picture. Its size is checked before its pixels are decoded."""
+    kinds = " or ".join(formats)
+    read_bytes(path, MAX_FILE_BYTES)
+    try:
+        with warnings.catch_warnings():
+            # Our own limit, checked below, is stricter than the one that warns.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=formats) as image:
+                _refuse_size(path, *image.size)
+                image.load()
+                return image.copy() if mode is None else image.convert(mode)
+    except Image.DecompressionBombError:
+        _refuse_size(path, MAX_SIDE_PX + 1, MAX_SIDE_PX + 1)
+        raise
+    except InputError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        problem = f"not a readable {kinds} picture ({type(error).__name__})"
+        raise InputError(path, "", problem, f"Save it again as {kinds}") from None
+
+
+def _refuse_size(path: Path, width: int, height: int) -> None:
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
+        size = "too many" if width > MAX_SIDE_PX and width == height else f"{width}x{height}"
+        raise InputError(path, "", f"{size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")

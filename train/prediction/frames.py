@@ -1,0 +1,179 @@
+"""What a depth camera gave at one moment: points in the camera's frame, with the picture they come from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from train.prediction.files import (
+    MAX_PIXELS,
+    Bools,
+    checked_pose,
+    read_depth,
+    read_intrinsics,
+    read_mask,
+    read_pose,
+    read_rgb,
+    valid_depth,
+)
+from train.prediction.npz import read_arrays
+from train.prediction.ply import read_ply
+from workers.geometry.mesh import F32, F64, U8
+
+DEPTH_SCALE_M = 0.001
+# Of a folder that holds one frame.
+RGB, DEPTH, INTRINSICS, MASK, POSE = "color.png", "depth.png", "intrinsics.json", "mask.png", "pose.json"
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics in pixels. Pixel (u, v) has its centre at (u, v), as cameras and OpenCV have it."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+    def points(self, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], depth_m: F32) -> F32:
+        """Points (N, 3) in the camera's frame, of pixels (N,) with their depths (N,)."""
+        x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
+        return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdImage:
+    """The picture of a frame; depth is 0 where nothing was measured."""
+
+    rgb: U8  # (H, W, 3)
+    depth_m: F32  # (H, W), along the camera's z axis
+    pinhole: Pinhole
+    mask: Bools | None  # (H, W), the target's pixels
+
+    @property
+    def missing_share(self) -> float:
+        """Share of pixels without depth."""
+        return float((self.depth_m == 0).mean())
+
+    def points(self, pixels: npt.NDArray[np.int64], depth_m: F32 | None = None) -> F32:
+        """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
+        v, u = np.divmod(pixels, self.depth_m.shape[1])
+        return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrame:
+    """Measured points in the camera's frame: x right, y down, z forward (OpenCV, RealSense optical).
+
+    `on_target` is None where nothing says which points are the target's; `T_world_camera` where the
+    frame came without a pose; `image` for a cloud that came without a picture.
+    """
+
+    place: str
+    points_m: F32  # (N, 3)
+    rgb: U8  # (N, 3)
+    on_target: Bools | None  # (N,)
+    T_world_camera: F64 | None  # (4, 4)
+    image: RgbdImage | None
+
+
+def read_frame(
+    rgb: str | Path,
+    depth: str | Path,
+    intrinsics: str | Path,
+    *,
+    mask: str | Path | None = None,
+    pose: str | Path | None = None,
+    depth_scale_m: float = DEPTH_SCALE_M,
+) -> SensorFrame:
+    """A frame of two aligned pictures and a JSON file of intrinsics, each as `train.prediction.files` has it.
+
+    InputError where a file is missing or no such thing, or where sizes differ.
+    """
+    colour, depth_m = read_rgb(Path(rgb)), read_depth(Path(depth), depth_scale_m)
+    fx, fy, cx, cy, width, height = read_intrinsics(Path(intrinsics))
+    chosen = None if mask is None else read_mask(Path(mask))
+    if (height, width) != depth_m.shape:
+        problem = f"{width}x{height}, where the depth picture has {_size(depth_m)}"
+        raise InputError(intrinsics, "width, height", problem, "Give the intrinsics of this stream")
+    T = None if pose is None else read_pose(Path(pose))
+    image = RgbdImage(colour, depth_m, Pinhole(fx, fy, cx, cy), chosen)
+    return image_frame(image, T, {"rgb": str(rgb), "depth": str(depth), "mask": str(mask)})
+
+
+def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> SensorFrame:
+    """The frame of a folder (color.png, depth.png, intrinsics.json, and if there: mask.png, pose.json),
+    of an .npz archive or of a .ply cloud.
+    """
+    path = Path(place)
+    match path.suffix.lower():
+        case ".npz":
+            return _npz_frame(path, depth_scale_m)
+        case ".ply":
+            cloud = read_ply(path)
+            return SensorFrame(str(path), cloud.points_m, cloud.rgb, cloud.on_target, None, None)
+        case _ if path.is_dir():
+            more = [path / name if (path / name).exists() else None for name in (MASK, POSE)]
+            files = (path / RGB, path / DEPTH, path / INTRINSICS)
+            return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
+        case _:
+            mend = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
+            raise InputError(path, "--frame", "no frame", mend)
+
+
+def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, str]) -> SensorFrame:
+    """The frame of a picture; `places` says where rgb, depth and mask come from.
+
+    InputError for pictures of different sizes, for depth that is missing everywhere, and for a mask
+    that selects nothing.
+    """
+    where = {name: places.get(name, name) for name in ("rgb", "depth", "mask")}
+    for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
+        if picture is not None and picture.shape[:2] != image.depth_m.shape:
+            problem = f"{_size(picture)} pixels, where the depth has {_size(image.depth_m)}"
+            mend = "Align colour and depth, and give pictures of one size"
+            raise InputError(where[name], "", problem, mend)
+    pixels = np.flatnonzero(image.depth_m.ravel())
+    if not len(pixels):
+        mend = "Look at the camera's depth stream, and at --depth-scale"
+        raise InputError(where["depth"], "", "no pixel has depth", mend)
+    if image.mask is not None and not image.mask.any():
+        raise InputError(where["mask"], "", "the mask selects nothing", "Paint the target white on black")
+    on_target = None if image.mask is None else image.mask.ravel()[pixels]
+    colours = image.rgb.reshape(-1, 3)[pixels]
+    return SensorFrame(where["depth"], image.points(pixels), colours, on_target, T_world_camera, image)
+
+
+def _npz_frame(path: Path, depth_scale_m: float) -> SensorFrame:
+    arrays = read_arrays(path)
+    for name, shape in (("depth", "(H, W)"), ("rgb", "(H, W, 3)"), ("intrinsics", "(4,)")):
+        if name not in arrays:
+            raise InputError(path, name, "missing", f"Put it in as an array {shape}")
+    depth, rgb, numbers = arrays["depth"], arrays["rgb"], arrays["intrinsics"]
+    if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
+        raise InputError(path, "depth", f"an array of shape {depth.shape}", "Give depth as (H, W)")
+    if depth.dtype.kind != "f" and depth.dtype != np.uint16:
+        mend = "Give uint16 in steps of --depth-scale, or float in metres"
+        raise InputError(path, "depth", f"of type {depth.dtype}", mend)
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        raise InputError(path, "rgb", f"{rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
+    if numbers.shape != (4,) or not np.isfinite(numbers).all() or (numbers[:2] < 1).any():
+        raise InputError(path, "intrinsics", "not fx, fy, cx, cy", "Give four numbers, in pixels")
+    scale = 1.0 if depth.dtype.kind == "f" else depth_scale_m
+    mask = arrays.get("mask")
+    if mask is not None and mask.ndim != 2:
+        raise InputError(path, "mask", f"an array of shape {mask.shape}", "Give the mask as (H, W)")
+    pose = arrays.get("T_world_camera")
+    with np.errstate(over="ignore", invalid="ignore"):
+        metres = valid_depth((depth.astype(np.float64) * scale).astype(np.float32))
+    fx, fy, cx, cy = (float(n) for n in numbers)
+    image = RgbdImage(rgb, metres, Pinhole(fx, fy, cx, cy), None if mask is None else mask.astype(np.bool_))
+    T = None if pose is None else checked_pose(pose.astype(np.float64), str(path))
+    return image_frame(image, T, {name: f"{path}: {name}" for name in ("rgb", "depth", "mask")})
+
+
+def _size(picture: npt.NDArray[np.generic]) -> str:
+    return f"{picture.shape[1]}x{picture.shape[0]}"

@@ -1,0 +1,123 @@
+"""The thing at a clicked pixel: what hangs together with it over what it stands on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from schemas.errors import InputError
+from train.prediction.files import Bools
+from train.prediction.frames import RgbdImage
+from train.prediction.ground import depth_error_m
+from train.prediction.target import from_nearest
+from workers.geometry.mesh import F32, F64
+
+_GROWS_M = 0.24  # from the clicked point
+# Growth that comes so near to that distance has run out over a surface.
+_RAN_OUT, _ROUNDS = 0.95, 4
+_SUPPORT_AREA_M2 = 0.004  # less of a level surface is no support
+_BIN_M = 0.004
+
+
+def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> Bools:
+    """The pixels (H, W) of the thing at pixel (u, v): what hangs together with it over its support.
+
+    Grows from the pixel to neighbours of like depth, above the widest level surface that lies below the
+    clicked point; where it runs out over a higher surface, that one is the support.
+    InputError for a pixel outside the picture, or without depth.
+    """
+    h, w = image.depth_m.shape
+    u, v = click
+    if not (0 <= u < w and 0 <= v < h):
+        raise InputError("--click", f"{u},{v}", f"outside the picture of {w}x{h}", "Give a pixel u,v in it")
+    depth_m = image.depth_m
+    if depth_m[v, u] == 0:
+        near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
+        mend = "Click on another place of the target" if near else "Take the frame again, or give --mask"
+        raise InputError("--click", f"{u},{v}", "this pixel has no depth", mend)
+    grid, facets = _world_grid(image, depth_m, T_world_camera), _facets(image, T_world_camera)
+    seed = grid[v, u]
+    far_m = np.linalg.norm(grid - seed, axis=2)
+    around = (depth_m > 0) & (far_m < _GROWS_M)
+    joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
+    level = around & (grid[..., 2] < seed[2] - 0.003)
+    for _ in range(_ROUNDS):
+        lowest_m = _above_support(grid, facets, level, seed)
+        allowed = around & (grid[..., 2] > min(lowest_m, seed[2] - 1e-4))
+        labels = np.asarray(ndimage.label(allowed & joined)[0], np.int64)
+        grown = (labels == labels[v, u]) & allowed & joined
+        if not grown.any() or far_m[grown].max() < _RAN_OUT * _GROWS_M:
+            break
+        level = grown & (grid[..., 2] < seed[2] - 0.003)
+    grown[v, u] = True
+    # What breaks left out at the rim is the target's where it is as near as the target beside it.
+    rim = np.asarray(ndimage.binary_dilation(grown, iterations=2), np.bool_) & allowed
+    step_m = np.abs(depth_m - from_nearest(depth_m, grown))
+    filled = np.asarray(ndimage.binary_fill_holes(grown | (rim & (step_m < _step_m(depth_m)))), np.bool_)
+    return filled & (depth_m > 0)
+
+
+def _world_grid(image: RgbdImage, depth_m: F32, T_world_camera: F64) -> F64:
+    """World points (H, W, 3) of all pixels; those without depth lie in the camera."""
+    h, w = depth_m.shape
+    points_m = image.points(np.arange(h * w), depth_m).astype(np.float64)
+    return (points_m @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).reshape(h, w, 3)
+
+
+def _facets(image: RgbdImage, T_world_camera: F64) -> F64:
+    """Area times upward normal (H, W, 3) of the surface that each pixel sees, from smoothed depth.
+
+    A pixel's own neighbours are nearer to it than a stereo camera's noise is wide.
+    """
+    known = (image.depth_m > 0).astype(np.float32)
+    weight = ndimage.uniform_filter(known, 7)
+    smooth = ndimage.uniform_filter(image.depth_m, 7) / np.maximum(weight, 1e-6)
+    grid = _world_grid(image, smooth.astype(np.float32), T_world_camera)
+    facets = np.cross(np.gradient(grid, axis=1), np.gradient(grid, axis=0))
+    return facets * np.sign(facets[..., 2:])
+
+
+def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
+    """Height from which on points belong to what stands on the widest level surface `among` pixels (H, W)."""
+    areas = np.linalg.norm(facets, axis=2)
+    rows = among & (facets[..., 2] > 0.9 * areas) & (areas > 0)
+    z = grid[rows][:, 2]
+    if not len(z):
+        return float(seed[2] - _GROWS_M)
+    edges = np.arange(z.min() - _BIN_M, z.max() + 2 * _BIN_M, _BIN_M)
+    # Beside an edge smoothed depth runs from one thing to the other: no pixel counts for much.
+    counted, _ = np.histogram(z, edges, weights=np.minimum(areas[rows], 10 * np.median(areas[rows])))
+    spread = np.convolve(counted, np.ones(3), mode="same")
+    k = int(spread.argmax())
+    if spread[k] < _SUPPORT_AREA_M2:
+        return float(seed[2] - _GROWS_M)
+    height_m = float(np.median(z[np.abs(z - (edges[k] + edges[k + 1]) / 2) < 1.5 * _BIN_M]))
+    near = np.abs(z[np.abs(z - height_m) < 0.015] - height_m)
+    return height_m + 0.004 + 3 * 1.48 * float(np.median(near))
+
+
+def _step_m(depth_m: F32) -> F64:
+    """Difference in depth of neighbouring pixels from which on they belong to different things."""
+    return 0.008 + 3 * depth_error_m(depth_m)
+
+
+def _breaks(depth_m: F32) -> Bools:
+    """Pixels (H, W) at a jump in depth that slope does not explain, or beside missing depth."""
+    smooth = ndimage.median_filter(depth_m, 3)
+    breaks = np.zeros(depth_m.shape, np.bool_)
+    for axis in (0, 1):
+        a, marks = np.moveaxis(smooth, axis, 0), np.moveaxis(breaks, axis, 0)
+        step = np.diff(a, axis=0)
+        padded = np.concatenate([step[:1], step, step[-1:]])
+        unlike = np.minimum(np.abs(step - padded[:-2]), np.abs(step - padded[2:]))
+        jump = unlike > _step_m(np.minimum(a[:-1], a[1:]))
+        nearer = a[:-1] < a[1:]
+        # Only what lies behind is left out: the rim of what stands before belongs to it.
+        marks[:-1] |= jump & ~nearer
+        marks[1:] |= jump & nearer
+    return breaks
+
+
+def _disc(shape: tuple[int, int], centre: tuple[int, int], radius: int) -> Bools:
+    v, u = np.ogrid[: shape[0], : shape[1]]
+    return (u - centre[0]) ** 2 + (v - centre[1]) ** 2 <= radius**2

@@ -1,0 +1,60 @@
+"""Frames in .npz archives: known arrays alone, each bounded before it is unpacked, never an object."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from train.prediction.files import MAX_FILE_BYTES, MAX_PIXELS, read_bytes
+
+NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
+_MAX_ARRAY_BYTES = 8 * MAX_PIXELS
+_MEND = (
+    "Write it with numpy.savez: depth, rgb, intrinsics (fx, fy, cx, cy), and if you like mask, T_world_camera"
+)
+
+
+def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Those of `NAMES` that the archive holds. InputError for objects, bombs and what is no archive."""
+    data = read_bytes(path, MAX_FILE_BYTES)
+    found: dict[str, npt.NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            for name in NAMES:
+                if f"{name}.npy" in archive.NameToInfo:
+                    with archive.open(f"{name}.npy") as member:
+                        unpacked = member.read(_MAX_ARRAY_BYTES + 1)
+                    found[name] = _array(path, name, unpacked)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+        raise InputError(path, "", f"not a .npz archive ({type(error).__name__})", _MEND) from None
+    if not found:
+        raise InputError(path, "", f"holds none of {', '.join(NAMES)}", _MEND)
+    return found
+
+
+def _array(path: Path, name: str, data: bytes) -> npt.NDArray[Any]:
+    """One array of numbers; its header is held against its bytes before anything of its size is made."""
+    if len(data) > _MAX_ARRAY_BYTES:
+        raise InputError(path, name, f"unpacks to more than {_MAX_ARRAY_BYTES:,} bytes", _MEND)
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, _, dtype = reader[version](file)
+    except (ValueError, KeyError, SyntaxError, MemoryError, RecursionError, EOFError) as error:
+        raise InputError(path, name, f"not an array ({type(error).__name__})", _MEND) from None
+    if dtype.hasobject or dtype.kind not in "buif":
+        raise InputError(path, name, f"holds {dtype}, not numbers", _MEND)
+    size = math.prod(shape) * dtype.itemsize
+    if size != len(data) - file.tell():
+        raise InputError(path, name, f"promises {size:,} bytes of {len(data) - file.tell():,}", _MEND)
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

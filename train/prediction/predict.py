@@ -1,0 +1,313 @@
+"""From frames to a scored grid of base poses around the target, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+from schemas.specification import CandidateParams, ObservationParams
+from train.inputs import Array, Batch, Candidates, Clouds, Robots
+from train.prediction.candidates import (
+    BLOCKED,
+    CLEAR,
+    STATES,
+    UNSEEN,
+    Places,
+    RobotSize,
+    facing_yaw,
+    look_at_places,
+    seen_share,
+)
+from train.prediction.frames import SensorFrame, image_frame
+from train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
+from train.prediction.ground import Ground, find_ground
+from train.prediction.growing import grow_mask
+from train.prediction.target import Filled, TargetBox, fill_target, locate
+from train.scorers import ModelScorer, Scorer
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse, yaw_pose
+from workers.rendering.cloud import Cloud
+
+# The margin is to this rank: neighbours of the best are nearly as good, and say nothing of doubt.
+_RANK = 10
+_SURE, _LIKELY = 0.8, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A scored grid of places around the target, and all that explains it. World: floor z = 0."""
+
+    scorer: str
+    robot: RobotSize
+    frames: tuple[SensorFrame, ...]
+    grounds: tuple[Ground, ...]  # one a frame
+    seen: SeenPoints
+    target: TargetBox
+    filled: Filled | None  # None where no mask was given or clicked
+    cloud: Cloud
+    places: Places
+    score: F64  # (N,)
+    best: int | None  # the best of those that may be chosen; None where there is none
+    notes: tuple[str, ...]
+
+    @property
+    def center_m(self) -> F64:
+        """The target's centre (3,)."""
+        return np.array(self.target.center_m)
+
+    @property
+    def base_xy_m(self) -> F64:
+        """Base positions (N, 2)."""
+        return self.center_m[:2] + self.places.offset_m
+
+    @property
+    def yaw_rad(self) -> F64:
+        """Headings (N,) that face the target, counter-clockwise from x."""
+        return facing_yaw(self.places.offset_m)
+
+    def T_world_base(self, row: int) -> F64:
+        """Pose (4, 4) of the arm's mount for one place: at base height, x towards the target."""
+        x, y = self.base_xy_m[row]
+        return yaw_pose(float(x), float(y), self.robot.base_height_m, float(self.yaw_rad[row]))
+
+    def T_camera_base(self, row: int) -> F64:
+        """The same in the first frame's camera."""
+        return inverse(self.grounds[0].T_world_camera) @ self.T_world_base(row)
+
+    def rows(self, state: str) -> npt.NDArray[np.int64]:
+        """The places of one state, best first."""
+        rows = np.flatnonzero(self.places.state == STATES.index(state))
+        return rows[np.argsort(-self.score[rows], kind="stable")]
+
+    @property
+    def margin(self) -> float | None:
+        """Score of the best over that of the 10th of its kind; None where there are fewer."""
+        if self.best is None:
+            return None
+        rows = self.rows(STATES[int(self.places.state[self.best])])
+        return float(self.score[self.best] - self.score[rows[_RANK - 1]]) if len(rows) >= _RANK else None
+
+    @property
+    def crop_seen(self) -> float:
+        """Share of the floor plan around the target in which anything was measured."""
+        return seen_share(self.cloud.points_m[: self.cloud.n].astype(np.float32), _CROP.crop_radius_m)
+
+    @property
+    def target_points(self) -> int:
+        """Points of the target in the cloud that was scored."""
+        return int(self.cloud.target_mask.sum())
+
+    @property
+    def missing_depth(self) -> float | None:
+        """Share of the frames' pixels without depth; None for clouds without pictures."""
+        shares = [f.image.missing_share for f in self.frames if f.image is not None]
+        return float(np.mean(shares)) if shares else None
+
+    @property
+    def sure(self) -> str:
+        """How sure the answer is, in plain words."""
+        if self.best is None:
+            return "no answer: no place around the target was seen to be clear"
+        score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
+        if score < _LIKELY:
+            return "doubtful: the scorer calls even the best place bad"
+        if self.places.state[self.best] == STATES.index(UNSEEN):
+            return "good if the floor there is free, which was not seen"
+        if score < _SURE or thin or self.crop_seen < 0.1:
+            return "likely, not sure: " + (
+                "a middling score"
+                if score < _SURE
+                else "few points of the target"
+                if thin
+                else "little was seen"
+            )
+        return "sure, as far as scores go"
+
+
+_CROP = ObservationParams()
+
+
+def load_scorer(checkpoint: str | Path, device: str = "cpu") -> ModelScorer:
+    """A checkpoint's model, ready to predict. InputError for what is no checkpoint."""
+    # Imported here: frames are read and refused without torch.
+    from train.training.checkpoints import load_model
+
+    model, head = load_model(checkpoint, device)
+    return ModelScorer(model, f"{head.model} ({head.stage})")
+
+
+def predict(
+    scorer: Scorer,
+    frames: Sequence[SensorFrame],
+    robot: RobotSize,
+    *,
+    camera_height_m: float | None = None,
+    gravity: F64 | None = None,
+    click: tuple[int, int] | None = None,
+    target_center_m: F64 | None = None,
+    allow_unseen: bool = False,
+    grid: int = 25,
+    half_width_m: float = 1.0,
+    seed: int = 0,
+) -> Prediction:
+    """Score a square grid of base poses around the target that the frames show.
+
+    Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
+    `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
+    The target is told by masks, by one click into the first frame, or by a cloud's own marks;
+    `target_center_m` (3,), world, replaces the estimated centre. InputError for what does not suffice.
+    """
+    grounds = _grounds(frames, camera_height_m, gravity)
+    frames = _with_target(frames, grounds, click)
+    prepared, filled = _fill(frames)
+    poses = [ground.T_world_camera for ground in grounds]
+    seen = fuse(prepared, poses)
+    target = _locate(seen)
+    if len(frames) > 1:
+        seen = join_target(seen, np.array(target.center_m), target.radius_m, target.support_height_m)
+        target = _locate(seen)
+    if target_center_m is not None:
+        x, y, z = (float(c) for c in target_center_m)
+        target = replace(target, center_m=(x, y, z), how="given")
+    centre = np.array(target.center_m)
+    cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
+    places = look_at_places(seen, centre, robot, _grid(grid, half_width_m))
+    score = scorer.score(_batch(cloud, target, robot, places))
+    best = _best(score, places, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
+    notes = _notes(grounds, filled, cloud)
+    return Prediction(
+        scorer.name,
+        robot,
+        tuple(frames),
+        tuple(grounds),
+        seen,
+        target,
+        filled,
+        cloud,
+        places,
+        score,
+        best,
+        notes,
+    )
+
+
+def _grounds(
+    frames: Sequence[SensorFrame], camera_height_m: float | None, gravity: F64 | None
+) -> list[Ground]:
+    if not frames:
+        raise InputError("frames", "", "none is given", "Give at least one frame")
+    for frame in frames:
+        if len(frames) > 1 and frame.T_world_camera is None:
+            mend = "Several frames need T_world_camera each: pose.json in its folder, or in the .npz"
+            raise InputError(frame.place, "pose", "missing", mend)
+    height_m = camera_height_m if len(frames) == 1 else None
+    return [find_ground(frame, height_m, gravity) for frame in frames]
+
+
+def _with_target(
+    frames: Sequence[SensorFrame], grounds: Sequence[Ground], click: tuple[int, int] | None
+) -> list[SensorFrame]:
+    """The frames, the first with the mask of what was clicked."""
+    first, image = frames[0], frames[0].image
+    if click is not None:
+        if image is None:
+            raise InputError("--click", "", "a cloud has no pixels", "Give a frame of pictures first")
+        if image.mask is not None:
+            raise InputError("--click", "", "the frame has a mask already", "Give one of --click and --mask")
+        grown = replace(image, mask=grow_mask(image, click, grounds[0].T_world_camera))
+        return [
+            image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"}),
+            *frames[1:],
+        ]
+    if not any(frame.on_target is not None for frame in frames):
+        mend = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
+        raise InputError(first.place, "target", "nothing says which pixels are the target's", mend)
+    return list(frames)
+
+
+def _fill(frames: Sequence[SensorFrame]) -> tuple[list[SensorFrame], Filled | None]:
+    done, counts = list[SensorFrame](), list[Filled]()
+    for frame in frames:
+        if frame.image is not None and frame.image.mask is not None:
+            frame, filled = fill_target(frame)
+            counts.append(filled)
+        done.append(frame)
+    if not counts:
+        return done, None
+    return done, Filled(sum(c.mask_pixels for c in counts), sum(c.missing_pixels for c in counts))
+
+
+def _locate(seen: SeenPoints) -> TargetBox:
+    points = seen.points_m.astype(np.float64)
+    return locate(points[seen.on_target], points[~seen.on_target], seen.eyes_m[0])
+
+
+def _grid(cells: int, half_width_m: float) -> CandidateParams:
+    if not 2 <= cells <= 200:
+        raise InputError("--grid", str(cells), "not between 2 and 200", "Ask for 25, as in training")
+    if not 0.05 <= half_width_m <= 5.0:
+        raise InputError(
+            "--half-width", str(half_width_m), "not between 0.05 and 5", "Ask for 1.0, as in training"
+        )
+    return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
+
+
+def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) -> Batch[Array]:
+    """The places as a scorer takes them; `base_is_clear` says what was seen to stand in the way."""
+    n = len(places.offset_m)
+
+    def one(value: float) -> Array:
+        return np.array([value], np.float32)
+
+    return Batch(
+        Clouds(
+            cloud.points_m[None].astype(np.float32),
+            cloud.rgb[None],
+            cloud.target_mask[None],
+            np.array([cloud.n], np.int64),
+            one(target.center_m[2]),
+            one(target.radius_m),
+        ),
+        Robots(
+            np.zeros(1, np.int64),
+            one(robot.camera_height_m),
+            one(robot.base_height_m),
+            one(robot.arm_reach_m),
+        ),
+        Candidates(np.zeros(n, np.int64), places.offset_m),
+        np.zeros(n, np.int64),
+        np.zeros((n, 16), np.uint8),
+        {"base_is_clear": places.state != STATES.index(BLOCKED)},
+    )
+
+
+def _best(score: F64, places: Places, allowed: Sequence[str]) -> int | None:
+    rows = np.flatnonzero(np.isin(places.state, [STATES.index(name) for name in allowed]))
+    return int(rows[np.argmax(score[rows])]) if len(rows) else None
+
+
+def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tuple[str, ...]:
+    notes: list[str] = []
+    for ground in grounds:
+        if ground.offset_m is not None and abs(ground.offset_m) > 0.03:
+            notes.append(
+                f"the floor that is seen lies at {ground.offset_m:+.3f} m, not at 0: check its camera"
+            )
+    if filled is not None and filled.missing_pixels:
+        share = filled.missing_pixels / filled.mask_pixels
+        notes.append(
+            f"{filled.missing_pixels} target pixels had no depth ({share:.0%}) and took their neighbour's"
+        )
+    if cloud.n < _CROP.n_points:
+        notes.append(
+            f"only {cloud.n} points within {_CROP.crop_radius_m:g} m of the target, {_CROP.n_points} wanted"
+        )
+    few = int(cloud.target_mask.sum())
+    if few < _CROP.min_target_points:
+        notes.append(f"only {few} points on the target, {_CROP.min_target_points} wanted")
+    return tuple(notes)

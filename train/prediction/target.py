@@ -1,0 +1,124 @@
+"""Which points are the target's, and where its centre is, of which only a part is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from schemas.errors import InputError
+from train.prediction.files import Bools
+from train.prediction.frames import SensorFrame
+from workers.geometry.mesh import F32, F64
+
+# Nothing that a gripper takes is wider: points farther from the middle of a target belong to other things.
+_LARGEST_M = 0.30
+# Of a mask's pixels, those with depth that must be there to stand for the others.
+_LEAST_SHARE, _LEAST_POINTS = 0.25, 30
+# A target is at least so deep along the sight line as this share of its width across it. It balances
+# boxes, whose tops show their depth, and round things, whose backs are hidden (docs/predict.md).
+_DEPTH_OVER_WIDTH = 0.8
+_RIM_PERCENT = 1.0  # left out at either end: noise at the rims
+
+
+@dataclass(frozen=True)
+class TargetBox:
+    """Where the target is, world frame; `how` says in words how it was found."""
+
+    center_m: tuple[float, float, float]
+    radius_m: float  # of the sphere around the centre that holds it
+    support_height_m: float  # what it stands on
+    how: str
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What became of a mask's pixels without depth."""
+
+    mask_pixels: int
+    missing_pixels: int
+
+
+def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
+    """The frame with depth for all of the mask's pixels: that of the nearest pixel of the mask.
+
+    InputError where too few pixels of the mask have depth to say what the others would have.
+    """
+    image = frame.image
+    assert image is not None and image.mask is not None
+    mask, known = image.mask, image.mask & (image.depth_m > 0)
+    wanted, have = int(mask.sum()), int(known.sum())
+    if have < max(_LEAST_POINTS, _LEAST_SHARE * wanted):
+        problem = f"only {have} of the target's {wanted} pixels have depth"
+        mend = "Take the frame from another angle or distance, or add frames"
+        raise InputError(frame.place, "target", problem, mend)
+    if have == wanted:
+        return frame, Filled(wanted, 0)
+    depth_m = from_nearest(image.depth_m, known)
+    pixels = np.flatnonzero((mask & ~known).ravel())
+    return replace(
+        frame,
+        points_m=np.concatenate([frame.points_m, image.points(pixels, depth_m)]),
+        rgb=np.concatenate([frame.rgb, image.rgb.reshape(-1, 3)[pixels]]),
+        on_target=np.concatenate([_known(frame), np.ones(len(pixels), np.bool_)]),
+    ), Filled(wanted, wanted - have)
+
+
+def from_nearest(values: F32, known: Bools) -> F32:
+    """Every pixel's value (H, W) from the nearest pixel that is known."""
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rows, columns = np.asarray(nearest, np.int64)
+    return values[rows, columns]
+
+
+def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
+    """The box of the target from its visible points (N, 3), the others (M, 3) and the camera (3,), world.
+
+    Across the sight line the middle of what is seen; along it as deep as seen, at least a share of its
+    width; in height from the support to the top. InputError where too few points are seen.
+    """
+    middle = np.median(target_m, axis=0)
+    kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
+    if len(kept) < _LEAST_POINTS:
+        problem = f"{len(kept)} points seen, {_LEAST_POINTS} are needed"
+        mend = "Give a mask of the whole target, or a frame that sees more of it"
+        raise InputError("target", "", problem, mend)
+    ahead = kept[:, :2].mean(axis=0) - eye_m[:2]
+    far_m = float(np.linalg.norm(ahead))
+    ahead = ahead / far_m if far_m > 1e-6 else np.array([0.0, 1.0])
+    across = np.array([-ahead[1], ahead[0]])
+    (front, back), (right, left), (low, top) = (
+        np.percentile(values, (_RIM_PERCENT, 100 - _RIM_PERCENT))
+        for values in (kept[:, :2] @ ahead, kept[:, :2] @ across, kept[:, 2])
+    )
+    width = left - right
+    deep = max(back - front, _DEPTH_OVER_WIDTH * width)
+    support = _support_under(others_m, kept[:, :2].mean(axis=0), width / 2 + 0.12, low)
+    centre_xy = (front + deep / 2) * ahead + (left + right) / 2 * across
+    centre = np.array([*centre_xy, (top + support) / 2])
+    corners = np.concatenate([kept, np.column_stack([kept[:, :2], np.full(len(kept), support)])])
+    radius_m = float(np.percentile(np.linalg.norm(corners - centre, axis=1), 100 - _RIM_PERCENT))
+    guessed = " (set by its width)" if deep > back - front else ""
+    how = (
+        f"box of the visible points: {width:.3f} m across, {deep:.3f} m along the sight line{guessed}, "
+        f"{top - support:.3f} m over a support at {support:.3f} m"
+    )
+    x, y, z = (float(c) for c in centre)
+    return TargetBox((x, y, z), radius_m, support, how)
+
+
+def _support_under(others_m: F64, middle_xy: F64, half_m: float, low_m: float) -> float:
+    """Height of what the target stands on: where most points around its foot lie, or its lowest point."""
+    near = (np.abs(others_m[:, :2] - middle_xy) < half_m).all(axis=1)
+    z = others_m[near & (others_m[:, 2] < low_m + 0.03) & (others_m[:, 2] > low_m - 0.1), 2]
+    if len(z) < 50:
+        return float(low_m)
+    counted, edges = np.histogram(z, np.arange(low_m - 0.1, low_m + 0.035, 0.005))
+    k = int(counted.argmax())
+    return float(np.median(z[(z >= edges[k] - 0.0025) & (z <= edges[k + 1] + 0.0025)]))
+
+
+def _known(frame: SensorFrame) -> Bools:
+    assert frame.on_target is not None
+    return frame.on_target
