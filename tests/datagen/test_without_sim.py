@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.small_runs import PER_SCENE, submit_arguments
+
 # As if none of them were installed, nor what they bring.
 WITHOUT = """
+import json
 import sys
 from importlib.machinery import PathFinder
 
@@ -20,31 +23,31 @@ PathFinder.find_spec = lambda name, *rest: None if name.split(".")[0] in MISSING
 
 from datagen import cli
 
-sys.exit(cli.run(sys.argv[1:]))
+for arguments in json.loads(sys.argv[1]):
+    if code := cli.run(arguments):
+        sys.exit(code)
 """
 
 
-def datagen_without_sim(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", WITHOUT, *arguments]
+def datagen_without_sim(*commands: list[str]) -> subprocess.CompletedProcess[str]:
+    """These commands one after another, up to the first that fails."""
+    command = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_heuristic_labels_are_made_shown_and_audited_without_it(tmp_path: Path) -> None:
-    run = str(tmp_path / "run")
-    made = datagen_without_sim("submit", "heuristic", "--n", "60", "--out", run, "--workers", "0")
-    assert made.returncode == 0, made.stderr
-    picture = tmp_path / "scene.png"
-    shown = datagen_without_sim("show", run, "--scene", "0", "--out", str(picture))
-    assert shown.returncode == 0 and picture.is_file(), shown.stderr
-    audited = datagen_without_sim("audit", run, "--json")
-    assert audited.returncode == 0 and json.loads(audited.stdout), audited.stderr
+    run, picture = tmp_path / "run", tmp_path / "scene.png"
+    show = ["show", str(run), "--scene", "0", "--out", str(picture)]
+    done = datagen_without_sim(submit_arguments(run, PER_SCENE), show, ["audit", str(run), "--json"])
+    assert done.returncode == 0, done.stderr
+    assert picture.is_file()
+    assert json.loads(done.stdout[done.stdout.index("\n{") :])["sources"]
 
 
 @pytest.mark.parametrize("source", ["plan", "sim"])
 def test_other_labels_name_the_extra_in_one_line(tmp_path: Path, source: str) -> None:
-    asked = datagen_without_sim(
-        "submit", source, "--n", "60", "--out", str(tmp_path / "run"), "--workers", "0"
-    )
+    command = ["submit", source, "--n", "60", "--out", str(tmp_path / "run"), "--workers", "0"]
+    asked = datagen_without_sim(command)
     assert asked.returncode == 2
     assert "pip install 'datagen[sim]'" in asked.stderr and "Traceback" not in asked.stderr
     assert len(asked.stderr.strip().splitlines()) == 1
