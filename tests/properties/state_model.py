@@ -80,6 +80,12 @@ def specification(seed: int, rule_name: str) -> Specification:
     return SPECS[seed, rule_name]
 
 
+@cache
+def hash_of(seed: int, rule_name: str) -> str:
+    """The hash of that specification, which a seed and a rule decide."""
+    return specification(seed, rule_name).hash()
+
+
 def united(one: Part, other: Part) -> Part:
     """What a merge of two runs of one specification holds."""
     committed = one.committed | other.committed
@@ -89,10 +95,10 @@ def united(one: Part, other: Part) -> Part:
 def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
     """(ids, labels) that a store over these parts must hold, from the drawn rows alone."""
     ids, labels = [], []
-    order = sorted(sealed, key=lambda key: specification(*key).hash())
+    order = sorted(sealed, key=lambda key: hash_of(*key))
     with_rows = [key for key in order if sealed[key].committed & set(sealed[key].planned)]
     for key in with_rows:
-        spec, part = specification(*key), sealed[key]
+        part = sealed[key]
         for shard in sorted(part.committed & set(part.planned)):
             rows = drawn_rows(key[0], shard)
             label = rows["label"]
@@ -103,7 +109,7 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
                 _, label = heuristic.heuristic(d, mount, reach, rho, RULES[key[1]])
             # Only the end of the store is cut: that of the last run with rows.
             kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == with_rows[-1] else PER_SHARD
-            ids.append(sample_ids(spec.hash(), shard, np.arange(PER_SHARD))[:kept])
+            ids.append(sample_ids(hash_of(*key), shard, np.arange(PER_SHARD))[:kept])
             labels.append(label[:kept])
     return np.concatenate(ids), np.concatenate(labels)
 
@@ -111,7 +117,7 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
 @cache
 def drawn_rows(seed: int, shard: int) -> Any:
     spec = specification(seed, "")
-    return tables_of(sized_schema("heuristic", spec), LAYOUT, seed, shard, spec.hash())[1]
+    return tables_of(sized_schema("heuristic", spec), LAYOUT, seed, shard, hash_of(seed, ""))[1]
 
 
 def files_of_shard(run: Run, shard: int) -> dict[str, bytes]:

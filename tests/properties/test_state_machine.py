@@ -48,6 +48,7 @@ from tests.properties.state_model import (
     Place,
     expected_rows,
     files_of_shard,
+    hash_of,
     specification,
     united,
 )
@@ -323,7 +324,7 @@ class AnyHistory(RuleBasedStateMachine):
 
     def runs(self, place: Place) -> dict[tuple[int, str], Run]:
         """The runs of a place by seed and rule; these are those of the model."""
-        names = {specification(*key).hash(): key for key in place.parts}
+        names = {hash_of(*key): key for key in place.parts}
         found = {names[run.manifest.spec_hash]: run for run in open_runs(place.folder)}
         assert found.keys() == place.parts.keys()
         return found
