@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from datagen.evaluating.svg import LINES, PALETTE, new_figure
+from datagen.evaluating.svg import BASELINE_COLOURS, LINES, MODEL_COLOURS, new_figure
 from datagen.evaluating.wording import METRIC_WORDS, paper_accuracy
 
 Report = Mapping[str, Any]
@@ -18,13 +18,15 @@ _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 def looks_of(records: Sequence[Report]) -> dict[str, dict[str, Any]]:
     """Colour and line of each method: models drawn through, baselines broken."""
     looks: dict[str, dict[str, Any]] = {}
-    of_baselines = 0
-    for k, record in enumerate(records):
-        line, width = "-", 2.4
+    models = baselines = 0
+    for record in records:
         if record["regime"] is None:
-            of_baselines += 1
-            line, width = LINES[1 + of_baselines % 3], 1.3
-        looks[record["name"]] = {"color": PALETTE[k % len(PALETTE)], "ls": line, "lw": width}
+            colour, line, width = BASELINE_COLOURS[baselines % 8], LINES[baselines % 3], 1.3
+            baselines += 1
+        else:
+            colour, line, width = MODEL_COLOURS[models % 6], "-", 2.4
+            models += 1
+        looks[record["name"]] = {"color": colour, "ls": line, "lw": width}
     return looks
 
 
@@ -40,19 +42,17 @@ def draw_intervals(report: Report, told: Report) -> Figure:
             _draw_estimate(ax, y, estimate, looks[record["name"]]["color"])
             stated = paper_accuracy(record, report["paper"])
             if metric == "accuracy" and stated is not None:
-                ax.plot(100 * stated, y, "D", ms=6, mfc="none", mec="black", label="the paper")
+                ax.plot(100 * stated, y, "D", ms=6, mfc="none", mec="black")
         if metric in ("balanced_accuracy", "area_under_roc"):
             ax.axvline(50, color="#999999", lw=0.8, ls=":")
-        ax.set_xlabel(f"{METRIC_WORDS[metric]} (%)")
+        mark = ", ◇ the paper" if metric == "accuracy" else ""
+        ax.set_xlabel(f"{METRIC_WORDS[metric]} (%){mark}")
         ax.grid(axis="x", color="#e4e4e4", lw=0.7)
         ax.set_axisbelow(True)
         for side in ("top", "right", "left"):
             ax.spines[side].set_visible(False)
     panels[0].set_yticks(range(len(records)), [r["name"] for r in records])
     panels[0].invert_yaxis()
-    handles, labels = panels[0].get_legend_handles_labels()
-    if handles:
-        panels[0].legend(handles[:1], labels[:1], fontsize=8, frameon=False, loc="best")
     return figure
 
 

@@ -40,7 +40,7 @@ def print_evaluation(report: Report) -> None:
         # The narrowest set is the one on which methods differ.
         _print_breakdown(report, next(iter(part["sets"].values())))
     notes = [
-        ("[low, high]", f"95% by {report['bootstrap']['resamples']:,} resamples of scenes"),
+        ("intervals", f"95% by {report['bootstrap']['resamples']:,} resamples of scenes"),
         ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
     ]
     if any(record["threshold"] is None for record in report["methods"]):

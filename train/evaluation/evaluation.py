@@ -53,8 +53,9 @@ class Method:
         return (score >= self.threshold).astype(np.float64)
 
     def says_probabilities(self, score: F64) -> bool:
-        """Whether its scores can be read as probabilities of a good label."""
-        return self.threshold == 0.5 and bool(((score >= 0) & (score <= 1)).all())
+        """Whether its scores can be read as probabilities of a good label, and not as yes and no."""
+        in_range = bool(((score >= 0) & (score <= 1)).all())
+        return self.threshold == 0.5 and in_range and len(np.unique(score)) > 2
 
 
 def evaluate_set(

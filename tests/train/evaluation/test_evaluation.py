@@ -1,0 +1,151 @@
+"""Tables by hand: what is told of a set of candidates and of whole grids."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.errors import InputError
+from tests.train.evaluation.made_columns import make_columns
+from train.evaluation.columns import Columns
+from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+
+METHODS = [
+    Method("truth", 0.5),
+    Method("constant", 0.5),
+    Method("noisy", 0.5, "stage1"),
+    Method("nearest", float("nan")),
+]
+
+
+def scored(seed: int = 0, **changes: int) -> Columns:
+    rng = np.random.default_rng(seed)
+    columns = make_columns(rng, **changes)
+    n = len(columns)
+    scores = {
+        "truth": columns.label.astype(np.float64),
+        "constant": np.full(n, 0.7),
+        "noisy": np.clip(columns.label * 0.4 + rng.random(n) * 0.6, 0, 1),
+        "nearest": -columns.mount_distance_m.astype(np.float64),
+    }
+    return replace(columns, scores=scores)
+
+
+def test_a_set_is_told_as_counting_by_hand_tells_it() -> None:
+    columns = scored(n_scenes=40)
+    told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 200, 0), ["0" * 64])
+    rows = columns.is_clear
+    label, said = columns.label[rows], columns.scores["noisy"][rows] >= 0.5
+    assert (told["count"], told["positives"], told["scenes"]) == (rows.sum(), label.sum(), 40)
+    noisy = told["methods"]["noisy"]
+    assert noisy["accuracy"]["value"] == pytest.approx((said == label).mean())
+    assert noisy["accuracy"]["low"] < noisy["accuracy"]["value"] < noisy["accuracy"]["high"]
+    reached = columns.is_reachable[rows]
+    assert noisy["accuracy_in_reach"]["value"] == pytest.approx((said == label)[reached].mean())
+    assert noisy["accuracy_out_of_reach"]["value"] == pytest.approx((said == label)[~reached].mean())
+    assert told["out_of_reach"] == {"count": int((~reached).sum()), "positives": 0}
+    assert told["methods"]["truth"]["accuracy"] == {"value": 1, "low": 1, "high": 1}
+    constant = told["methods"]["constant"]
+    assert (
+        constant["balanced_accuracy"] == constant["area_under_roc"] == {"value": 0.5, "low": 0.5, "high": 0.5}
+    )
+    assert constant["accuracy"]["value"] == pytest.approx(label.mean())
+    json.dumps(told, allow_nan=False)
+
+
+def test_a_method_without_threshold_says_good_of_its_pick_alone() -> None:
+    columns = scored(n_scenes=30)
+    told = evaluate_set(columns, METHODS, "in-range", weights_for(columns, 50, 0))
+    cut = columns.at(columns.is_in("in-range"))
+    right = 0
+    for scene in range(30):
+        rows = np.flatnonzero(cut.scene == scene)
+        if len(rows):
+            pick = rows[np.argmin(cut.mount_distance_m[rows])]
+            right += sum(bool(cut.label[row]) == (row == pick) for row in rows)
+    assert told["methods"]["nearest"]["accuracy"]["value"] == pytest.approx(right / len(cut))
+
+
+def test_breakdowns_part_the_candidates_and_know_what_was_trained_on() -> None:
+    columns = scored(n_scenes=30)
+    told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0), ["0" * 64])
+    headings = dict.fromkeys(row["by"] for row in told["breakdown"])
+    assert list(headings) == [
+        *("object", "distance (m)", "mount distance / reach", "visibility", "outcome", "object trained on"),
+    ]
+    for heading in headings:
+        rows = [row for row in told["breakdown"] if row["by"] == heading]
+        assert sum(row["count"] for row in rows) == told["count"]
+        assert sum(row["positives"] for row in rows) == told["positives"]
+        weighted = sum(row["count"] * row["methods"]["noisy"]["accuracy"] for row in rows)
+        assert weighted / told["count"] == pytest.approx(told["methods"]["noisy"]["accuracy"]["value"])
+    trained = [row["count"] for row in told["breakdown"] if row["by"] == "object trained on"]
+    on_first = columns.is_clear & (columns.scene % 3 == 0)
+    assert trained == [on_first.sum(), told["count"] - on_first.sum()]
+
+
+def test_differences_are_of_the_same_resamples_both_ways_round() -> None:
+    columns = scored(n_scenes=40)
+    weights = weights_for(columns, 300, 5)
+    forth = evaluate_set(columns, METHODS, "clear", weights)["differences"]
+    back = evaluate_set(columns, METHODS[::-1], "clear", weights)["differences"]
+    by_pair = {(d["metric"], d["first"], d["second"]): d for d in back}
+    assert len(forth) == len(back) == 4 * 6
+    turned = {"above": "below", "below": "above", "open": "open"}
+    for d in forth:
+        other = by_pair[d["metric"], d["second"], d["first"]]
+        assert d["value"] == pytest.approx(-other["value"])
+        assert (d["low"], d["high"]) == pytest.approx((-other["high"], -other["low"]))
+        assert (d["verdict"], d["disjoint"]) == (turned[other["verdict"]], other["disjoint"])
+    sure = next(
+        d for d in forth if (d["metric"], d["first"], d["second"]) == ("accuracy", "truth", "constant")
+    )
+    assert sure["verdict"] == "above" and sure["disjoint"]
+
+
+def test_probabilities_are_judged_as_such_and_other_scores_are_not() -> None:
+    columns = scored()
+    methods = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0))["methods"]
+    assert methods["noisy"]["brier"] > 0 and methods["noisy"]["expected_calibration_error"] > 0
+    assert sum(b["count"] for b in methods["noisy"]["reliability"]) == columns.is_clear.sum()
+    # Yes and no, one constant, and no threshold at all: none of them says how sure it is.
+    assert [methods[name]["brier"] for name in ("truth", "constant", "nearest")] == [None, None, None]
+
+
+def test_grids_count_scenes_with_a_good_candidate_and_say_how_many_have_none() -> None:
+    columns = scored(n_scenes=60, per_scene=9)
+    label = columns.label & (columns.scene % 4 != 0)
+    columns = replace(columns, label=label, scores={**columns.scores, "truth": label.astype(np.float64)})
+    some = np.unique(columns.scene[label])
+    told = evaluate_grids(columns, METHODS, weights_for(columns, 200, 0))
+    assert told["scenes"] == 60 and told["scenes_without_positive"] == 60 - len(some)
+    assert told["methods"]["truth"]["good"] == {"value": 1, "low": 1, "high": 1}
+    assert told["methods"]["truth"]["missed_m"]["value"] is None
+    # A constant picks any clear candidate.
+    shares = [label[rows].mean() for s in some if (rows := (columns.scene == s) & columns.is_clear).any()]
+    assert told["methods"]["constant"]["good"]["value"] == pytest.approx(np.mean(shares))
+    assert told["any_clear"] == pytest.approx(np.mean(shares))
+    missed: list[float] = []
+    for s in some:
+        rows = np.flatnonzero((columns.scene == s) & columns.is_clear)
+        pick = rows[np.argmax(columns.scores["noisy"][rows])]
+        if not label[pick]:
+            goods = columns.base_xy_m[rows[label[rows]]]
+            missed.append(float(np.linalg.norm(goods - columns.base_xy_m[pick], axis=1).min()))
+    found = told["methods"]["noisy"]
+    assert found["good"]["value"] == pytest.approx(1 - len(missed) / len(some))
+    assert found["missed_m"]["value"] == pytest.approx(np.mean(missed))
+
+
+def test_sets_without_candidates_or_with_one_class_are_refused() -> None:
+    columns = scored()
+    weights = weights_for(columns, 10, 0)
+    nothing = replace(columns, is_clear=np.zeros(len(columns), np.bool_))
+    with pytest.raises(InputError, match="--candidates: clear: no candidate of these runs is in it"):
+        evaluate_set(nothing, METHODS, "clear", weights)
+    bad = replace(columns, label=np.zeros(len(columns), np.bool_))
+    with pytest.raises(InputError, match="grid: all 240 candidates have the label 0"):
+        evaluate_set(bad, METHODS, "grid", weights)
