@@ -1,0 +1,71 @@
+"""The order of an epoch: what holds for any data, batches, buffers and ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from train.epoch_plan import EpochPlan, batches_of, plan_epoch
+
+SHARDS = st.lists(st.integers(1, 6), min_size=1, max_size=12)  # scenes of each
+ASKED = st.tuples(st.integers(1, 9), st.integers(1, 5))  # scenes a batch, shards a buffer
+
+
+def plans(sizes: list[int], asked: tuple[int, int], seed: int | None, world: int) -> list[EpochPlan]:
+    shard = np.repeat(np.arange(len(sizes)), sizes)
+    rngs = [None if seed is None else np.random.default_rng(seed) for _ in range(world)]
+    return [plan_epoch(shard, *asked, rngs[rank], rank, world) for rank in range(world)]
+
+
+@given(SHARDS, ASKED, st.none() | st.integers(0, 99), st.integers(1, 5))
+@settings(max_examples=150, deadline=None)
+def test_ranks_share_the_scenes_out_evenly_in_equally_many_batches(
+    sizes: list[int], asked: tuple[int, int], seed: int | None, world: int
+):
+    n = sum(sizes)
+    assume(n >= world)
+    made = plans(sizes, asked, seed, world)
+    assert sorted(np.concatenate([p.order for p in made]).tolist()) == list(range(n))
+    batches = batches_of(n, asked[0], world)
+    for plan in made:
+        assert len(plan.cuts) == batches + 1
+        counts = np.diff(plan.cuts)
+        assert counts.min() >= 1
+        assert counts.max() - counts.min() <= 1
+        assert counts.max() <= max(asked[0], 2)
+        assert counts.sum() == len(plan.order)
+    assert max(len(p.order) for p in made) - min(len(p.order) for p in made) <= 1
+
+
+@given(SHARDS, ASKED, st.integers(0, 99), st.integers(1, 4))
+@settings(max_examples=100, deadline=None)
+def test_scenes_are_shuffled_within_a_buffer_of_whole_shards(
+    sizes: list[int], asked: tuple[int, int], seed: int, world: int
+):
+    assume(sum(sizes) >= world)
+    shard = np.repeat(np.arange(len(sizes)), sizes)
+    for plan in plans(sizes, asked, seed, world):
+        assert (np.diff(plan.buffer) >= 0).all()
+        held = [set(shard[plan.order[plan.buffer == b]].tolist()) for b in range(plan.buffer[-1] + 1)]
+        assert all(len(some) <= asked[1] for some in held)
+        assert sum(map(len, held)) == len(set().union(*held))  # no shard is read twice by one rank
+        assert all(len(some) == asked[1] for some in held[:-1])
+
+
+@given(SHARDS, st.tuples(ASKED, ASKED), st.integers(1, 4))
+@settings(max_examples=50, deadline=None)
+def test_unshuffled_order_depends_on_nothing(
+    sizes: list[int], asked: tuple[tuple[int, int], tuple[int, int]], world: int
+):
+    assume(sum(sizes) >= world)
+    for one in asked:
+        order = np.concatenate([p.order for p in plans(sizes, one, None, world)])
+        np.testing.assert_array_equal(order, np.arange(sum(sizes)))
+
+
+def test_epochs_differ_and_mix_shards():
+    orders = [plans([4] * 50, (8, 8), seed, 1)[0].order for seed in (1, 2)]
+    assert not np.array_equal(*orders)
+    # The first of 25 batches takes scenes from most of a buffer's shards.
+    assert len(set((orders[0][:8] // 4).tolist())) >= 4
