@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from schemas.errors import InputError
 from train.prediction.files import (
@@ -62,6 +63,25 @@ class RgbdImage:
         """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
+
+    def facets(self, T: F64) -> F64:
+        """Area times normal (H, W, 3), turned to the camera, of what each pixel sees; in T's parent frame.
+
+        From smoothed depth: a pixel's own neighbours are nearer to it than a stereo camera's noise is wide.
+        """
+        known = (self.depth_m > 0).astype(np.float32)
+        weight = np.asarray(ndimage.uniform_filter(known, 7), np.float32)
+        smooth = np.asarray(ndimage.uniform_filter(self.depth_m, 7), np.float32) / np.maximum(weight, 1e-6)
+        grid = self.world_grid(T, smooth)
+        facets = np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1))
+        towards = np.einsum("ijk,ijk->ij", facets, T[:3, 3] - grid)
+        return facets * np.sign(towards)[..., None]
+
+    def world_grid(self, T: F64, depth_m: F32 | None = None) -> F64:
+        """Points (H, W, 3) of all pixels in T's parent frame; those without depth lie in the camera."""
+        h, w = self.depth_m.shape
+        points_m = self.points(np.arange(h * w), depth_m).astype(np.float64)
+        return (points_m @ T[:3, :3].T + T[:3, 3]).reshape(h, w, 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from schemas.errors import InputError
 from train.prediction.files import Bools
@@ -20,7 +21,9 @@ _GIVEN_ERROR_M = 0.01  # of the camera's height as people measure it
 # The floor's normal points up in the picture (cosine; 75 degrees), and cameras are hardly rolled (sine).
 _LEAST_UP, _MOST_ROLL = 0.26, 0.25
 # A plane of fewer points, or with more than this share of all points below it, is no floor.
-_LEAST_POINTS, _LEAST_SHARE, _MOST_BELOW = 300, 0.01, 0.02
+_LEAST_POINTS, _LEAST_SHARE, _MOST_BELOW = 300, 0.015, 0.02
+# A plane that cuts through things passes many points, whose surfaces run another way (cosine; 15 degrees).
+_LIES_FLAT = 0.966
 _MEND = "Give --gravity x,y,z (camera frame: where things fall) or --camera-pose pose.json"
 
 
@@ -116,23 +119,36 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     """
     rng = np.random.default_rng([0, len(frame.points_m)])
     points = frame.points_m.astype(np.float64)
-    some = points[rng.choice(len(points), min(_SAMPLE, len(points)), replace=False)]
-    band_m = 0.008 + 2 * depth_error_m(some[:, 2])
-    normals, heights = _tried_planes(some, rng)
+    rows = rng.choice(len(points), min(_SAMPLE, len(points)), replace=False)
+    some = _Some(points[rows], 0.008 + 2 * depth_error_m(points[rows, 2]), _normals(frame, rows))
+    normals, heights = _tried_planes(some.points, rng)
     agrees = np.abs(heights - camera_height_m) < _tolerance_m(camera_height_m)
-    found = _best(some, band_m, normals[agrees], heights[agrees])
+    found = _best(some, normals[agrees], heights[agrees])
     if found is None:
-        other = _best(some, band_m, normals, heights)
+        other = _best(some, normals, heights)
         if other is not None and other[1] > 0.3:
             problem = f"the lowest plane is {other[1]:.2f} m below the camera, {camera_height_m:.2f} m given"
             mend = f"Correct --camera-height, or, if that plane is no floor: {_MEND}"
             raise InputError(frame.place, "floor", problem, mend)
         raise InputError(frame.place, "floor", "not seen in the depth picture", _MEND)
-    normal, height_m = _fitted(points, *found, camera_height_m)
-    if abs(height_m - camera_height_m) > _tolerance_m(camera_height_m):
-        problem = f"its plane is {height_m:.2f} m below the camera, {camera_height_m:.2f} m given"
-        raise InputError(frame.place, "floor", problem, f"Correct --camera-height. {_MEND}")
-    return normal, height_m
+    return _fitted(points, *found, camera_height_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Some:
+    """Points on which planes are tried, how near a plane passes them that they lie on, and normals."""
+
+    points: F64  # (N, 3)
+    band_m: F64  # (N,)
+    normals: F64 | None  # (N, 3); None for clouds without a picture
+
+
+def _normals(frame: SensorFrame, rows: npt.NDArray[np.int64]) -> F64 | None:
+    """Unit normals (N, 3) at some of a frame's points, in its camera's frame."""
+    if frame.image is None:
+        return None
+    facets = frame.image.facets(np.eye(4))[frame.image.depth_m > 0][rows]
+    return facets / np.maximum(np.linalg.norm(facets, axis=1, keepdims=True), 1e-12)
 
 
 def _fitted(points: F64, normal: F64, height_m: float, camera_height_m: float) -> tuple[F64, float]:
@@ -179,15 +195,15 @@ def _tried_planes(points: F64, rng: np.random.Generator) -> tuple[F64, F64]:
     return normals[good], heights[good]
 
 
-def _best(points: F64, band_m: F64, normals: F64, heights: F64) -> tuple[F64, float] | None:
-    """The plane with most points near it, of those with next to nothing below; None where none serves."""
+def _best(some: _Some, normals: F64, heights: F64) -> tuple[F64, float] | None:
+    """The plane with most points on it, of those with next to nothing below; None where none serves."""
     if not len(normals):
         return None
-    gaps = points @ normals.T + heights  # (N, K), height of each point over each plane
-    near = (np.abs(gaps) < band_m[:, None]).sum(axis=0)
-    below = (gaps < -0.03 - 2 * band_m[:, None]).mean(axis=0)
-    near = np.where(below <= _MOST_BELOW, near, 0)
-    k = int(near.argmax())
-    if near[k] < max(_LEAST_SHARE * len(points), _LEAST_POINTS * min(1.0, len(points) / 100_000)):
-        return None
-    return normals[k], float(heights[k])
+    gaps = some.points @ normals.T + heights  # (N, K), height of each point over each plane
+    on = np.abs(gaps) < some.band_m[:, None]
+    if some.normals is not None:
+        on &= some.normals @ normals.T > _LIES_FLAT
+    below = (gaps < -0.03 - 2 * some.band_m[:, None]).mean(axis=0)
+    share = np.where(below <= _MOST_BELOW, on.mean(axis=0), 0.0)
+    k = int(share.argmax())
+    return (normals[k], float(heights[k])) if share[k] >= _LEAST_SHARE else None

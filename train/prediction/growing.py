@@ -35,7 +35,7 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
         mend = "Click on another place of the target" if near else "Take the frame again, or give --mask"
         raise InputError("--click", f"{u},{v}", "this pixel has no depth", mend)
-    grid, facets = _world_grid(image, depth_m, T_world_camera), _facets(image, T_world_camera)
+    grid, facets = image.world_grid(T_world_camera), image.facets(T_world_camera)
     seed = grid[v, u]
     far_m = np.linalg.norm(grid - seed, axis=2)
     around = (depth_m > 0) & (far_m < _GROWS_M)
@@ -55,26 +55,6 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     step_m = np.abs(depth_m - from_nearest(depth_m, grown))
     filled = np.asarray(ndimage.binary_fill_holes(grown | (rim & (step_m < _step_m(depth_m)))), np.bool_)
     return filled & (depth_m > 0)
-
-
-def _world_grid(image: RgbdImage, depth_m: F32, T_world_camera: F64) -> F64:
-    """World points (H, W, 3) of all pixels; those without depth lie in the camera."""
-    h, w = depth_m.shape
-    points_m = image.points(np.arange(h * w), depth_m).astype(np.float64)
-    return (points_m @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).reshape(h, w, 3)
-
-
-def _facets(image: RgbdImage, T_world_camera: F64) -> F64:
-    """Area times upward normal (H, W, 3) of the surface that each pixel sees, from smoothed depth.
-
-    A pixel's own neighbours are nearer to it than a stereo camera's noise is wide.
-    """
-    known = (image.depth_m > 0).astype(np.float32)
-    weight = ndimage.uniform_filter(known, 7)
-    smooth = ndimage.uniform_filter(image.depth_m, 7) / np.maximum(weight, 1e-6)
-    grid = _world_grid(image, smooth.astype(np.float32), T_world_camera)
-    facets = np.cross(np.gradient(grid, axis=1), np.gradient(grid, axis=0))
-    return facets * np.sign(facets[..., 2:])
 
 
 def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:

@@ -16,8 +16,9 @@ from workers.geometry.mesh import F32, F64
 _LARGEST_M = 0.30
 # Of a mask's pixels, those with depth that must be there to stand for the others.
 _LEAST_SHARE, _LEAST_POINTS = 0.25, 30
-# A target is at least so deep along the sight line as this share of its width across it. It balances
-# boxes, whose tops show their depth, and round things, whose backs are hidden (docs/predict.md).
+# A target is at least so deep along the sight line as this share of its width across it, or of its height
+# where that is less. It balances boxes, whose tops show their depth, and round things, whose backs are
+# hidden; what lies flat hides nothing (docs/predict.md).
 _DEPTH_OVER_WIDTH = 0.8
 _RIM_PERCENT = 1.0  # left out at either end: noise at the rims
 
@@ -76,7 +77,7 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     """The box of the target from its visible points (N, 3), the others (M, 3) and the camera (3,), world.
 
     Across the sight line the middle of what is seen; along it as deep as seen, at least a share of its
-    width; in height from the support to the top. InputError where too few points are seen.
+    width or height; in height from the support to the top. InputError where too few points are seen.
     """
     middle = np.median(target_m, axis=0)
     kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
@@ -93,13 +94,13 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
         for values in (kept[:, :2] @ ahead, kept[:, :2] @ across, kept[:, 2])
     )
     width = left - right
-    deep = max(back - front, _DEPTH_OVER_WIDTH * width)
     support = _support_under(others_m, kept[:, :2].mean(axis=0), width / 2 + 0.12, low)
+    deep = max(back - front, _DEPTH_OVER_WIDTH * min(width, top - support))
     centre_xy = (front + deep / 2) * ahead + (left + right) / 2 * across
     centre = np.array([*centre_xy, (top + support) / 2])
     corners = np.concatenate([kept, np.column_stack([kept[:, :2], np.full(len(kept), support)])])
     radius_m = float(np.percentile(np.linalg.norm(corners - centre, axis=1), 100 - _RIM_PERCENT))
-    guessed = " (set by its width)" if deep > back - front else ""
+    guessed = " (guessed by its width and height)" if deep > back - front else ""
     how = (
         f"box of the visible points: {width:.3f} m across, {deep:.3f} m along the sight line{guessed}, "
         f"{top - support:.3f} m over a support at {support:.3f} m"

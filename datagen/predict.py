@@ -1,0 +1,213 @@
+"""`datagen predict`: a base pose from a depth camera's frame, by a trained checkpoint."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from cyclopts import Parameter
+
+from datagen.console.options import AsJson
+from datagen.console.printing import print_json, print_rows
+from datagen.console.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+from workers.geometry.mesh import F64
+
+if TYPE_CHECKING:
+    from train.prediction.frames import SensorFrame
+
+_LARGEST_M = 10.0
+_MOST_FRAMES = 64
+
+
+def predict(
+    checkpoint: Annotated[Path, Parameter(help="What `datagen train` wrote.")],
+    *,
+    base_height: Annotated[float, Parameter(help="Height of the arm's mount above the floor, m.")],
+    reach: Annotated[float, Parameter(help="Reach of the arm, m.")],
+    rgb: Annotated[Path | None, Parameter(help="Colour picture, aligned with the depth.")] = None,
+    depth: Annotated[Path | None, Parameter(help="16-bit depth PNG.")] = None,
+    intrinsics: Annotated[
+        Path | None, Parameter(help="JSON: fx, fy, cx, cy (or ppx, ppy), width, height.")
+    ] = None,
+    mask: Annotated[Path | None, Parameter(help="PNG of the target's pixels, white on black.")] = None,
+    click: Annotated[str | None, Parameter(help="A pixel u,v on the target of the first frame.")] = None,
+    frame: Annotated[
+        list[Path] | None,
+        Parameter(
+            help="A frame's folder, .npz or .ply; may be given several times, with poses.", negative=()
+        ),
+    ] = None,
+    frame_dir: Annotated[Path | None, Parameter(help="A folder of such frames, taken by name.")] = None,
+    camera_height: Annotated[float | None, Parameter(help="Of the camera that took the frame, m.")] = None,
+    camera_pose: Annotated[
+        Path | None, Parameter(help="JSON: T_world_camera (4x4); world z up, floor at z = 0.")
+    ] = None,
+    gravity: Annotated[
+        str | None, Parameter(help="x,y,z: where things fall, in the camera's frame (x right, y down).")
+    ] = None,
+    robot_camera_height: Annotated[
+        float | None, Parameter(help="Of the robot's own camera, m; that of the frame's unless given.")
+    ] = None,
+    depth_scale: Annotated[float, Parameter(help="Metres a step of 16-bit depth.")] = 0.001,
+    grid: Annotated[int, WHOLE_NUMBER, Parameter(help="Places a side of the grid around the target.")] = 25,
+    half_width: Annotated[float, Parameter(help="Half the grid's side, m.")] = 1.0,
+    allow_unseen: Annotated[
+        bool, Parameter(negative=(), help="Choose also among places whose floor was not seen.")
+    ] = False,
+    out: Annotated[Path | None, Parameter(help="The picture to write, FILE.png.")] = None,
+    html: Annotated[Path | None, Parameter(help="The page to write, FILE.html.")] = None,
+    as_json: Annotated[bool, Parameter(name="--json"), AsJson] = False,
+) -> int:
+    """Score a grid of base poses around a target that a depth camera sees, and name the best clear one.
+
+    One frame: --rgb --depth --intrinsics and --mask or --click; or --frame. Where the floor is comes from
+    --camera-pose, or from --gravity and --camera-height, or from the floor in the picture and
+    --camera-height. Exit code 1 when no place was seen to be clear.
+    """
+    # Imported here: training's libraries take seconds, and other verbs need none of them.
+    from train.prediction import RobotSize, load_scorer
+    from train.prediction import predict as scored
+    from train.prediction.answer import document, told
+
+    for name, value in (("--base-height", base_height), ("--reach", reach), ("--camera-height", camera_height),
+                        ("--robot-camera-height", robot_camera_height)):  # fmt: skip
+        _refuse_length(name, value)
+    if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
+        mend = "Give metres a step: 0.001 for millimetres"
+        raise InputError("--depth-scale", str(depth_scale), "not between 0.000001 and 1", mend)
+    pixel = None if click is None else _pixel(click)
+    falls = None if gravity is None else _direction(gravity)
+    frames = _frames(rgb, depth, intrinsics, mask, camera_pose, frame, frame_dir, depth_scale)
+    _refuse_outputs(out, html, [checkpoint, rgb, depth, intrinsics, mask, camera_pose, *(frame or [])])
+    own_height = robot_camera_height if robot_camera_height is not None else camera_height
+    if own_height is None:
+        own_height = float(frames[0].T_world_camera[2, 3]) if frames[0].T_world_camera is not None else None
+    if own_height is None:
+        mend = "Give it in metres above the floor, or --camera-pose pose.json"
+        raise InputError("--camera-height", "", "missing", mend)
+    _refuse_length("--robot-camera-height", own_height)
+    answer = scored(
+        load_scorer(checkpoint),
+        frames,
+        RobotSize(own_height, base_height, reach),
+        camera_height_m=camera_height,
+        gravity=falls,
+        click=pixel,
+        allow_unseen=allow_unseen,
+        grid=grid,
+        half_width_m=half_width,
+    )
+    if out is not None:
+        from train.prediction.pictures import draw_prediction
+
+        _replace(out, lambda file: draw_prediction(answer, file))
+    if html is not None:
+        from train.prediction.page import write_page
+
+        _replace(html, lambda file: write_page(answer, file))
+    if as_json:
+        print_json(document(answer))
+    else:
+        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
+        print_rows(f"base poses by {answer.scorer}", [*told(answer), *written])
+    return 0 if answer.best is not None else 1
+
+
+def _frames(
+    rgb: Path | None,
+    depth: Path | None,
+    intrinsics: Path | None,
+    mask: Path | None,
+    camera_pose: Path | None,
+    places: Sequence[Path] | None,
+    folder: Path | None,
+    depth_scale_m: float,
+) -> list[SensorFrame]:
+    """The frames that the options name, the first with the pose that is given apart."""
+    from train.prediction.files import read_pose
+    from train.prediction.frames import read_frame, read_place
+
+    named = list(places or [])
+    if folder is not None:
+        if not folder.is_dir():
+            raise InputError(folder, "--frame-dir", "no such folder", "Name a folder of frames")
+        named += sorted(p for p in folder.iterdir() if p.is_dir() or p.suffix.lower() in (".npz", ".ply"))
+    parts = {"--rgb": rgb, "--depth": depth, "--intrinsics": intrinsics}
+    missing = [name for name, value in parts.items() if value is None]
+    pictures = rgb is not None or depth is not None or intrinsics is not None or mask is not None
+    if len(named) > _MOST_FRAMES:
+        raise InputError("--frame", "", f"{len(named)} frames", f"Give at most {_MOST_FRAMES}")
+    if pictures and missing:
+        raise InputError(", ".join(missing), "", "missing", "Give --rgb, --depth and --intrinsics together")
+    frames: list[SensorFrame] = []
+    if rgb is not None and depth is not None and intrinsics is not None:
+        frames.append(
+            read_frame(rgb, depth, intrinsics, mask=mask, pose=camera_pose, depth_scale_m=depth_scale_m)
+        )
+    elif camera_pose is not None and len(named) != 1:
+        mend = "Put pose.json into each frame's folder, or T_world_camera into its .npz"
+        raise InputError("--camera-pose", "", f"one pose for {len(named)} frames", mend)
+    frames += [read_place(place, depth_scale_m) for place in named]
+    if not frames:
+        raise InputError(
+            "--rgb, --depth", "", "no frame is named", "Give --rgb, --depth, --intrinsics, or --frame"
+        )
+    if not pictures and camera_pose is not None:
+        frames[0] = replace(frames[0], T_world_camera=read_pose(camera_pose))
+    return frames
+
+
+def _refuse_length(name: str, value: float | None) -> None:
+    if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
+        raise InputError(name, f"{value:g}", f"not between 0 and {_LARGEST_M:g}", "Give it in metres")
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    parts = text.split(",")
+    if len(parts) != 2 or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", part, re.ASCII) for part in parts):
+        raise InputError("--click", text[:40], "not a pixel", "Give column and row as u,v: 320,240")
+    return int(parts[0]), int(parts[1])
+
+
+def _direction(text: str) -> F64:
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    sound = values.shape == (3,) and bool(np.isfinite(values).all())
+    if not sound or not 1e-6 < float(np.abs(values).max()) < 1e6:
+        mend = "Give x,y,z in the camera's frame; of a level camera 0,1,0"
+        raise InputError("--gravity", text[:60], "not a direction", mend)
+    return values
+
+
+def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
+    """What is written must be new, or an older picture or page; never one of the inputs."""
+    read = {path.resolve() for path in inputs if path is not None}
+    for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
+        if file is None:
+            continue
+        if file.suffix.lower() != suffix:
+            raise InputError(file, option, f"not a {suffix} file", f"Give a name that ends in {suffix}")
+        if not file.parent.is_dir():
+            raise InputError(file, option, "its folder does not exist", "Make the folder first")
+        if file.is_dir() or file.resolve() in read:
+            problem = "a folder stands there" if file.is_dir() else "one of the files that are read"
+            raise InputError(file, option, problem, "Give another name")
+
+
+def _replace(file: Path, write: Callable[[Path], None]) -> None:
+    """Write a file whole or not at all."""
+    new = file.with_name(f".{file.name}.new{file.suffix}")
+    try:
+        write(new)
+        os.replace(new, file)
+    finally:
+        new.unlink(missing_ok=True)
