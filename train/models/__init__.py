@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from schemas.errors import InputError, choices
-from train.models.model import Model
+from train.models.model import Model, fast
 from train.models.paper import PaperModel
 from train.models.shared import SharedModel
 
@@ -27,4 +27,4 @@ def build_model(name: str, config: Mapping[str, Any]) -> Model:
     return MODELS[name](config)
 
 
-__all__ = ["MODELS", "Model", "build_model"]
+__all__ = ["MODELS", "Model", "build_model", "fast"]

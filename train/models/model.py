@@ -30,6 +30,8 @@ class Model(nn.Module, ABC):
     """
 
     name: ClassVar[str]
+    # Methods of tensors alone in which the time goes: what `fast` compiles.
+    hot: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -49,6 +51,26 @@ class Model(nn.Module, ABC):
     def device(self) -> torch.device:
         """Where the parameters are."""
         return next(self.parameters()).device
+
+
+def fast(model: Model) -> Model:
+    """The same model, on CUDA with its hot methods compiled and matrix products in bfloat16.
+
+    On a CPU it is returned as it is: there the compiler's minutes buy little. Parameters, and so
+    checkpoints, stay as they are.
+    """
+    if model.device.type != "cuda":
+        return model
+    for method in model.hot:
+        setattr(model, method, torch.compile(getattr(model, method), dynamic=True))
+    plain = model.forward
+
+    def mixed(clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]) -> Tensor:
+        with torch.autocast("cuda", dtype=torch.bfloat16):
+            return plain(clouds, candidates, robots).float()
+
+    model.forward = mixed
+    return model
 
 
 def read_config(kind: type[ConfigT], name: str, config: Mapping[str, Any]) -> ConfigT:

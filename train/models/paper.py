@@ -84,6 +84,7 @@ class PaperModel(Model):
     """
 
     name = "paper"
+    hot = ("_abstract",)
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self.sizes = read_config(PaperConfig, self.name, config)

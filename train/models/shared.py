@@ -20,12 +20,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from train.inputs import Candidates, Clouds, Robots
-from train.models.crop import crop_clouds
+from train.models.crop import Crop, crop_clouds
 from train.models.frames import N_PAIR_FEATURES, N_SCALARS, Frames, frames_of, pair_features, target_features
 from train.models.layers import empty_logits, mlp
 from train.models.model import Model, ModelConfig, read_config
@@ -36,15 +37,20 @@ from train.models.tokens import (
     TARGET_TENSORS,
     TARGET_VECTORS,
     Tokens,
+    target_frame_points,
     token_sizes,
     tokens_of,
 )
+from train.observed_visibility import visible_share
 
 # Candidates that are worked on together: their tokens stay in a core's cache. A GPU wants more at once.
 _TILE_CPU, _TILE_CUDA = 64, 4096
 # Height of an unknown camera above the mount: the difference of the middles of both ranges in the paper.
 _CAMERA_ABOVE_MOUNT_M = 0.4
 _MIN_REACH_M = 0.05
+_N_VISIBILITY = 3
+# An estimate of what is hidden needs surfaces without gaps: all points of a usual cloud.
+_VISIBILITY_POINTS = 4096
 
 Width = Annotated[int, Field(ge=1, le=1024)]
 Count = Annotated[int, Field(ge=1, le=1024)]
@@ -55,6 +61,8 @@ class SharedConfig(ModelConfig):
     """Sizes and inputs of the shared model.
 
     `camera`: "given", or "unknown" for what `paper` sees, which knows the robot's mount and not its camera.
+    `observed_visibility`: also give rho as `train.observed_visibility` estimates it from the robot's
+    crop, on the CPU.
     """
 
     n_points: int = Field(default=2048, ge=1, le=65_536)
@@ -66,12 +74,14 @@ class SharedConfig(ModelConfig):
     head: tuple[Width, ...] = Field(default=(128, 64), max_length=8)
     dropout: float = Field(default=0.0, ge=0, lt=1)
     camera: Literal["given", "unknown"] = "given"
+    observed_visibility: bool = False
 
 
 class SharedModel(Model):
     """Tokens of a robot's cloud, read from each candidate's frame."""
 
     name = "shared"
+    hot = ("_pool",)
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self.sizes = read_config(SharedConfig, self.name, config)
@@ -79,6 +89,7 @@ class SharedModel(Model):
         width, embedding = self.sizes.width, self.sizes.embedding
         token = token_sizes(len(self.sizes.scales_m))
         n_scalars = N_SCALARS + TARGET_NUMBERS + 2 * (TARGET_VECTORS + TARGET_TENSORS)
+        n_scalars += _N_VISIBILITY * self.sizes.observed_visibility
         self.token = nn.Sequential(
             nn.Linear(token.numbers, width),
             nn.LayerNorm(width),
@@ -123,7 +134,11 @@ class SharedModel(Model):
         with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
             frames = self._frames(tokens, clouds, candidates, robots)
             target = target_features(frames, tokens, candidates.robot_row)
-            scalars = torch.cat([frames.scalars(), target], dim=1)
+            parts = [frames.scalars(), target]
+            if self.sizes.observed_visibility:
+                crop = crop_clouds(clouds, robots, _VISIBILITY_POINTS)
+                parts.append(_visibility(frames, crop, candidates))
+            scalars = torch.cat(parts, dim=1)
         steered = self._steered(tokens)
         condition = self.condition(scalars)
         tile = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
@@ -183,6 +198,24 @@ class SharedModel(Model):
             n = there.sum(1).clamp(min=1)[:, None, None]
             parts += [of_kind.amax(2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
+
+
+def _visibility(frames: Frames, crop: Crop, candidates: Candidates[Tensor]) -> Tensor:
+    """(N, 3): estimated rho, and it stretched near 0 and near 1, where the paper's score is steep."""
+    eyes_m = torch.cat([candidates.base_xy_m, frames.camera_rise_m[:, None]], dim=1).cpu().numpy()
+    radius_m = frames.target_radius_m.cpu().numpy()
+    robot_row = candidates.robot_row.cpu().numpy()
+    points_m = target_frame_points(crop).cpu().numpy()
+    mask, valid = crop.target_mask.cpu().numpy(), crop.valid.cpu().numpy()
+    rho = np.zeros(len(robot_row), np.float32)
+    for robot in np.unique(robot_row):
+        mine = np.flatnonzero(robot_row == robot)
+        others = points_m[robot][valid[robot] & ~mask[robot]]
+        rho[mine] = visible_share(
+            others, points_m[robot][mask[robot]], float(radius_m[mine[0]]), eyes_m[mine]
+        )
+    share = torch.from_numpy(rho).to(candidates.base_xy_m.device)
+    return torch.stack([share, (share / 0.04).clamp(max=1), (share - 0.8).clamp(min=0) / 0.2], dim=1)
 
 
 def _turning(layer: nn.Linear, pairs: Tensor) -> tuple[Tensor, Tensor]:

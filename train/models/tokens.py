@@ -69,8 +69,7 @@ def tokens_of(crop: Crop, counts: tuple[int, int, int], near_m: float, scales_m:
     At each scale a token has the moments of the points around it, weighed by 1 - (d / scale)^2: how many
     they are, their mean colour and share of target, their mean place and its covariance.
     """
-    points = crop.points_m - torch.nn.functional.pad(crop.target_rise_m[:, None, None], (2, 0))
-    points = torch.where(crop.valid[..., None], points, 0.0)
+    points = target_frame_points(crop)
     distance = torch.linalg.vector_norm(points, dim=2)
     others = crop.valid & ~crop.target_mask
     kinds = (crop.target_mask, others & (distance <= near_m), others & (distance > near_m))
@@ -134,6 +133,12 @@ def tokens_of(crop: Crop, counts: tuple[int, int, int], near_m: float, scales_m:
         target_radius_m=radius,
         target_rise_m=crop.target_rise_m,
     )
+
+
+def target_frame_points(crop: Crop) -> Tensor:
+    """The crop's points (R, K, 3) with the target's centre as origin; rows that are not valid are zero."""
+    points = crop.points_m - torch.nn.functional.pad(crop.target_rise_m[:, None, None], (2, 0))
+    return torch.where(crop.valid[..., None], points, 0.0)
 
 
 def turned(v: Tensor, axis: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from schemas.errors import InputError
 from tests.train.models.made_batches import drawn_tables, small_model
 from train.inputs import Candidates
-from train.models import MODELS, build_model
+from train.models import MODELS, build_model, fast
 
 NAMES = sorted(MODELS)
 
@@ -106,3 +106,13 @@ def test_a_configuration_that_is_not_one_is_named(name: str, config: dict[str, A
     with pytest.raises(InputError) as error:
         build_model(name, config)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_on_a_cpu_fast_changes_nothing(name: str):
+    model = small_model(name)
+    logits = model.score(*drawn_tables(0))
+    same = fast(model)
+    assert same is model
+    assert torch.equal(same.score(*drawn_tables(0)), logits)

@@ -85,3 +85,28 @@ def test_distances_from_the_mount_and_from_the_arms_line():
     want = torch.tensor([0.0, half, math.hypot(half, 0.05), math.hypot(0.7, 0.2)]) / 0.8
     torch.testing.assert_close(features[:, 5], want, atol=1e-5, rtol=0)
     torch.testing.assert_close(features[:, 6], 3 * torch.tensor([0.0, 0.0, 0.05, 0.1]), atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_the_estimate_of_what_is_hidden_is_one_more_input():
+    model = small_model("shared", observed_visibility=True)
+    clouds, candidates, robots = drawn_tables(1, scenes=1, robots=1)
+    before = model.score(clouds, candidates, robots)
+    # A wall around the target.
+    angle = torch.linspace(0, 2 * math.pi, 30)
+    ring = torch.stack([0.12 * angle.cos(), 0.12 * angle.sin()], dim=1)
+    levels = torch.linspace(-0.1, 0.3, 14)
+    wall = torch.cat([torch.nn.functional.pad(ring, (0, 1), value=float(z)) for z in levels])
+    points = torch.cat([clouds.points_m, wall[None]], dim=1)
+    grown = replace(
+        clouds,
+        points_m=points,
+        rgb=torch.zeros_like(points).byte(),
+        target_mask=torch.nn.functional.pad(clouds.target_mask, (0, len(wall))),
+        n_points=torch.tensor([points.shape[1]]),
+    )
+    hidden = model.score(grown, candidates, robots)
+    assert torch.isfinite(before).all()
+    # Tokens are made of the first 96 points alone, black by now: the estimate is what reads the wall.
+    black = replace(clouds, rgb=torch.zeros_like(clouds.rgb))
+    assert float((hidden - model.score(black, candidates, robots)).abs().amax()) > 1e-4
