@@ -49,6 +49,8 @@ def page_of(report: Report, gathered: Gathered) -> str:
             body.append(f"<h2>{part['scenes']:,} scenes in houses {trained}</h2>")
         for name, told in part["sets"].items():
             body += _set(report, told, f"{number}-{name}")
+        for name, why in part["left_out"].items():
+            body.append(f"<h2>Table I: {escape(name)} is left out</h2><p>{escape(why)}</p>")
         body += _grids(report, part)
     if gathered.examples:
         figure = draw_examples(gathered.examples, gathered.columns, report["methods"])

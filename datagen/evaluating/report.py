@@ -10,6 +10,7 @@ import numpy as np
 from datagen import __version__
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import Place
+from schemas.errors import InputError
 from train.evaluation import paper
 from train.evaluation.bootstrap import LEVEL
 from train.evaluation.columns import Columns, Gathered
@@ -34,13 +35,13 @@ def evaluation_report(
     methods = [c.method for c in contestants]
     objects = frozenset[str]().union(*(c.objects for c in contestants))
     is_seen = np.isin(columns.house.astype(str), np.array(sorted(seen_houses), str))
+    sides = [(name, rows) for name, rows in ((UNSEEN, ~is_seen), (SEEN, is_seen)) if rows.any()]
     parts = [
         {
             "houses": name,
-            **_part(columns.of_scenes(scenes), methods, sets, objects, resamples, seed),
+            **_part(columns.of_scenes(rows), methods, sets, objects, resamples, seed, len(sides) > 1),
         }
-        for name, scenes in ((UNSEEN, ~is_seen), (SEEN, is_seen))
-        if scenes.any()
+        for name, rows in sides
     ]
     n = len(columns)
     return {
@@ -70,8 +71,19 @@ def _part(
     objects: frozenset[str],
     resamples: int,
     seed: int,
+    is_one_of_two: bool,
 ) -> dict[str, Any]:
+    """The tables of some scenes. One side of two may be too small for a set, which is then left out."""
     weights = weights_for(columns, resamples, seed)
+    told: dict[str, Any] = {}
+    left_out: dict[str, str] = {}
+    for name in sets:
+        try:
+            told[name] = evaluate_set(columns, methods, name, weights, objects)
+        except InputError as error:
+            if not is_one_of_two:
+                raise
+            left_out[name] = error.problem
     grids, why = None, None
     if not columns.is_grid.any():
         why = "no scene has every cell of its grid for one robot: submit sim with --candidates-per-scene grid"
@@ -84,7 +96,8 @@ def _part(
         "scenes": columns.n_scenes,
         "house_count": len(set(columns.house.tolist())),
         "candidates": len(columns),
-        "sets": {name: evaluate_set(columns, methods, name, weights, objects) for name in sets},
+        "sets": told,
+        "left_out": left_out,
         "grids": grids,
         "no_grids": why,
     }

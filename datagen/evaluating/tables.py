@@ -32,13 +32,16 @@ def print_evaluation(report: Report) -> None:
             print_rows(f"{part['scenes']:,} scenes in houses {trained}", [])
         for told in part["sets"].values():
             _print_accuracy(report, told)
+        for name, why in part["left_out"].items():
+            print_rows(f"Table I: {name} is left out", [("", why)])
         for told in part["sets"].values():
             _print_reach(report, told)
         _print_grids(report, part)
         for told in part["sets"].values():
             _print_calibration(report, told)
         # The narrowest set is the one on which methods differ.
-        _print_breakdown(report, next(iter(part["sets"].values())))
+        for told in list(part["sets"].values())[:1]:
+            _print_breakdown(report, told)
     notes = [
         ("intervals", f"95% by {report['bootstrap']['resamples']:,} resamples of scenes"),
         ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),

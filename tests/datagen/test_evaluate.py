@@ -1,0 +1,189 @@
+"""`datagen evaluate` over real trials, with checkpoints of tiny models that learned nothing."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from datagen import cli
+from datagen.evaluating.contestants import open_models
+from tests.made_runs import make_run
+from tests.sim_extra import needs_sim
+from tests.small_runs import CONFIG, arrays_of, json_of
+from train.models import build_model
+from train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
+
+pytestmark = needs_sim
+
+SIDE, SCENES = 5, 6
+CELLS = SIDE * SIDE
+GRID = f"[candidates]\ngrid_cells = {SIDE}\narm_reach_m = {{low = 0.9, high = 1.0}}\n"
+FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+TINY = {
+    "n_points": 64, "tokens": [4, 4, 4], "scales_m": [0.1], "width": 4, "embedding": 8, "head": [8],
+}  # fmt: skip
+QUICK = ("--bootstrap", "50", "--baselines", "none")
+
+
+@pytest.fixture(scope="module")
+def grids(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Whole grids, planned and executed; sealed, to be read by other means too."""
+    folder = tmp_path_factory.mktemp("grids")
+    (folder / "grid.toml").write_text(CONFIG + GRID + FEW_GRASPS)
+    where = ["--out", str(folder / "run"), "--config", str(folder / "grid.toml"), "--workers", "0"]
+    n = str(SCENES * CELLS)
+    assert cli.run(["submit", "sim", "--n", n, "--candidates-per-scene", "grid", *where]) == 0
+    return folder / "run"
+
+
+def checkpoint(path: Path, stage: str = "stage2", seed: int = 0, **said: Any) -> str:
+    torch.manual_seed(seed)
+    model = build_model("shared", TINY)
+    plain: dict[str, Any] = {
+        "options": {}, "data": (), "val_data": (), "house_ids": ("elsewhere",), "object_digests": (),
+        "val_house_ids": (), "cost": {}, "versions": {}, "history": (),
+    }  # fmt: skip
+    head = CheckpointHead(model="shared", model_config=model.config, stage=stage, **{**plain, **said})
+    write_checkpoint(path, Checkpoint(head, dict(model.state_dict())))
+    return str(path)
+
+
+class Page(HTMLParser):
+    """The tags of a page, and the addresses that it asks for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "xlink:href", "srcset") and v]
+
+
+def test_tables_are_of_what_the_run_holds(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"stage1": "a.pt", "sim-only": "b.pt", "stage2": "c.pt"}
+    files = [checkpoint(tmp_path / f, stage, seed) for seed, (stage, f) in enumerate(names.items())]
+    page = tmp_path / "page.html"
+    report = json_of(capsys, ["evaluate", *files, str(grids), *QUICK, "--html", str(page)])
+    stored = arrays_of(grids)
+    label, clear = stored["label"] == 1, stored["base_is_clear"]
+    (part,) = report["parts"]
+    assert part["houses"] == "unseen" and report["seen_houses"] == []
+    assert {m["name"]: m["regime"] for m in report["methods"]} == {
+        "stage1": "stage1", "sim-only": "sim-only", "two-stage": "two-stage",
+    }  # fmt: skip
+    assert all(len(m["checkpoint"]["sha256"]) == 64 for m in report["methods"])
+    counts = {name: (told["count"], told["positives"]) for name, told in part["sets"].items()}
+    in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    expected = {"in-range": in_range, "clear": clear, "grid": np.ones(len(label), np.bool_)}
+    assert counts == {k: (int(rows.sum()), int(label[rows].sum())) for k, rows in expected.items()}
+    with_good = {int(s) for s in stored["sample_scene_index"][label]}
+    assert part["grids"]["scenes"] == SCENES
+    assert part["grids"]["scenes_without_positive"] == SCENES - len(with_good)
+    assert report["runs"][0]["parts"][0]["label_source"] == "sim"
+    assert page.stat().st_size < 3_000_000
+    _check_page(page.read_text(), n_sets=3)
+
+
+def _check_page(text: str, n_sets: int) -> None:
+    page = Page(text)
+    # Each set has intervals and curves, and there is one picture of grids; nothing lies elsewhere.
+    pictures = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
+    assert len(pictures) == 2 * n_sets + 1
+    for picture in pictures:
+        ET.fromstring(picture)
+    assert not {"script", "link", "iframe", "img"} & set(page.tags)
+    assert page.addresses and all(a.startswith(("#", "data:")) for a in page.addresses)
+    for words in ("84.1", "94.7", "arXiv:2509.11594", "Table II:", "Table III:", "two-stage", "sha256"):
+        assert words in text, words
+
+
+def test_the_same_words_give_the_same_numbers_and_people_read_them(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = checkpoint(tmp_path / "c.pt")
+    words = ["evaluate", str(grids), file, *QUICK, "--candidates", "clear", "--seed", "3"]
+    first, second = json_of(capsys, words), json_of(capsys, words)
+    for report in (first, second):
+        for method in report["methods"]:
+            assert method.pop("seconds") > 0 and method.pop("seconds_per_600") > 0
+    assert first == second
+    assert list(first["parts"][0]["sets"]) == ["clear"]
+    assert cli.run(words) == 0
+    said = capsys.readouterr().out
+    accuracy = first["parts"][0]["sets"]["clear"]["methods"]["two-stage"]["accuracy"]
+    assert f"{100 * accuracy['value']:.1f} [{100 * accuracy['low']:.1f}, " in said
+    for line in ("Table I:", "Table II:", "Table III:", "accuracy by outcome", "Brier", "arXiv:2509.11594"):
+        assert line in said, line
+
+
+def test_houses_that_were_trained_on_are_refused_or_told_apart(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    houses, digests = arrays_of(grids)["house_id"], arrays_of(grids)["object_digest"]
+    house, count = str(houses[0]), int((houses == houses[0]).sum())
+    assert 0 < count < SCENES
+    clean = checkpoint(tmp_path / "clean.pt", "stage1", 1)
+    for k, field in enumerate(("house_ids", "val_house_ids")):
+        leaky = checkpoint(tmp_path / f"{k}.pt", **{field: (house,)})
+        assert cli.run(["evaluate", clean, leaky, str(grids), *QUICK]) == 2
+        error = capsys.readouterr().err
+        assert f"house_id: '{house}': two-stage ({leaky})" in error and "--allow-seen-houses" in error
+    leaky = checkpoint(tmp_path / "leaky.pt", house_ids=(house,), object_digests=(str(digests[0, 0]),))
+    words = ["evaluate", leaky, str(grids), *QUICK, "--candidates", "grid", "--allow-seen-houses"]
+    report = json_of(capsys, words)
+    assert [(part["houses"], part["scenes"]) for part in report["parts"]] == [
+        ("unseen", SCENES - count), ("seen", count),
+    ]  # fmt: skip
+    assert report["seen_houses"] == [house]
+    label = arrays_of(grids)["label"].reshape(SCENES, CELLS)
+    for part, scenes in zip(report["parts"], (houses != house, houses == house), strict=True):
+        if label[scenes].any():
+            rows = part["sets"]["grid"]["breakdown"]
+            known = sum(r["count"] for r in rows if (r["by"], r["group"]) == ("object trained on", "yes"))
+            assert known == CELLS * int((digests[scenes, 0] == digests[0, 0]).sum())
+        else:
+            assert part["left_out"] == {"grid": part["left_out"]["grid"]} and part["grids"] is None
+
+
+def test_models_of_one_regime_are_told_apart_by_number(tmp_path: Path) -> None:
+    files = [checkpoint(tmp_path / f"{k}.pt", stage, k) for k, stage in enumerate(("stage2", "stage2", "x"))]
+    assert [c.scorer.name for c in open_models(files)] == ["two-stage shared 1", "two-stage shared 2", "x"]
+
+
+def test_what_cannot_be_evaluated_is_refused_in_one_line(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, run = checkpoint(tmp_path / "c.pt"), str(grids)
+    (tmp_path / "thesis.tex").write_text("text")
+    heuristic = make_run(tmp_path / "heuristic").storage.url
+    cases: list[tuple[list[str], list[str]]] = [
+        ([file], ["RUN", "only checkpoints are named"]),
+        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint's file nor a run's folder"]),
+        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "no checkpoint"]),
+        ([file, heuristic], ["label_source", "heuristic labels", "datagen submit sim"]),
+        ([run, "--baselines", "none"], ["CKPT", "there is nobody to evaluate"]),
+        ([file, file, run], ["the same checkpoint as"]),
+        ([file, run, run], ["sample_id", "comes twice"]),
+        ([file, run, "--bootstrap", "0"], ["--bootstrap"]),
+        ([file, run, "--seed", "-1"], ["--seed"]),
+        ([file, run, "--threads", "0"], ["--threads"]),
+        ([file, run, "--html", "page.pdf"], ["--html", "not an .html file"]),
+        ([file, run, "--html", str(tmp_path / "no" / "page.html")], ["--html", "folder does not exist"]),
+    ]
+    for words, expected in cases:
+        more = [] if "--baselines" in words else ["--baselines", "none"]
+        assert cli.run(["evaluate", *words, *more]) == 2, words
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert said.startswith("error: ") and all(part in said for part in expected), (words, said)
