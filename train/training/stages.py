@@ -79,7 +79,7 @@ def prepare(job: Job, ranks: Ranks) -> tuple[Training, CheckpointHead]:
     train, val = _streams(job, ranks)
     for stream in (train, val):
         _refuse_other_labels(stage.name, stage.label_sources, stream)
-        refuse_one_class(stream)
+    refuse_one_class(train)
     if began is not None:
         _refuse_known_houses(job, began.head, val)
     class_weights = _class_weights(train, stage.weighted)

@@ -1,0 +1,196 @@
+"""`datagen train` as a user calls it: stages, refusals, and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from datagen import cli
+from datagen.training.options import model_sizes, read_augmentation, share_cores
+from schemas.errors import InputError
+from tests.refusals import refused
+from tests.sim_extra import needs_sim
+from tests.train.conftest import heuristic_run, shared_folder, sim_run
+from tests.train.training.small import TINY, equal
+from train.training.checkpoints import load_model, read_checkpoint
+
+__all__ = ["heuristic_run", "shared_folder", "sim_run"]
+HERE = ("--threads", "1", "--device", "cpu", "--batch-scenes", "4")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A file of the tiny model's sizes."""
+    path = tmp_path_factory.mktemp("model") / "tiny.toml"
+    path.write_text("".join(f"{name} = {value}\n" for name, value in TINY.items()))
+    return str(path)
+
+
+def words(stage: str, run: Path, out: Path, *more: str) -> list[str]:
+    return ["train", stage, str(run), "--out", str(out), *HERE, *more]
+
+
+@pytest.fixture(scope="module")
+def first(heuristic_run: Path, tiny: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished stage 1 of one epoch."""
+    out = tmp_path_factory.mktemp("first") / "one.ckpt"
+    assert cli.run(words("stage1", heuristic_run, out, "--epochs", "1", "--model-config", tiny)) == 0
+    return out
+
+
+@needs_sim
+def test_both_stages_from_the_command_line(
+    first: Path, sim_run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    curves = tmp_path / "curves"
+    out = tmp_path / "two.ckpt"
+    arguments = words("stage2", sim_run, out, "--init", str(first), "--epochs", "2")
+    capfd.readouterr()
+    assert cli.run([*arguments, "--tensorboard", str(curves), "--augment", "rotation,dropout", "--json"]) == 0
+    told = capfd.readouterr()
+    report = json.loads(told.out)
+    lines = [json.loads(line) for line in told.err.splitlines()]
+    model, head = load_model(out)
+    began = read_checkpoint(first).head
+    assert report["end"] == "finished"
+    assert report["digest"] == head.digest
+    assert [line["epoch"] for line in lines if line["event"] == "epoch"] == [1, 2]
+    assert report["history"] == list(head.history)
+    assert report["best"] == head.history[(head.best_epoch or 0) - 1]
+    assert head.stage == "stage2"
+    assert head.init == {"digest": began.digest, "stage": "stage1", "cost": began.cost}
+    assert set(began.house_ids) <= set(head.house_ids)
+    assert model.config == began.model_config
+    assert not set(head.house_ids) & set(head.val_house_ids)
+    assert head.options["augment"].keys() == {"rotation", "dropout"}
+    assert head.options["weight_decay"] == 0.01
+    assert [run["schema"] for run in head.data] == ["sim"]
+    assert list(curves.glob("events.*"))
+    again = [*arguments, "--augment", "rotation,dropout", "--json"]
+    assert cli.run(again) == 0
+    assert json.loads(capfd.readouterr().out)["digest"] == head.digest
+
+
+@needs_sim
+def test_runs_that_do_not_fit_the_stage_are_refused(
+    first: Path, heuristic_run: Path, sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "c.ckpt"
+    learns = "learns from those of"
+    refused(
+        words("stage1", sim_run, out), capsys, str(sim_run), "sim labels", learns, "Train stage2 or sim-only"
+    )
+    refused(words("sim-only", heuristic_run, out), capsys, "heuristic labels", learns, "Train stage1")
+    validation = ("--val", str(heuristic_run))
+    refused(words("sim-only", sim_run, out, *validation), capsys, "heuristic labels", str(heuristic_run))
+    assert not out.exists()
+
+
+def test_what_cannot_be_trained_is_refused(
+    first: Path, heuristic_run: Path, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out, run = tmp_path / "c.ckpt", heuristic_run
+    cases: list[tuple[list[str], tuple[str, ...]]] = [
+        (words("stage2", run, out), ("--init", "no checkpoint is named")),
+        (words("stage1", run, out, "--init", str(first)), ("--init", "fresh weights")),
+        (words("stage2", run, out, "--init", tiny), (tiny, "checkpoint")),
+        (words("stage1", tmp_path / "none", out), ("none",)),
+        (words("stage1", run, out, "--val", str(run)), ("house",)),
+        (words("stage1", run, out, "--epochs", "0"), ("--epochs",)),
+        (words("stage1", run, out, "--lr", "nan"), ("--lr",)),
+        (words("stage1", run, out, "--weight-decay", "-1"), ("--weight-decay",)),
+        (words("stage1", run, out, "--model-config", "width=x"), ("width",)),
+        (words("stage1", run, out, "--model-config", "beauty=1"), ("beauty",)),
+        (words("stage1", run, out, "--model-config", "none.toml"), ("none.toml",)),
+        (words("stage1", run, out, "--augment", "beauty"), ("beauty", "rotation")),
+        (words("stage1", run, out, "--processes", "0"), ("--processes",)),
+        (words("stage1", run, tmp_path), (str(tmp_path), "not a file")),
+    ]
+    if not torch.cuda.is_available():
+        cases.append((words("stage1", run, out, "--device", "cuda"), ("--device", "no GPU")))
+    for arguments, told in cases:
+        refused(arguments, capsys, *told)
+    assert not out.exists()
+
+
+def test_another_training_is_not_overwritten(
+    first: Path, heuristic_run: Path, tiny: str, capsys: pytest.CaptureFixture[str]
+):
+    before = first.read_bytes()
+    more = ("--model-config", tiny, "--epochs", "2", "--seed", "5")
+    told = refused(words("stage1", heuristic_run, first, *more), capsys, str(first), "epochs (1, now 2)")
+    assert "seed (0, now 5)" in told
+    assert "patience" not in told
+    refused(words("stage1", heuristic_run, Path(more[1]), *more), capsys, "not a checkpoint")
+    assert first.read_bytes() == before
+
+
+def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
+    """A real interrupt of a real process; what goes on from there ends as what nobody interrupted."""
+    more = ("--model-config", tiny, "--epochs", "3")
+    arguments = words("stage1", heuristic_run, tmp_path / "c.ckpt", *more)
+    program = "import sys; from datagen.cli import main; main()"
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "c.ckpt").exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    told = process.communicate()[1]
+    if process.returncode == 130:  # unless it had come to its end just then
+        assert f"Go on with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
+        assert not read_checkpoint(tmp_path / "c.ckpt").head.finished
+    else:
+        assert process.returncode == 0
+    assert cli.run(arguments) == 0
+    assert cli.run(words("stage1", heuristic_run, tmp_path / "whole.ckpt", *more)) == 0
+    one, other = (read_checkpoint(tmp_path / name) for name in ("c.ckpt", "whole.ckpt"))
+    assert equal(one.resume, other.resume)
+    assert one.head.history == other.head.history
+
+
+def test_sizes_of_a_model(tiny: str):
+    asked = model_sizes([tiny, "width=16", "scales_m=[0.1, 0.2]", "camera=unknown"])
+    assert asked == {**TINY, "width": 16, "scales_m": [0.1, 0.2], "camera": "unknown"}
+
+
+def test_effects_with_their_numbers(tmp_path: Path):
+    file = tmp_path / "effects.toml"
+    file.write_text("[dropout]\nlargest_share = 0.5\n[rotation]\n")
+    augmentation, plain = read_augmentation(str(file))
+    assert augmentation is not None
+    assert augmentation.dropout is not None
+    assert augmentation.dropout.largest_share == plain["dropout"]["largest_share"] == 0.5
+    assert plain.keys() == {"dropout", "rotation"}
+    assert read_augmentation(None) == (None, {})
+    bad: dict[str, str] = {"[dropout]\nshare = 1": "dropout", "dropout = 1": "dropout", "[rain]": "rain"}
+    bad["[dropout]\nlargest_share = 'x'"] = "dropout.largest_share"
+    for text, field in bad.items():
+        file.write_text(text)
+        with pytest.raises(InputError) as error:
+            read_augmentation(str(file))
+        assert error.value.field == field
+
+
+def test_threads_are_bound_only_where_one_process_has_every_core(monkeypatch: pytest.MonkeyPatch):
+    names = ("OMP_PROC_BIND", "OMP_PLACES", "OMP_NUM_THREADS")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    cases: list[tuple[Any, Any, int, set[str]]] = [
+        (None, None, 4, {"OMP_PROC_BIND", "OMP_PLACES"}),
+        (None, 2, 2, set()),
+        (2, None, 2, {"OMP_NUM_THREADS"}),
+        (4, 1, 1, {"OMP_NUM_THREADS"}),
+        (8, None, 1, {"OMP_NUM_THREADS"}),
+    ]
+    for processes, threads, each, expected in cases:
+        environment: dict[str, str] = {}
+        monkeypatch.setattr(os, "environ", environment)
+        assert share_cores(processes, threads) == each
+        assert {name for name in names if name in environment} == expected

@@ -1,0 +1,82 @@
+"""What the processes of a test do; new processes import it by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from schemas.errors import InputError
+from train.inputs import Array, Batch, Candidates, Clouds, Robots
+from train.training.loop import run
+from train.training.ranks import Ranks
+from train.training.stages import Job, keep, prepare
+from train.training.watching import Watchers
+
+
+def train_and_tell(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
+    """Train, and leave this rank's weights, its samples and what its last step was beside the checkpoint."""
+    torch.set_num_threads(1)
+    training, head = prepare(job, ranks)
+    finished = run(training, lambda: keep(job.out, training, head), Watchers([]), stopping)
+    samples = [batch.sample_id for batch in training.train.epoch(0)]
+    told = {"weights": training.model.state_dict(), "ids": torch.from_numpy(np.concatenate(samples))}
+    torch.save(told, f"{job.out}.{ranks.rank}")
+    return finished
+
+
+def fail_on_the_second(_job: Any, ranks: Ranks, _stopping: Callable[[], bool]) -> bool:
+    """The second rank refuses its input while the first waits for it."""
+    if ranks.rank == 1:
+        raise InputError("place", "field", "problem", "Mend")
+    ranks.gather("never answered")
+    return True
+
+
+class Union:
+    """The batches of several ranks as one, step by step."""
+
+    def __init__(self, streams: list[Any]) -> None:
+        self._streams = streams
+        self.batches_per_epoch: int = streams[0].batches_per_epoch
+
+    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
+        epochs = [stream.epoch(k, skip_batches) for stream in self._streams]
+        for parts in zip(*epochs, strict=True):
+            yield joined(list(parts))
+
+
+def joined(parts: list[Batch[Array]]) -> Batch[Array]:
+    clouds = np.cumsum([0, *(len(p.clouds) for p in parts)])
+    robots = np.cumsum([0, *(len(p.robots) for p in parts)])
+    rows = {
+        "cloud_row": np.concatenate(
+            [p.robots.cloud_row + n for p, n in zip(parts, clouds[:-1], strict=True)]
+        ),
+        "robot_row": np.concatenate(
+            [p.candidates.robot_row + n for p, n in zip(parts, robots[:-1], strict=True)]
+        ),
+    }
+
+    def table(kind: Any, name: str) -> Any:
+        tables = [getattr(p, name) for p in parts]
+        columns = {
+            f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in dataclasses.fields(kind)
+        }
+        return kind(**{**columns, **{k: v for k, v in rows.items() if k in columns}})
+
+    return Batch(
+        clouds=table(Clouds, "clouds"),
+        robots=table(Robots, "robots"),
+        candidates=table(Candidates, "candidates"),
+        label=np.concatenate([p.label for p in parts]),
+        sample_id=np.concatenate([p.sample_id for p in parts]),
+    )
+
+
+def told_by(out: Path | str, rank: int) -> dict[str, Any]:
+    return torch.load(f"{out}.{rank}", weights_only=True)

@@ -1,0 +1,77 @@
+"""Small trainings on the runs of tests: tiny models, a step of some scenes, one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from train.training.loop import run
+from train.training.options import Options
+from train.training.ranks import Ranks
+from train.training.stages import Job, keep, prepare
+from train.training.watching import Step, Watchers
+
+TINY: dict[str, Any] = {
+    "n_points": 64,
+    "tokens": [4, 4, 4],
+    "scales_m": [0.1],
+    "width": 4,
+    "embedding": 8,
+    "head": [8],
+    "dropout": 0.25,
+}
+TINY_PAPER: dict[str, Any] = {
+    "n_points": 64,
+    "centroids": [8, 4],
+    "neighbours": [4, 4],
+    "widths": [[8], [8], [8]],
+    "head": [8],
+}
+
+
+def options_of(**changes: Any) -> Options:
+    fields = {"stage": "stage1", "model": "shared", "model_config": TINY, "epochs": 2, "batch_scenes": 4}
+    return Options(**{**fields, **changes})
+
+
+def job_of(runs: Path, out: Path, val: Path | None = None, **changes: Any) -> Job:
+    return Job(options_of(**changes), (str(runs),), (str(val),) if val else (), str(out))
+
+
+class Recorder:
+    """Remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+        self.epochs: list[dict[str, Any]] = []
+
+    def step(self, step: Step) -> None:
+        self.steps.append(step)
+
+    def epoch(self, record: dict[str, Any]) -> None:
+        self.epochs.append(record)
+
+    def close(self) -> None:
+        pass
+
+
+def train_until(job: Job, step: int | None = None) -> tuple[bool, Recorder]:
+    """Go on with a job, as the verb does, until it ends or Ctrl-C comes during the given step."""
+    training, head = prepare(job, Ranks())
+    seen = Recorder()
+
+    def stopping() -> bool:
+        return step is not None and training.position.step + 1 >= step
+
+    done = run(training, lambda: keep(job.out, training, head), Watchers([seen]), stopping)
+    return done, seen
+
+
+def equal(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> bool:
+    """Same names and, bit for bit, the same numbers."""
+    return a.keys() == b.keys() and all(
+        a[k].dtype == b[k].dtype and a[k].numpy().tobytes() == b[k].numpy().tobytes() for k in a
+    )

@@ -1,0 +1,76 @@
+"""Several processes train like one: gloo on this machine, with two of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.errors import InputError
+from tests.train.training.rank_work import Union, fail_on_the_second, told_by, train_and_tell
+from tests.train.training.small import TINY, Recorder, equal, job_of
+from train.training.checkpoints import read_checkpoint
+from train.training.launching import interruptible, train_in_processes
+from train.training.loop import run
+from train.training.ranks import Ranks
+from train.training.stages import Job, prepare
+
+# Without dropout, whose draws are each rank's own.
+STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
+
+
+def still_job(run_: Path, out: Path) -> Job:
+    return job_of(run_, out, epochs=1, model_config=STILL)
+
+
+def test_two_processes_train_like_one_on_both_their_batches(heuristic_run: Path, tmp_path: Path):
+    job = still_job(heuristic_run, tmp_path / "two.ckpt")
+    assert train_in_processes(train_and_tell, job, 2, "cpu", lambda: False)
+    told = [told_by(job.out, rank) for rank in (0, 1)]
+    kept = read_checkpoint(job.out)
+    assert equal(told[0]["weights"], told[1]["weights"])
+    assert equal(
+        told[0]["weights"], {k.removeprefix("model."): v for k, v in kept.resume.items() if "model." in k}
+    )
+    ids = [{bytes(i) for i in t["ids"].numpy()} for t in told]
+    assert not ids[0] & ids[1]
+    assert len(ids[0] | ids[1]) == sum(r["n_samples"] for r in kept.head.data)
+
+    ranks = [prepare(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks(r, 2))[0] for r in (0, 1)]
+    alone, _ = prepare(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks())
+    union = Union([r.train for r in ranks])
+    assert run(dataclasses.replace(alone, train=union), lambda: None, Recorder())
+    for name, value in alone.model.state_dict().items():
+        np.testing.assert_allclose(value, told[0]["weights"][name], rtol=1e-3, atol=1e-5, err_msg=name)
+    one, two = alone.position.history[0], kept.head.history[0]
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        assert value == pytest.approx(two[name], rel=1e-4), name
+
+
+def test_what_one_process_refuses_ends_both(tmp_path: Path):
+    with pytest.raises(InputError, match="place: field: problem") as error:
+        train_in_processes(fail_on_the_second, None, 2, "cpu", lambda: False)
+    assert error.value.mend == "Mend"
+
+
+def test_the_first_interrupt_is_noted_and_the_second_ends():
+    assert threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), interruptible() as stopping:
+        assert not stopping()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stopping()
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_steps_share_out_whole_scenes(heuristic_run: Path, tmp_path: Path):
+    with pytest.raises(InputError, match="cannot be shared out evenly among 3"):
+        prepare(still_job(heuristic_run, tmp_path / "c.ckpt"), Ranks(0, 3))

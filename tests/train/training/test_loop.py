@@ -1,0 +1,156 @@
+"""The loop: what stops anywhere goes on bit for bit, and what is no number ends it before harm is done."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from schemas.errors import InputError
+from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
+from train.inputs import Array, Batch
+from train.training.checkpoints import load_model, read_checkpoint
+from train.training.loop import Batches, run
+from train.training.ranks import Ranks
+from train.training.stages import prepare
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def whole(heuristic_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training that nobody interrupted."""
+    out = tmp_path_factory.mktemp("whole") / "whole.ckpt"
+    assert train_until(job_of(heuristic_run, out))[0]
+    return out
+
+
+def test_stopped_at_any_batch_it_ends_as_if_it_had_not(heuristic_run: Path, whole: Path, tmp_path: Path):
+    truth = read_checkpoint(whole)
+    assert truth.head.step == 6
+    for step in range(1, 7):
+        job = job_of(heuristic_run, tmp_path / f"{step}.ckpt")
+        assert train_until(job, step)[0] is False
+        assert read_checkpoint(job.out).head.step == step
+        assert train_until(job)[0] is True
+        gone_on = read_checkpoint(job.out)
+        assert equal(gone_on.resume, truth.resume)
+        assert equal(gone_on.weights, truth.weights)
+        assert gone_on.head.history == truth.head.history
+        assert gone_on.loop == truth.loop
+
+
+def test_stopped_at_every_step_it_ends_as_if_it_had_not(heuristic_run: Path, tmp_path: Path):
+    """With batch statistics and dropout, which both leave traces that a step must find again."""
+    config = {"model": "paper", "model_config": TINY_PAPER, "candidates_per_robot": 2}
+    whole = job_of(heuristic_run, tmp_path / "whole.ckpt", epochs=1, **config)
+    assert train_until(whole)[0]
+    halting = job_of(heuristic_run, tmp_path / "halting.ckpt", epochs=1, **config)
+    while not train_until(halting, 1)[0]:
+        pass
+    assert equal(read_checkpoint(halting.out).resume, read_checkpoint(whole.out).resume)
+
+
+def test_a_finished_training_is_left_as_it_is(heuristic_run: Path, whole: Path):
+    before = whole.read_bytes()
+    done, seen = train_until(job_of(heuristic_run, whole))
+    assert done
+    assert not seen.steps
+    assert whole.read_bytes() == before
+    assert read_checkpoint(whole).head.finished
+
+
+def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_path: Path):
+    job = job_of(heuristic_run, tmp_path / "c.ckpt", epochs=40, patience=2, lr=0.3)
+    done, seen = train_until(job)
+    checkpoint = read_checkpoint(job.out)
+    losses = [row["val_loss"] for row in checkpoint.head.history]
+    best = int(np.argmin(losses)) + 1
+    assert done
+    assert checkpoint.head.best_epoch == best
+    assert len(losses) == best + 2 < 40
+    assert [row["best"] for row in seen.epochs][best - 1 :] == [True, False, False]
+    last = {k.removeprefix("model."): v for k, v in checkpoint.resume.items() if k.startswith("model.")}
+    assert not equal(checkpoint.weights, last)
+    model, head = load_model(job.out)
+    assert equal(model.state_dict(), checkpoint.weights)
+    assert head == checkpoint.head
+
+
+def test_classes_weigh_alike_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
+    training, _ = prepare(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    counts = np.array(training.train.class_counts())  # type: ignore[attr-defined]
+    weights = training.class_weights.numpy()
+    assert weights[0] * counts[0] == pytest.approx(weights[1] * counts[1])
+    assert (weights * counts).sum() == pytest.approx(counts.sum())
+
+
+class Spoilt:
+    """Batches of a stream, of which one holds a number that is none."""
+
+    def __init__(self, batches: Batches, at: int, rows: list[int]) -> None:
+        self._batches, self._at, self._rows = batches, at, rows
+        self.batches_per_epoch = batches.batches_per_epoch
+        self.ids: list[str] = []
+
+    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
+        for i, batch in enumerate(self._batches.epoch(k, skip_batches), skip_batches):
+            if k * self.batches_per_epoch + i == self._at:
+                base_xy_m = batch.candidates.base_xy_m.copy()
+                base_xy_m[self._rows] = np.nan
+                self.ids = [bytes(batch.sample_id[row]).hex() for row in self._rows]
+                candidates = dataclasses.replace(batch.candidates, base_xy_m=base_xy_m)
+                batch = dataclasses.replace(batch, candidates=candidates)
+            yield batch
+
+
+def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_run: Path, tmp_path: Path):
+    job = job_of(heuristic_run, tmp_path / "c.ckpt")
+    training, _ = prepare(job, Ranks())
+    rows = [3, 5, 6, 20, 21]
+    spoilt = Spoilt(training.train, 4, rows)
+    kept: list[int] = []
+    seen = Recorder()
+    with pytest.raises(InputError, match="loss: not a number") as error:
+        run(dataclasses.replace(training, train=spoilt), lambda: kept.append(training.position.step), seen)
+    assert error.value.place == "training, epoch 2, batch 2"
+    assert f"at 5 of its samples: {', '.join(spoilt.ids[:4])}, ..." in error.value.problem
+    assert spoilt.ids[4] not in str(error.value)
+    assert kept == [3]
+    assert all(torch.isfinite(p).all() for p in training.model.parameters())
+
+
+def test_a_gradient_that_is_no_number_ends_it_too(heuristic_run: Path, tmp_path: Path):
+    training, _ = prepare(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    first = next(iter(training.model.parameters()))
+    first.register_hook(lambda gradient: gradient * float("nan"))
+    before = {k: v.clone() for k, v in training.model.state_dict().items()}
+    with pytest.raises(InputError, match="gradient: not a number, at "):
+        run(training, lambda: None, Recorder())
+    assert equal(training.model.state_dict(), before)
+
+
+def test_what_a_step_tells(heuristic_run: Path, whole: Path, tmp_path: Path):
+    job = job_of(heuristic_run, tmp_path / "c.ckpt")
+    _, seen = train_until(job)
+    head = read_checkpoint(job.out).head
+    assert [s.step for s in seen.steps] == [1, 2, 3, 4, 5, 6]
+    assert {s.steps for s in seen.steps} == {6}
+    per_epoch = sum(s.samples for s in seen.steps[:3])
+    assert per_epoch == sum(run["n_samples"] for run in head.data)
+    assert all(0 <= s.wait_s <= s.step_s for s in seen.steps)
+    assert head.cost["train_wall_s"] >= sum(s.step_s for s in seen.steps) * 0.999
+    assert head.cost["label_cpu_s"] > 0
+    rows: list[dict[str, Any]] = [{k: v for k, v in row.items() if k != "best"} for row in seen.epochs]
+    assert tuple(rows) == head.history == read_checkpoint(whole).head.history
