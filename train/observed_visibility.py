@@ -13,17 +13,18 @@ seen, nothing hides: neither the backs of other things, nor what is outside the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from train.inputs import Array, Candidates, Clouds, Robots
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.integer[Any]]
 
 _CELLS = 16  # of a window, each way
 _TARGET_POINTS = 128  # that stand for the target's observed side
@@ -33,7 +34,7 @@ _DISC_SHARE = 0.5
 _LARGEST_DISC_M = 0.06
 _MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
 _NEAREST_M = 0.02  # to an eye; points before it are the robot's own
-_PAIRS = 1 << 21  # of eye and point at once; bounds memory at about 100 MB
+_PAIRS = 1 << 18  # of eye and point at once: bounds memory, and stays in the cache
 
 
 def observed_visibility(clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]) -> F64:
@@ -72,7 +73,7 @@ def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) ->
     usable = np.flatnonzero(np.linalg.norm(eyes_m, axis=1) > max(1.05 * radius_m, 1e-3))
     if not len(side_m) or not len(usable) or not radius_m > 0:
         return share
-    whole_m = np.concatenate([side_m, side_m * np.float32([-1, -1, 1])])
+    whole_m = np.concatenate([side_m, side_m * np.array([-1, -1, 1], np.float32)])
     others_m = others_m[np.isfinite(others_m).all(1)].astype(np.float32)
     block = max(1, _PAIRS // max(len(others_m), len(whole_m)))
     blocks = [usable[start : start + block] for start in range(0, len(usable), block)]
@@ -106,7 +107,7 @@ def _discs(points_m: F32) -> _Discs:
     n = len(points_m)
     if n <= _NEIGHBOURS:  # too few to tell a surface
         return _Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
-    distance_m, row = cKDTree(points_m).query(points_m, _NEIGHBOURS + 1)
+    distance_m, row = KDTree(points_m).query(points_m, _NEIGHBOURS + 1)
     around_m = points_m[row]
     around_m = around_m - around_m.mean(1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around_m, around_m))
@@ -122,7 +123,9 @@ class Views:
         self.towards = eyes_m / self.distance_m[:, None]  # (N, 3), from the target to the eye
         right = np.stack([-self.towards[:, 1], self.towards[:, 0], np.zeros_like(self.distance_m)], axis=1)
         length = np.linalg.norm(right, axis=1, keepdims=True)
-        self.right = np.where(length > 1e-6, right / np.maximum(length, 1e-6), np.float32([1, 0, 0]))
+        self.right = np.where(
+            length > 1e-6, right / np.maximum(length, 1e-6), np.array([1, 0, 0], np.float32)
+        )
         self.up = np.cross(self.towards, self.right)
         sine = np.minimum(radius_m / self.distance_m, 0.99)
         self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), of the window at the target's centre
@@ -184,13 +187,14 @@ class Views:
 
 def _cells_within(x: F32, y: F32, reach: F32) -> tuple[Ints, Ints, Ints]:
     """Pair, column and row of every cell in the squares of half-width `reach` around x, y (K,), in cells."""
-    low = [np.clip(np.floor(c - reach), 0, _CELLS).astype(np.int64) for c in (x, y)]
-    high = [np.clip(np.floor(c + reach) + 1, 0, _CELLS).astype(np.int64) for c in (x, y)]
+    low = [np.clip(np.floor(c - reach), 0, _CELLS).astype(np.int32) for c in (x, y)]
+    high = [np.clip(np.floor(c + reach) + 1, 0, _CELLS).astype(np.int32) for c in (x, y)]
     width, height = high[0] - low[0], high[1] - low[1]
     count = width * height
-    pair = np.repeat(np.arange(len(x)), count)
-    k = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    return pair, low[0][pair] + k % width[pair], low[1][pair] + k // width[pair]
+    pair = np.repeat(np.arange(len(x), dtype=np.int32), count)
+    k = np.arange(len(pair), dtype=np.int32) - (np.cumsum(count, dtype=np.int32) - count)[pair]
+    down, across = np.divmod(k, width[pair])
+    return pair, low[0][pair] + across, low[1][pair] + down
 
 
 def _closed(depths_m: F32) -> F32:
