@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
+from datagen import cli
 from tests.conftest import REPOSITORY
 
 # Small runs in the command's own process: starting Ray eight times would cost more than the labels.
@@ -45,12 +48,28 @@ def runs(request: pytest.FixtureRequest) -> str:
     return request.getfixturevalue("bucket") + "/page"
 
 
-def test_the_page_of_runs(runs: str, tmp_path: Path) -> None:
+def in_this_process(command: Any, capture: pytest.CaptureFixture[str]) -> Any:
+    """A line that calls `datagen` alone, without a shell and the imports of a new process."""
+    capture.readouterr()
+    program, *arguments = shlex.split(os.path.expandvars(command.text))
+    assert program == "datagen"
+    code = cli.run(arguments)
+    told = capture.readouterr()
+    errors = [line for line in told.err.splitlines() if line.startswith("error:")]
+    here = str(Path.cwd())
+    output = tuple(line.rstrip().replace(here, ".") for line in [*told.out.splitlines(), *errors])
+    return replace(command, output=output, exit_code=code)
+
+
+def test_the_page_of_runs(
+    runs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RUNS", runs)
     script = _script()
     commands = script.commands_of((REPOSITORY / "docs" / "runs.md").read_text())
     assert len(commands) >= 10
     environment = {
-        "RUNS": runs,
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": str(REPOSITORY),
         "PYTHONWARNINGS": "",
@@ -64,7 +83,9 @@ def test_the_page_of_runs(runs: str, tmp_path: Path) -> None:
         text = command.text
         for large, small in (SMALL | sizes).items():
             text = text.replace(large, small)
-        done = script.run_command(replace(command, lines=(text,)), tmp_path, environment)
+        asked = replace(command, lines=(text,))
+        alone = text.startswith("datagen ") and len(command.lines) == 1
+        done = in_this_process(asked, capsys) if alone else script.run_command(asked, tmp_path, environment)
         output = tuple(line.replace(runs, ".") for line in done.output)  # the page was filled in on a folder
         told = "\n".join(output)
         assert done.exit_code == command.exit_code, f"{text}\n{told}"
