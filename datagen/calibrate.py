@@ -1,0 +1,337 @@
+"""`datagen calibrate`: the heuristic's parameters that agree best with labels of grasp trials."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from datagen.console.options import AsJson
+from datagen.console.printing import print_json, print_rows
+from datagen.console.steps import steps
+from datagen.console.whole_number import WHOLE_NUMBER
+from schemas.errors import InputError
+from schemas.merged import open_runs
+from schemas.specification import HeuristicParams, Specification
+
+if TYPE_CHECKING:
+    from train.calibration import Agreement, Trials
+    from train.evaluation.bootstrap import Estimate
+
+Sets = Literal["grid", "clear", "in-range"]
+Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
+
+_MOST_RESAMPLES = 10_000
+_SETS: tuple[Sets, ...] = ("in-range", "clear", "grid")  # from the narrowest
+_SAMPLE_FIELDS = ("distance_m", "mount_distance_m", "arm_reach_m", "visibility", "base_is_clear", "label")
+_COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative")
+_METRICS = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Calibrated:
+    """Both rules and how they agree with the labels: the new one also in houses it was not fitted on."""
+
+    before: HeuristicParams
+    after: HeuristicParams
+    by_fold: tuple[HeuristicParams, ...]
+    agreements: dict[str, Agreement]  # before, after (houses left out), fitted (on these very labels)
+
+
+def calibrate(
+    runs: Annotated[list[str], Parameter(negative=(), help="Runs of sim (or plan) labels.")],
+    *,
+    out: Annotated[Path, Parameter(help="The configuration to write: a .toml file that is not there yet.")],
+    candidates: Annotated[Sets, Parameter(help="The candidates that are to be labelled alike.")] = "clear",
+    distance: Annotated[
+        Literal[Form, "any"], Parameter(help="What the distance score is a function of; any takes the best.")
+    ] = "planar",
+    objective: Annotated[
+        Literal["balanced", "accuracy"], Parameter(help="Balanced accuracy, or the share of right labels.")
+    ] = "balanced",
+    fit_alpha: Annotated[
+        bool, Parameter(negative=(), help="Fit the weight of the visibility score too.")
+    ] = False,
+    split_check: Annotated[
+        bool, Parameter(negative=(), help="Refuse runs of other houses than --split val, instead of warning.")
+    ] = False,
+    bootstrap: Annotated[
+        int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
+    ] = 1000,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of folds and resamples.")] = 0,
+    json: AsJson = False,
+) -> int:
+    """Fit what the paper leaves open in its rule, mu, sigma_l, sigma_r and tau, to labels of grasp trials.
+
+    Before and after are told over a named set of candidates, after always in houses that were left out of
+    the fit, with intervals by resampling scenes. FILE has the section [heuristic] that `datagen submit
+    heuristic --config FILE` and `datagen relabel RUN --config FILE` take.
+    """
+    _refuse_odd(out, bootstrap, seed)
+    specs, warnings = _specifications(runs, candidates, split_check)
+    from train.calibration import FOLDS, FORMS, refuse_too_little
+
+    if specs[0].heuristic.alpha == 1 and not fit_alpha:
+        problem = "1 in these runs: distance has no weight, and nothing to fit"
+        raise InputError(runs[0], "heuristic.alpha", problem, "Give --fit-alpha")
+    trials = _read(runs, candidates)
+    refuse_too_little(trials, ", ".join(runs))
+    forms = FORMS if distance == "any" else (distance,)
+    for warning in warnings:
+        sys.stderr.write(f"warning: {warning}\n")
+    with steps("fits", 1 + min(FOLDS, len(set(trials.house))), True if json else None) as step:
+        made = _calibrate(trials, specs[0].heuristic, forms, objective, fit_alpha, bootstrap, seed, step)
+    report = {
+        "out": str(out),
+        "candidates": candidates,
+        "objective": objective,
+        "seed": seed,
+        "resamples": bootstrap,
+        "samples": len(trials),
+        "positives": int(trials.label.sum()),
+        "scenes": trials.n_scenes,
+        "houses": len(set(trials.house)),
+        "runs": [_run_record(spec) for spec in specs],
+        "warnings": warnings,
+        **_findings(made),
+    }
+    said = {"--candidates": candidates, "--distance": distance, "--objective": objective}
+    flags = [*(["--fit-alpha"] if fit_alpha else []), *(["--split-check"] if split_check else [])]
+    words = [*runs, "--out", str(out), *(word for option in said.items() for word in option), *flags]
+    command = shlex.join(["datagen", "calibrate", *words, "--bootstrap", str(bootstrap), "--seed", str(seed)])
+    _write_new(out, _toml(report, command, made.after))
+    if json:
+        print_json(report)
+        return 0
+    title = (
+        f"{len(trials):,} {candidates} candidates of {trials.n_scenes:,} scenes in {report['houses']} houses"
+    )
+    print_rows(f"{title}: {out}", list(_rows(report)), ("", "before", "after", "gain", "on the fitted"))
+    print_rows("[heuristic]", list(_parameter_rows(made)), ("", "before", "after", "in the folds"))
+    return 0
+
+
+def _refuse_odd(out: Path, bootstrap: int, seed: int) -> None:
+    if not 1 <= bootstrap <= _MOST_RESAMPLES:
+        mend = f"Give 1 to {_MOST_RESAMPLES}; 1000 is usual"
+        raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
+    if seed < 0:
+        raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+    if out.suffix.lower() != ".toml":
+        raise InputError(out, "--out", "is not a .toml file", "Give a name that ends in .toml")
+    if not out.parent.is_dir():
+        raise InputError(out, "--out", "its folder does not exist", "Make the folder first")
+    if out.exists() or out.is_symlink():
+        raise InputError(out, "--out", "is there already", "Choose another name, or remove it first")
+
+
+def _specifications(
+    places: Sequence[str], candidates: Sets, split_check: bool
+) -> tuple[list[Specification], list[str]]:
+    """Those of all runs, and what is odd about them. InputError where labels do not belong together."""
+    if not places:
+        raise InputError("datagen calibrate", "RUN", "no run is named", "Name one or more run folders")
+    found: list[tuple[str, Specification]] = [
+        (place, run.manifest.spec) for place in places for run in open_runs(place)
+    ]
+    first_place, first = found[0]
+    scenes: set[str] = set()
+    warnings: list[str] = []
+    for place, spec in found:
+        if spec.label_source == "heuristic":
+            problem = "heuristic labels are the rule itself, and nothing to fit it to"
+            mend = "Name a run of its scenes with trials: datagen submit sim --scenes-from"
+            raise InputError(place, "label_source", problem, mend)
+        if spec.label_source != first.label_source:
+            problem = f"{spec.label_source} labels, and those of {first_place} are {first.label_source}"
+            raise InputError(place, "label_source", problem, "Calibrate to one kind of labels")
+        if spec.heuristic != first.heuristic:
+            problem = f"another rule than that of {first_place}, so that there is no one before"
+            raise InputError(place, "heuristic", problem, "Calibrate the two apart")
+        if spec.scenes_hash in scenes:
+            problem = "its scenes are those of another run here"
+            raise InputError(place, "scenes", problem, "Name every run once, and labels of its scenes once")
+        scenes.add(spec.scenes_hash)
+        held = spec.candidates.within or "grid"
+        if _SETS.index(candidates) > _SETS.index(held):
+            problem = f"the run was made of {held} candidates, not of {candidates}"
+            raise InputError(place, "--candidates", problem, f"Give --candidates {held}")
+        if spec.split != "val":
+            problem = f"houses of split {spec.split}, and parameters are chosen on val"
+            if split_check:
+                mend = "Make a run with `datagen submit --split val`, or leave --split-check out"
+                raise InputError(place, "split", problem, mend)
+            warnings.append(f"{place}: {problem}: evaluate on other houses")
+    return [spec for _, spec in found], warnings
+
+
+def _read(places: Sequence[str], candidates: Sets) -> Trials:
+    """The labels of all runs over the named set of candidates."""
+    import numpy as np
+
+    from train.calibration import Trials
+    from train.reader import SampleReader
+
+    reader = SampleReader(places, scene_fields=("house_id",), sample_fields=_SAMPLE_FIELDS)
+    parts: list[dict[str, Any]] = []
+    n_scenes = 0
+    for columns in reader.shards():
+        columns["scene_row"] = columns["scene_row"] + n_scenes
+        n_scenes += len(columns["house_id"])
+        parts.append(columns)
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    all_trials = Trials(
+        scene=joined["scene_row"],
+        house=joined["house_id"],
+        **{name: joined[name] for name in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")},
+        label=joined["label"] == 1,
+    )
+    rows = np.ones(len(all_trials), np.bool_)
+    if candidates != "grid":
+        rows &= joined["base_is_clear"].astype(np.bool_)
+    if candidates == "in-range":
+        rows &= all_trials.mount_distance_m <= all_trials.arm_reach_m
+    return all_trials.at(rows)
+
+
+def _calibrate(
+    trials: Trials,
+    before: HeuristicParams,
+    forms: Sequence[Form],
+    objective: Literal["balanced", "accuracy"],
+    fit_alpha: bool,
+    resamples: int,
+    seed: int,
+    step: Any,
+) -> _Calibrated:
+    from train.calibration import agreements, fit, fit_leaving_houses_out
+
+    def refit(some: Trials) -> HeuristicParams:
+        return fit(some, before, forms, objective, fit_alpha)
+
+    after = refit(trials)
+    if len(set(trials.said(after).tolist())) == 1:
+        problem = f"the best such rule calls all {len(trials):,} candidates alike"
+        mend = "Choose --objective balanced, another --distance, or other --candidates"
+        raise InputError("datagen calibrate", "--objective", problem, mend)
+    step()
+    left_out = fit_leaving_houses_out(trials, refit, seed, step)
+    said = {"before": trials.said(before), "after": left_out.said, "fitted": trials.said(after)}
+    found = agreements(trials, list(said.values()), resamples, seed)
+    return _Calibrated(before, after, left_out.params, dict(zip(said, found, strict=True)))
+
+
+def _run_record(spec: Specification) -> dict[str, Any]:
+    return {
+        "spec_hash": spec.hash(),
+        "label_source": spec.label_source,
+        "disturbed": spec.arm is not None and spec.arm.disturbance is not None,
+        "split": spec.split,
+        "seed": spec.seed,
+        "candidates": spec.candidates.within or "grid",
+    }
+
+
+def _findings(made: _Calibrated) -> dict[str, Any]:
+    from train.evaluation.bootstrap import verdict
+
+    def record(agreement: Agreement) -> dict[str, Any]:
+        counts = dict(zip(_COUNTS, map(int, agreement.confusion), strict=True))
+        return {name: _estimate(getattr(agreement, name)) for name in _METRICS} | {"confusion": counts}
+
+    told = {name: record(agreement) for name, agreement in made.agreements.items()}
+    gain: dict[str, Any] = {}
+    for name in _METRICS:
+        difference = getattr(made.agreements["after"], name).minus(getattr(made.agreements["before"], name))
+        gain[name] = {**_estimate(difference), "verdict": verdict(difference)}
+    return {
+        "before": {"heuristic": made.before.model_dump(), **told["before"]},
+        "after": {"heuristic": made.after.model_dump(), **told["after"]},
+        "on_the_fitted": told["fitted"],
+        "gain": gain,
+        "folds": [params.model_dump() for params in made.by_fold],
+    }
+
+
+def _estimate(estimate: Estimate) -> dict[str, float | None]:
+    low, high = estimate.interval()
+    numbers = {"value": estimate.value, "low": low, "high": high}
+    return {name: number if number == number else None for name, number in numbers.items()}  # nan
+
+
+def _rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    columns = [report[name] for name in ("before", "after", "gain", "on_the_fitted")]
+    for metric, words in _METRICS.items():
+        shown = [_percent(column[metric], signed=column is report["gain"]) for column in columns]
+        yield (f"{words} (%)", *shown)
+    for count in _COUNTS:
+        before, after, _, fitted = (column.get("confusion", {}).get(count, 0) for column in columns)
+        yield (count.replace("_", " "), f"{before:,}", f"{after:,}", f"{after - before:+,}", f"{fitted:,}")
+
+
+def _percent(estimate: dict[str, float | None], signed: bool = False) -> str:
+    if estimate["value"] is None:
+        return "-"
+    sign = "+" if signed else ""
+    value, low, high = (format(100 * (estimate[k] or 0.0), f"{sign}.1f") for k in ("value", "low", "high"))
+    return value if estimate["low"] is None else f"{value} [{low}, {high}]"
+
+
+def _parameter_rows(made: _Calibrated) -> Iterator[tuple[str, ...]]:
+    before, after = made.before.model_dump(), made.after.model_dump()
+    for name, value in after.items():
+        found = [params.model_dump()[name] for params in made.by_fold]
+        each = sorted(set(found)) if isinstance(value, str) else [min(found), max(found)]
+        yield (name, str(before[name]), str(value), " .. ".join(str(v) for v in dict.fromkeys(each)))
+
+
+def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
+    """The section, complete, below a comment that says where its numbers come from."""
+    runs = [
+        f"{run['spec_hash']}: {run['label_source']}{', disturbed' if run['disturbed'] else ''}, "
+        f"split {run['split']}, seed {run['seed']}, {run['candidates']} candidates"
+        for run in report["runs"]
+    ]
+    share = report["positives"] / report["samples"]
+    lines = [
+        "The distance-visibility rule, fitted to labels of trials.",
+        command,
+        *(f"run {run}" for run in runs),
+        f"n {report['samples']:,} {report['candidates']} candidates, {share:.1%} positive, of "
+        f"{report['scenes']:,} scenes in {report['houses']:,} houses",
+        f"objective {_METRICS.get(report['objective'], 'balanced accuracy')}, seed {report['seed']}; "
+        f"intervals from {report['resamples']:,} resamples of scenes",
+        *(f"{words} (%): {_told(report, metric)}" for metric, words in _METRICS.items()),
+        *(f"warning {warning}" for warning in report["warnings"]),
+    ]
+    comments = "".join(f"# {_printable(line)}\n" for line in lines)
+    section = "".join(
+        f"{name} = {value!r}\n" if isinstance(value, float) else f'{name} = "{value}"\n'
+        for name, value in params.model_dump().items()
+    )
+    return f"{comments}\n[heuristic]\n{section}"
+
+
+def _told(report: dict[str, Any], metric: str) -> str:
+    before, after = (_percent(report[name][metric]) for name in ("before", "after"))
+    return f"before {before}, after {after} in houses left out of the fit"
+
+
+def _printable(text: str) -> str:
+    """A run's name may hold what no comment can."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _write_new(path: Path, text: str) -> None:
+    """Make the file; what came there meanwhile stays."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        mend = "Choose another name, or remove it first"
+        raise InputError(path, "--out", "is there already", mend) from None
