@@ -22,7 +22,15 @@ class PointMlp(nn.Module):
 
     def forward(self, rows: Tensor) -> Tensor:
         """Features of rows."""
-        return self.layers(rows.flatten(0, -2)).unflatten(0, rows.shape[:-1])
+        flat = rows.flatten(0, -2)
+        alone = self.training and len(flat) == 1
+        if alone:
+            # One row has no spread to be normalised by: what was seen before serves.
+            self.layers.eval()
+        features = self.layers(flat)
+        if alone:
+            self.layers.train()
+        return features.unflatten(0, rows.shape[:-1])
 
 
 def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:

@@ -70,6 +70,15 @@ def test_odd_clouds_give_finite_logits_and_gradients(name: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_batch_of_one_candidate_can_be_learnt_from(name: str):
+    model = small_model(name).train()
+    logits = model.score(*drawn_tables(0, candidates=1))
+    logits[0, 1].backward()
+    assert torch.isfinite(logits).all()
+    assert all(module.training for module in model.modules())
+
+
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("sizes", [{"candidates": 0}, {"candidates": 0, "robots": 0}, {"points": 0}])
 @torch.no_grad()
 def test_empty_tables_are_scored(name: str, sizes: dict[str, int]):
