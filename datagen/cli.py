@@ -39,6 +39,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "repair": ("datagen.repair:repair", "Mend what verify finds, and touch nothing else."),
     "replay": ("datagen.replay:replay", "One sample's scene made again, beside what is stored."),
     "relabel": ("datagen.relabel:relabel", "Labels by another rule, from stored distances."),
+    "calibrate": ("datagen.calibrate:calibrate", "Fit the heuristic's rule to labels of trials."),
     "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
     "gc": ("datagen.gc:gc", "Remove what a run holds and nothing names."),
     "show": ("datagen.show:show", "A picture of one scene of a run."),
