@@ -1,10 +1,12 @@
-"""How fast samples with their clouds are read: the reader, tensorstore and zarr-python, as a table.
+"""How fast samples with their clouds are read: the stream, tensorstore and zarr-python, as a table.
 
     python -m benchmarks.reading [--samples 60000] [--run RUN]
 
 Without a run it makes one of random rows (4,096 points a scene, the worst case for size) in a
-temporary folder. Sequential: all samples in stored order, a shard at a time. Random: single samples
-drawn uniformly, each with its scene's cloud.
+temporary folder. `chunks`: the project's reader of chunks, which gives the same arrays as tensorstore and
+zarr-python do. `stream`: batches for training, in one process with its thread. By whole shard: all samples
+in stored order. Random: single samples drawn uniformly, each with its scene's cloud. Beside samples a second
+of wall time stand samples a second of CPU time, which other programs on the machine disturb less.
 """
 
 from __future__ import annotations
@@ -22,11 +24,17 @@ import zarr
 
 from schemas.run import Run
 from schemas.sealing import SEALED, seal
-from tests.made_runs import make_run, small_spec
-from train.reader import SAMPLE_FIELDS, SCENE_FIELDS, SampleReader
+from tests.train.stream_runs import make_stream_run
+from train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
+from train.batching import SAMPLE_FIELDS as SAMPLES
+from train.batching import SCENE_FIELDS as SCENES
+from train.dataset import SampleStream
+from train.opening import open_parts
+from train.reader import load_shard
 
-REPEATS = 3
-FIELDS = (*SCENE_FIELDS, *SAMPLE_FIELDS, "sample_scene_index")
+REPEATS = 5
+FIELDS = (*SCENES, *SAMPLES, "sample_scene_index")
+ALL = Augmentation(SensorNoise(), DepthHoles(), PointDropout(), ColourJitter(), Rotation())
 
 
 def main() -> None:
@@ -39,12 +47,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         if options.run is None:
             started = time.perf_counter()
-            run = make_run(
+            run = make_stream_run(
                 Path(folder) / "run",
                 options.samples,
-                options.scenes_per_shard,
-                60,
-                spec=small_spec(n_points=4096),
+                scenes_per_shard=options.scenes_per_shard,
+                candidates_per_scene=60,
+                robots=4,
+                cloud_points=4096,
             )
             print(f"made {run.n} samples in {time.perf_counter() - started:.1f} s")
         else:
@@ -65,30 +74,39 @@ def _print_sizes(run: Run) -> None:
 
 def _print_rates(folder: Path) -> None:
     rows = [
-        ("reader", "stored order", _rate(lambda: _reader(folder, None))),
-        ("reader", "shuffled, 8 shards", _rate(lambda: _reader(folder, 0))),
+        ("chunks", "committed shards", _rate(lambda: _chunks(folder))),
+        ("chunks", "by whole shard", _rate(lambda: _chunks(folder / SEALED))),
+        ("stream", "stored order", _rate(lambda: _stream(folder, shuffle=False))),
+        ("stream", "shuffled, 8 shards", _rate(lambda: _stream(folder))),
+        ("stream", "with all augmentations", _rate(lambda: _stream(folder, augment=ALL))),
         ("tensorstore", "by whole shard", _rate(lambda: _tensorstore_shards(folder))),
         ("tensorstore", "random, 64 in flight", _rate(lambda: _tensorstore_random(folder, 2000))),
         ("zarr-python", "by whole shard", _rate(lambda: _zarr_shards(folder))),
         ("zarr-python", "random", _rate(lambda: _zarr_random(folder, 100))),
     ]
-    print(f"{'library':<12} {'order':<22} {'samples/s':>10}")
-    for library, order, rate in rows:
-        print(f"{library:<12} {order:<22} {rate:>10,.0f}")
+    print(f"{'library':<12} {'order':<22} {'samples/s':>10} {'a CPU s':>10}")
+    for library, order, (rate, cpu_rate) in rows:
+        print(f"{library:<12} {order:<22} {rate:>10,.0f} {cpu_rate:>10,.0f}")
 
 
-def _rate(work: Callable[[], int]) -> float:
-    rates: list[float] = []
+def _rate(work: Callable[[], int]) -> tuple[float, float]:
+    """Samples a second of wall time and of CPU time, medians."""
+    rates: list[tuple[float, float]] = []
     for _ in range(REPEATS):
-        started = time.perf_counter()
+        wall, cpu = time.perf_counter(), time.process_time()
         count = work()
-        rates.append(count / (time.perf_counter() - started))
-    return statistics.median(rates)
+        rates.append((count / (time.perf_counter() - wall), count / (time.process_time() - cpu)))
+    return statistics.median(r[0] for r in rates), statistics.median(r[1] for r in rates)
 
 
-def _reader(folder: Path, seed: int | None) -> int:
-    rng = None if seed is None else np.random.default_rng(seed)
-    return sum(len(b["label"]) for b in SampleReader([folder]).epoch(256, rng))
+def _chunks(place: Path) -> int:
+    parts = open_parts([place], [*FIELDS, "scene_index"])
+    return sum(len(load_shard(s, part.arrays)[0]["label"]) for part in parts for s in part.shards)
+
+
+def _stream(folder: Path, **options: Any) -> int:
+    """One epoch, with the time that opening the run takes."""
+    return sum(len(b) for b in SampleStream([folder], **options).epoch(0))
 
 
 def _spans(group: Any) -> tuple[int, list[tuple[int, int, int, int]]]:
@@ -118,7 +136,7 @@ def _tensorstore_shards(folder: Path) -> int:
     arrays = _open_tensorstore(folder)
     samples, spans = _spans(zarr.open_group(folder / SEALED, mode="r"))
     for s0, s1, r0, r1 in spans:
-        reads = [arrays[name][s0:s1] if name in SCENE_FIELDS else arrays[name][r0:r1] for name in FIELDS]
+        reads = [arrays[name][s0:s1] if name in SCENES else arrays[name][r0:r1] for name in FIELDS]
         for future in [a.read() for a in reads]:
             future.result()
     return samples
@@ -131,7 +149,7 @@ def _tensorstore_random(folder: Path, count: int) -> int:
     per_scene = group.attrs["candidates_per_scene"]
     for start in range(0, count, 64):
         futures = [
-            arrays[name][int(row) // per_scene if name in SCENE_FIELDS else int(row)].read()
+            arrays[name][int(row) // per_scene if name in SCENES else int(row)].read()
             for row in rows[start : start + 64]
             for name in FIELDS
         ]
@@ -146,7 +164,7 @@ def _zarr_shards(folder: Path) -> int:
     samples, spans = _spans(group)
     for s0, s1, r0, r1 in spans:
         for name in FIELDS:
-            _ = arrays[name][s0:s1] if name in SCENE_FIELDS else arrays[name][r0:r1]
+            _ = arrays[name][s0:s1] if name in SCENES else arrays[name][r0:r1]
     return samples
 
 
@@ -156,7 +174,7 @@ def _zarr_random(folder: Path, count: int) -> int:
     per_scene = group.attrs["candidates_per_scene"]
     for row in np.random.default_rng(0).integers(0, group["label"].shape[0], count):
         for name in FIELDS:
-            _ = arrays[name][int(row) // per_scene if name in SCENE_FIELDS else int(row)]
+            _ = arrays[name][int(row) // per_scene if name in SCENES else int(row)]
     return count
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
 from pathlib import Path
@@ -149,7 +149,7 @@ class SampleStream:
             for summary in self.parts
         ]
 
-    def epoch(self, k: int, skip_batches: int = 0) -> Iterator[Batch[Array]]:
+    def epoch(self, k: int, skip_batches: int = 0) -> Generator[Batch[Array]]:
         """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping.
 
         The next shards are read in a thread while a batch is used. Close the iterator, or use it up, to
@@ -163,11 +163,12 @@ class SampleStream:
         )
         return self._batches(plan, k, skip_batches)
 
-    def _batches(self, plan: EpochPlan, k: int, skip: int) -> Iterator[Batch[Array]]:
+    def _batches(self, plan: EpochPlan, k: int, skip: int) -> Generator[Batch[Array]]:
         if skip >= len(plan.cuts) - 1:
             return
         with ThreadPoolExecutor(1, "read-ahead") as pool:
-            loaded = in_order(pool, self.buffer_shards, self._load, self._reads(plan, int(plan.cuts[skip])))
+            ahead = max(2, self.buffer_shards)
+            loaded = in_order(pool, ahead, self._load, self._reads(plan, int(plan.cuts[skip])))
             try:
                 held: dict[int, StoredScene] = {}
                 for first, past in zip(plan.cuts[skip:-1], plan.cuts[skip + 1 :], strict=True):
@@ -181,7 +182,6 @@ class SampleStream:
     def _reads(self, plan: EpochPlan, start: int) -> list[tuple[int, npt.NDArray[np.int64]]]:
         """(shard, its scenes that are wanted) from a place of the order on, buffer by buffer."""
         scenes, buffer = plan.order[start:], plan.buffer[start:]
-        # A buffer's shards are read in the order of their first scenes' numbers: any would do.
         by_shard = np.lexsort([scenes, self._scenes.shard[scenes], buffer])
         scenes = scenes[by_shard]
         shards = self._scenes.shard[scenes]

@@ -14,6 +14,7 @@ from schemas.storage import open_storage
 from tests.faults.s3_campaign import sealed_arrays
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
+from train.dataset import SampleStream
 from train.reader import SampleReader
 
 
@@ -84,6 +85,11 @@ def test_worker_processes_write_to_s3_and_a_reader_reads_it(
             assert ours.keys() == theirs.keys()
             for name in ours:
                 np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+    streams = [SampleStream([place], scenes_per_batch=1) for place in (local, out, f"{out}/data.zarr")]
+    here, *there = ([(b.sample_id, b.clouds.points_m) for b in s.epoch(1, 1)] for s in streams)
+    assert len(here) == 1
+    for batches in there:
+        np.testing.assert_equal(batches, here)
 
 
 def test_places_on_s3_that_cannot_be_used(

@@ -22,7 +22,6 @@ n_clutter = 2
 arm_reach_m = {low = 0.6, high = 1.0}
 
 [arm.grasps]
-per_object = 100
 per_scene = 8
 """
 

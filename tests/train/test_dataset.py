@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -185,10 +185,10 @@ def test_reading_ahead_is_bounded_and_ends_with_the_iterator(place: str):
     def readers() -> list[str]:
         return [t.name for t in threading.enumerate() if t.name.startswith("read-ahead")]
 
-    batches: Iterator[Batch[Array]] = SampleStream([place], scenes_per_batch=2).epoch(0)
+    batches = SampleStream([place], scenes_per_batch=2).epoch(0)
     next(batches)
     assert len(readers()) == 1
-    batches.close()  # type: ignore[attr-defined]
+    batches.close()
     assert readers() == []
     for _ in SampleStream([place]).epoch(0):
         pass
