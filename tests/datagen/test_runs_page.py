@@ -18,7 +18,7 @@ from tests.conftest import REPOSITORY
 
 # Small runs in the command's own process: starting Ray eight times would cost more than the labels.
 SMALL = {
-    "--n 20000 --seed 1": "--n 120 --seed 1 --workers 0",
+    "--n 20000 --seed 1": "--n 60 --seed 1 --workers 0",
     "datagen resume": "datagen resume --workers 0",
     "--deep 20": "--deep 2",
     # The commands are what is tried here, on every machine; real houses and objects have tests of their own.
@@ -38,7 +38,7 @@ def _script() -> ModuleType:
 
 
 # The run that is killed must not be done before somebody has looked; a store is slower than a disk.
-KILLED_AND_EXTENDED = {"folder": (1440, 1680), "s3": (300, 480)}
+KILLED_AND_EXTENDED = {"folder": (1440, 1560), "s3": (300, 420)}
 
 
 @pytest.fixture(params=["folder", "s3"])
