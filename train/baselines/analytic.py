@@ -1,0 +1,51 @@
+"""The distance-visibility rule H >= tau with rho estimated from the observed cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from schemas.specification import HeuristicParams
+from train.baselines.baseline import F64, is_clear, mount_m, observed_rho, planar_distance_m, reach_m
+from train.inputs import Array, Batch
+from workers.labels.heuristic import heuristic
+
+_PAPER = HeuristicParams()
+
+
+@dataclass(frozen=True)
+class Analytic:
+    """Score H (workers/labels/heuristic.py), good from tau on.
+
+    `params` are those of a specification, by default the paper's with ours where it states none;
+    `datagen calibrate` writes better ones. Where the base does not fit the score is H - 10.
+    With `only_clear` off every place is judged by H alone, as the label source `heuristic` does.
+    """
+
+    params: HeuristicParams = _PAPER
+    only_clear: bool = True
+
+    name: str = field(default="analytic", init=False)
+    needs_fit: bool = field(default=False, init=False)
+
+    @property
+    def threshold(self) -> float:
+        return float(np.float32(self.params.tau))
+
+    def score(self, batch: Batch[Array]) -> F64:
+        """H (N,) of the estimated rho."""
+        inputs = (planar_distance_m(batch), mount_m(batch), reach_m(batch), observed_rho(batch))
+        planar, mount, reach, rho = (a.astype(np.float32) for a in inputs)
+        score, _ = heuristic(planar, mount, reach, rho, self.params)
+        ruled_out = ~is_clear(batch) if self.only_clear else np.zeros(len(batch), np.bool_)
+        return score.astype(np.float64) - np.where(ruled_out, 10.0, 0.0)
+
+    def fit(self, batches: Sequence[Batch[Array]]) -> Analytic:
+        """Itself: its parameters come from a specification, where `datagen calibrate` puts fitted ones."""
+        return self
+
+    def state(self) -> dict[str, Any]:
+        return {"params": self.params.model_dump(mode="json"), "only_clear": self.only_clear}

@@ -1,0 +1,92 @@
+"""Object detectors that are told in words what to look for. The one file that imports transformers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.errors import InputError
+
+U8 = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """K boxes of one picture."""
+
+    boxes_px: npt.NDArray[np.float64]  # (K, 4) left, top, right, bottom
+    scores: npt.NDArray[np.float64]  # (K,) in [0, 1]
+
+    def best_at_middle(self, shape: Sequence[int]) -> float:
+        """The highest score of the boxes that hold the middle of a picture (H, W), or 0."""
+        y, x = shape[0] / 2, shape[1] / 2
+        left, top, right, bottom = self.boxes_px.reshape(-1, 4).T
+        holds = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+        return float(self.scores[holds].max(initial=0.0))
+
+
+class Detector(Protocol):
+    """Finds what a text names."""
+
+    def detect(self, frames: U8, label: str) -> list[Detections]:
+        """What is found in each of the frames (B, H, W, 3)."""
+        ...
+
+
+class ZeroShotDetector:
+    """A zero-shot detector of transformers (OWL-ViT, OWLv2, Grounding DINO) from a local folder.
+
+    Nothing is downloaded. InputError where the folder, the package or a part of the model is missing.
+    """
+
+    def __init__(self, folder: str | Path, device: str = "cpu") -> None:
+        where = Path(folder)
+        if not (where / "config.json").is_file():
+            mend = "Name a folder that holds a detector's config.json, weights and processor"
+            raise InputError(where, "config.json", "not the folder of a detector", mend)
+        try:
+            from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
+        except ImportError as error:
+            mend = "Install it with `pip install 'datagen[detect]'`"
+            raise InputError("--detector", "transformers", f"not usable ({error})", mend) from None
+        try:
+            self._processor: Any = AutoProcessor.from_pretrained(where, local_files_only=True)
+            model: Any = AutoModelForZeroShotObjectDetection.from_pretrained(
+                where, local_files_only=True, use_safetensors=True
+            )
+        except (OSError, ValueError, KeyError, RuntimeError) as error:
+            mend = "Save model and processor into it again with `save_pretrained`"
+            raise InputError(where, "", f"no zero-shot detector: {error}", mend) from None
+        self._model = model.to(device).eval()
+        self._device = device
+
+    def detect(self, frames: U8, label: str) -> list[Detections]:
+        """Boxes of each frame (B, H, W, 3), all of them, whatever their score."""
+        import torch
+
+        # Lower case and a full stop is what Grounding DINO was trained with; OWL-ViT does not mind.
+        words = [[f"a photo of a {label.lower()}."]] * len(frames)
+        with torch.inference_mode():
+            inputs = self._processor(images=list(frames), text=words, return_tensors="pt", padding=True)
+            inputs = inputs.to(self._device)
+            outputs = self._model(**inputs)
+        sizes = [frame.shape[:2] for frame in frames]
+        ids = {"input_ids": inputs["input_ids"], "text_threshold": 0.0} if _needs_ids(self._processor) else {}
+        found = self._processor.post_process_grounded_object_detection(
+            outputs, threshold=0.0, target_sizes=sizes, **ids
+        )
+        return [
+            Detections(f["boxes"].double().cpu().numpy(), f["scores"].double().cpu().numpy()) for f in found
+        ]
+
+
+def _needs_ids(processor: Any) -> bool:
+    """Grounding DINO reads from the tokens which words a box is for."""
+    from inspect import signature
+
+    return "input_ids" in signature(processor.post_process_grounded_object_detection).parameters

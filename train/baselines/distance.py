@@ -1,0 +1,87 @@
+"""A band of distances, and nothing else: what there is to know without looking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from train.baselines.baseline import (
+    F64,
+    RULED_OUT,
+    Bools,
+    is_clear,
+    labels,
+    mount_m,
+    planar_distance_m,
+    reach_m,
+)
+from train.inputs import Array, Batch
+
+Kind = Literal["planar", "planar-over-reach", "mount-over-reach"]
+KINDS: tuple[Kind, ...] = ("planar", "planar-over-reach", "mount-over-reach")
+_EDGES = 101
+
+
+@dataclass(frozen=True)
+class DistanceBand:
+    """Good where low <= d <= high, and the base fits; score: how far inside the band d is.
+
+    d is the distance of a `kind` as the heuristic has them, in metres or shares of the reach. `fit`
+    chooses kind and band.
+    """
+
+    kind: Kind = "planar"
+    low: float = float("nan")
+    high: float = float("nan")
+
+    name: str = field(default="distance", init=False)
+    threshold: float = field(default=0.0, init=False)
+
+    @property
+    def needs_fit(self) -> bool:
+        return bool(np.isnan(self.low))
+
+    def score(self, batch: Batch[Array]) -> F64:
+        """min(d - low, high - d) (N,), less `RULED_OUT` where the base does not fit."""
+        d = _distance(batch, self.kind)
+        return np.minimum(d - self.low, self.high - d) - np.where(is_clear(batch), 0.0, RULED_OUT)
+
+    def fit(self, batches: Sequence[Batch[Array]]) -> DistanceBand:
+        """The kind and band with the best balanced accuracy; edges are quantiles of d."""
+        label = labels(batches, self.name)
+        clear = np.concatenate([is_clear(b) for b in batches])
+        found: dict[Kind, tuple[float, float, float]] = {}
+        for kind in KINDS:
+            found[kind] = _best_band(np.concatenate([_distance(b, kind) for b in batches]), label, clear)
+        kind = max(KINDS, key=lambda kind: found[kind][0])
+        return replace(self, kind=kind, low=found[kind][1], high=found[kind][2])
+
+    def state(self) -> dict[str, Any]:
+        return {"kind": self.kind, "low": self.low, "high": self.high}
+
+
+def _distance(batch: Batch[Array], kind: Kind) -> F64:
+    match kind:
+        case "planar":
+            return planar_distance_m(batch)
+        case "planar-over-reach":
+            return planar_distance_m(batch) / reach_m(batch)
+        case "mount-over-reach":
+            return mount_m(batch) / reach_m(batch)
+
+
+def _best_band(d: F64, label: Bools, clear: Bools) -> tuple[float, float, float]:
+    """(balanced accuracy, low, high) of the best band of those between the quantiles of d."""
+    edges = np.quantile(d, np.linspace(0, 1, _EDGES))
+    inside: list[F64] = []
+    for rows in (label & clear, ~label & clear):
+        values = np.sort(d[rows])
+        from_low, to_high = (np.searchsorted(values, edges, side) for side in ("left", "right"))
+        inside.append(np.maximum(to_high[None, :] - from_low[:, None], 0).astype(np.float64))
+    sensitivity = inside[0] / label.sum()
+    balanced = np.triu(0.5 * (sensitivity + 1 - inside[1] / (~label).sum()))
+    low, high = np.unravel_index(int(balanced.argmax()), balanced.shape)
+    return float(balanced[low, high]), float(edges[low]), float(edges[high])

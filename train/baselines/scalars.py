@@ -1,0 +1,121 @@
+"""A small network on a dozen numbers: what can be known of a candidate without looking at shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import InputError
+from train.baselines.baseline import (
+    F64,
+    is_clear,
+    labels,
+    mount_m,
+    observed_rho,
+    planar_distance_m,
+    reach_m,
+)
+from train.inputs import Array, Batch
+
+FEATURES = (
+    *("distance_m", "mount_distance_m", "reach_m", "distance_over_reach", "mount_over_reach"),
+    *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho", "is_clear"),
+)
+_WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
+_STEPS = 3000
+
+Layer = tuple[F64, F64]  # weights (out, in), bias (out,)
+
+
+@dataclass(frozen=True, eq=False)
+class Scalars:
+    """Probability of a good label by two hidden layers of 32; fitted by cross-entropy."""
+
+    seed: int = 0
+    layers: tuple[Layer, ...] = ()  # the first takes the features as they are
+
+    name: str = field(default="scalars", init=False)
+    threshold: float = field(default=0.5, init=False)
+
+    @property
+    def needs_fit(self) -> bool:
+        return not self.layers
+
+    def score(self, batch: Batch[Array]) -> F64:
+        """Probabilities (N,)."""
+        if not self.layers:
+            raise InputError("baseline scalars", "", "not fitted", "Fit it on runs in validation houses")
+        hidden = features(batch)
+        for weights, bias in self.layers[:-1]:
+            hidden = np.maximum(hidden @ weights.T + bias, 0)
+        weights, bias = self.layers[-1]
+        return 1 / (1 + np.exp(-np.clip((hidden @ weights.T + bias)[:, 0], -50, 50)))
+
+    def fit(self, batches: Sequence[Batch[Array]]) -> Scalars:
+        """Fitted anew; the same for the same batches and seed, whatever torch drew before."""
+        label = labels(batches, self.name)
+        rows = np.concatenate([features(b) for b in batches])
+        return replace(self, layers=_fitted(rows, label.astype(np.float32), self.seed))
+
+    def state(self) -> dict[str, Any]:
+        return {"features": FEATURES, "layers": [[w.tolist(), b.tolist()] for w, b in self.layers]}
+
+
+def features(batch: Batch[Array]) -> F64:
+    """The numbers (N, 11) of every candidate, in the order of `FEATURES`."""
+    robot = batch.candidates.robot_row
+    cloud = batch.robots.cloud_row[robot]
+    height_m = batch.clouds.target_height_m[cloud].astype(np.float64)
+    planar, mount, reach = planar_distance_m(batch), mount_m(batch), reach_m(batch)
+    return np.column_stack(
+        [
+            *(planar, mount, reach, planar / reach, mount / reach),
+            height_m - batch.robots.base_height_m[robot],
+            batch.robots.camera_height_m[robot] - height_m,
+            *(
+                height_m,
+                batch.clouds.target_radius_m[cloud],
+                observed_rho(batch),
+                is_clear(batch).astype(float),
+            ),
+        ]
+    )
+
+
+def _fitted(rows: F64, label: Array, seed: int) -> tuple[Layer, ...]:
+    import torch
+    from torch import nn
+
+    mean = rows.mean(0)
+    # What hardly varies here must not count for much where it does.
+    scale = np.maximum(rows.std(0), 1e-2)
+    x = torch.from_numpy(((rows - mean) / scale).astype(np.float32))
+    y = torch.from_numpy(label)
+    draw = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        net = nn.Sequential(
+            nn.Linear(rows.shape[1], _WIDTH),
+            nn.ReLU(),
+            nn.Linear(_WIDTH, _WIDTH),
+            nn.ReLU(),
+            nn.Linear(_WIDTH, 1),
+        )
+    optimiser = torch.optim.AdamW(net.parameters(), lr=_RATE, weight_decay=_DECAY)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    for _ in range(_STEPS):
+        chosen = torch.randint(len(x), (min(_BATCH, len(x)),), generator=draw)
+        loss = nn.functional.binary_cross_entropy_with_logits(net(x[chosen])[:, 0], y[chosen])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    linear = [m for m in net if isinstance(m, nn.Linear)]
+    layers = [(m.weight.detach().double().numpy(), m.bias.detach().double().numpy()) for m in linear]
+    # Into the first layer goes what made the features comparable.
+    weights = layers[0][0] / scale
+    layers[0] = weights, layers[0][1] - weights @ mean
+    return tuple(layers)
