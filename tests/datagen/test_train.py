@@ -22,6 +22,7 @@ from tests.sim_extra import needs_sim
 from tests.train.conftest import heuristic_run, shared_folder, sim_run
 from tests.train.training.small import TINY, equal
 from train.training.checkpoints import load_model, read_checkpoint
+from train.training.devices import choose_device
 
 __all__ = ["heuristic_run", "shared_folder", "sim_run"]
 HERE = ("--threads", "1", "--device", "cpu", "--batch-scenes", "4")
@@ -115,8 +116,6 @@ def test_what_cannot_be_trained_is_refused(
         (words("stage1", run, out, "--processes", "0"), ("--processes",)),
         (words("stage1", run, tmp_path), (str(tmp_path), "not a file")),
     ]
-    if not torch.cuda.is_available():
-        cases.append((words("stage1", run, out, "--device", "cuda"), ("--device", "no GPU")))
     for arguments, told in cases:
         refused(arguments, capsys, *told)
     assert not out.exists()
@@ -154,6 +153,14 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
     one, other = (read_checkpoint(tmp_path / name) for name in ("c.ckpt", "whole.ckpt"))
     assert equal(one.resume, other.resume)
     assert one.head.history == other.head.history
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_a_gpu_that_is_not_there_is_refused():
+    with pytest.raises(InputError, match="torch finds no GPU here"):
+        choose_device("cuda", None)
+    assert choose_device("auto", None) == ("cpu", 1)
+    assert choose_device("auto", 3) == ("cpu", 3)
 
 
 def test_sizes_of_a_model(tiny: str):

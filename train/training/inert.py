@@ -1,9 +1,9 @@
 """What a file of `torch.save` declares, read as plain data: nothing is called, nothing larger than the file.
 
-`torch.load(weights_only=True)` calls no foreign code, yet it believes the sizes that a pickle states (a
-storage may claim more bytes than its record has), allocates what a pickle asks for and does not check the
-records' checksums. Whoever loads a checkpoint of unknown origin looks at it here first: a zip of stored
-records, whose pickle is one flat dictionary of texts and dense tensors, each as large as its record.
+`torch.load(weights_only=True)` calls no foreign code, yet it allocates what a pickle asks for, and not every
+release compares the size that a pickle states with that of the record. Whoever loads a checkpoint of unknown
+origin looks at it here first: a zip of stored records with right checksums, whose pickle is one flat
+dictionary of texts and dense tensors, each exactly as large as its record.
 """
 
 from __future__ import annotations

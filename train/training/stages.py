@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from schemas.errors import InputError
 from train.augment import Augmentation
 from train.dataset import SampleStream
 from train.models import Model, build_model
-from train.splits import refuse_one_class, refuse_shared_houses, split_by_house
+from train.splits import HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
 from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
@@ -77,8 +77,6 @@ def prepare(job: Job, ranks: Ranks) -> tuple[Training, CheckpointHead]:
     options, stage = job.options, STAGES[job.options.stage]
     began = read_checkpoint(job.init) if job.init is not None else None
     train, val = _streams(job, ranks)
-    for stream in (train, val):
-        _refuse_other_labels(stage.name, stage.label_sources, stream)
     refuse_one_class(train)
     if began is not None:
         _refuse_known_houses(job, began.head, val)
@@ -148,22 +146,31 @@ def _streams(job: Job, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
     if options.batch_scenes % ranks.world:
         problem = f"{options.batch_scenes} scenes cannot be shared out evenly among {ranks.world} processes"
         raise InputError("datagen train", "--batch-scenes", problem, f"Give a multiple of {ranks.world}")
-    shared: dict[str, Any] = {
-        "scenes_per_batch": options.batch_scenes // ranks.world,
-        "seed": options.seed,
-        "rank": ranks.rank,
-        "world": ranks.world,
-    }
+    sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
     drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
-    if not job.val_runs:
-        return split_by_house(job.runs, **shared, **drawn)
-    train = SampleStream(job.runs, **shared, **drawn)
-    val = SampleStream(job.val_runs, **shared, shuffle=False)
+    if job.val_runs:
+        train, val = (
+            SampleStream(job.runs, **sizes, **drawn),
+            SampleStream(job.val_runs, **sizes, shuffle=False),
+        )
+    else:
+        train, val = split_by_house(job.runs, **sizes, **drawn)
+    for stream in (train, val):
+        _refuse_other_labels(options.stage, stream)
     refuse_shared_houses(train, val)
+    if ranks.world == 1:
+        return train, val
+    sides = (None, None) if job.val_runs else (HouseSide(held_out=False), HouseSide(held_out=True))
+    shared: dict[str, Any] = {"rank": ranks.rank, "world": ranks.world, **sizes}
+    train = SampleStream(job.runs, houses=sides[0], **shared, **drawn)
+    # Of fewer scenes than processes each process judges all; `validate` counts a sample once.
+    if val.n_scenes >= ranks.world:
+        val = SampleStream(job.val_runs or job.runs, houses=sides[1], **shared, shuffle=False)
     return train, val
 
 
-def _refuse_other_labels(stage: str, wanted: Sequence[str], stream: SampleStream) -> None:
+def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
+    wanted = STAGES[stage].label_sources
     for summary in stream.parts:
         source = summary.part.schema
         if source not in wanted:

@@ -39,7 +39,7 @@ def validate(
             columns.append(rows.cpu().numpy())
     model.train()
     everyone = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
-    # Ranks that had one batch too few were given samples that another has, too.
+    # Several ranks may have judged the same sample.
     _, first = np.unique(np.concatenate([i for i, _ in everyone]), axis=0, return_index=True)
     label, p, loss = np.concatenate([c for _, c in everyone])[np.sort(first)].T
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]

@@ -19,18 +19,17 @@ from train.training.watching import Watchers
 
 
 def train_and_tell(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
-    """Train, and leave this rank's weights, its samples and what its last step was beside the checkpoint."""
+    """Train, and leave this rank's weights and samples beside the checkpoint.
+
+    Then the second rank refuses something while the first still waits for it.
+    """
     torch.set_num_threads(1)
     training, head = prepare(job, ranks)
-    finished = run(training, lambda: keep(job.out, training, head), Watchers([]), stopping)
+    assert run(training, lambda: keep(job.out, training, head), Watchers([]), stopping)
     samples = [batch.sample_id for batch in training.train.epoch(0)]
     told = {"weights": training.model.state_dict(), "ids": torch.from_numpy(np.concatenate(samples))}
     torch.save(told, f"{job.out}.{ranks.rank}")
-    return finished
-
-
-def fail_on_the_second(_job: Any, ranks: Ranks, _stopping: Callable[[], bool]) -> bool:
-    """The second rank refuses its input while the first waits for it."""
+    ranks.gather("told")
     if ranks.rank == 1:
         raise InputError("place", "field", "problem", "Mend")
     ranks.gather("never answered")

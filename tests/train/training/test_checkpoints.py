@@ -148,7 +148,7 @@ def test_foreign_pickles_are_never_run(written: Path, tmp_path: Path):
 
 
 def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path):
-    """torch believes a pickle that a record is larger than it is, and would read beyond it."""
+    """Some releases of torch believe a pickle that a record is larger than it is, and read beyond it."""
     (n,) = torch.load(written, weights_only=True)["weights/token.1.bias"].shape
     assert n == TINY["width"]
 
