@@ -36,9 +36,8 @@ class Frames:
         return Frames(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def steering(self) -> Tensor:
-        """(..., 5): 1, the frame's axis, and the axis of twice its angle."""
-        one = torch.ones_like(self.planar_m)[..., None]
-        return torch.cat([one, self.forward, doubled(self.forward)], dim=-1)
+        """(..., 4): the frame's axis, and the axis of twice its angle."""
+        return torch.cat([self.forward, doubled(self.forward)], dim=-1)
 
     def scalars(self) -> Tensor:
         """(..., N_SCALARS): distances and heights, also in units of the reach; all of the order of 1."""
@@ -76,6 +75,8 @@ def frames_of(
 
 def pair_features(frames: Frames, centres_m: Tensor) -> Tensor:
     """(..., J, N_PAIR_FEATURES) of places (..., J, 3), target frame, for candidates (...).
+
+    The first one is positive on the left; the others are the same on both sides.
 
     What is not linear in the place: its offsets from the line of sight as a camera would see them on
     the target, in target radii, how far before the target it is, and its distances from the mount and from
@@ -117,8 +118,12 @@ def pair_features(frames: Frames, centres_m: Tensor) -> Tensor:
     )
 
 
-def target_features(frames: Frames, tokens: Tokens, robot_row: Tensor) -> Tensor:
-    """(N, F): the target's size and shape as candidates of the given robots have it before them."""
+def target_features(frames: Frames, tokens: Tokens, robot_row: Tensor) -> tuple[Tensor, Tensor]:
+    """The target's size and shape as candidates of the given robots have it before them.
+
+    (N, F) of what is the same in a mirror, and (N, G) of what changes its sign.
+    """
     vectors = turned(tokens.target_vectors[robot_row], frames.forward[:, None])
     tensors = turned(tokens.target_tensors[robot_row], doubled(frames.forward)[:, None])
-    return torch.cat([tokens.target_numbers[robot_row], vectors.flatten(1), tensors.flatten(1)], dim=1)
+    along, left = torch.cat([vectors, tensors], dim=1).unbind(2)
+    return torch.cat([tokens.target_numbers[robot_row], along, left.abs()], dim=1), left

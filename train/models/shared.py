@@ -1,16 +1,18 @@
 """Encodes what a robot sees once, and scores all its candidates on that encoding.
 
-The cloud becomes some 160 tokens: places on the target, near it and further away, with the shape of what is
+The cloud becomes 80 tokens: places on the target, near it and further away, with the shape of what is
 around them (`train.models.tokens`). A candidate sees each token from its own frame: what has a direction is
 turned into the frame, and offsets from its line of sight and from its arm's way are added
 (`train.models.frames`). A first layer over all of that is linear, so that the part that belongs to the
-token is worked out once for all candidates, and the part that turns is a product with (1, cos, sin, cos 2,
+token is worked out once for all candidates, and the part that turns is a product with (cos, sin, cos 2,
 sin 2) of the frame's angle:
 
     token_kj = relu(A f_j + turn_k(V f_j) + B g_kj + C s_k)
 
 then a small layer, and the maximum and the mean over each kind of token, joined with the candidate's
 scalars s_k. The logits do not change when cloud and candidates are turned together about the vertical.
+Nor, if `mirrored`, when what is to the left of each candidate's line to the target is put to its right:
+what tokens say is then read both ways, and the mean taken.
 
 The computation is the same in training and in evaluation (LayerNorm, no BatchNorm).
 """
@@ -63,18 +65,20 @@ class SharedConfig(ModelConfig):
     `camera`: "given", or "unknown" for what `paper` sees, which knows the robot's mount and not its camera.
     `observed_visibility`: also give rho as `train.observed_visibility` estimates it from the robot's
     crop, on the CPU.
+    `mirrored`: the arm is taken to do on its left what it does on its right.
     """
 
-    n_points: int = Field(default=2048, ge=1, le=65_536)
-    tokens: tuple[Count, Count, Count] = (32, 64, 64)  # on the target, near it, further away
+    n_points: int = Field(default=1024, ge=1, le=65_536)
+    tokens: tuple[Count, Count, Count] = (16, 32, 32)  # on the target, near it, further away
     near_m: float = Field(default=0.25, gt=0, le=10)
-    scales_m: tuple[Scale, ...] = Field(default=(0.03, 0.08, 0.2), min_length=1, max_length=8)
+    scales_m: tuple[Scale, ...] = Field(default=(0.05, 0.15), min_length=1, max_length=8)
     width: Width = 64
     embedding: Width = 128
     head: tuple[Width, ...] = Field(default=(128, 64), max_length=8)
-    dropout: float = Field(default=0.0, ge=0, lt=1)
+    dropout: float = Field(default=0.2, ge=0, lt=1)
     camera: Literal["given", "unknown"] = "given"
     observed_visibility: bool = False
+    mirrored: bool = True
 
 
 class SharedModel(Model):
@@ -98,13 +102,17 @@ class SharedModel(Model):
             nn.ReLU(),
             nn.Linear(width, width),
         )
+        # Along the frame's axis, then to its left.
         self.vectors = nn.Linear(2 * token.vectors, width, bias=False)
         self.tensors = nn.Linear(2 * token.tensors, width, bias=False)
         self.gates = nn.Linear(width, token.vectors + token.tensors)
         self.pair = nn.Linear(N_PAIR_FEATURES, width, bias=False)
         self.condition = nn.Linear(n_scalars, width, bias=False)
+        self.condition_left = nn.Linear(TARGET_VECTORS + TARGET_TENSORS, width, bias=False)
         self.seen = nn.Sequential(nn.Linear(width, width), nn.ReLU())
-        self.pooled = nn.Linear(2 * N_KINDS * width, embedding)
+        self.pooled = nn.Sequential(
+            nn.Linear(2 * N_KINDS * width, embedding), nn.LayerNorm(embedding), nn.ReLU()
+        )
         self.scalars = nn.Sequential(nn.Linear(n_scalars, 64), nn.ReLU(), nn.Linear(64, embedding))
         self.head = nn.Sequential(
             nn.LayerNorm(2 * embedding),
@@ -133,28 +141,30 @@ class SharedModel(Model):
         """Logits (N, 2) from what `encode` gave for the same clouds and robots."""
         with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
             frames = self._frames(tokens, clouds, candidates, robots)
-            target = target_features(frames, tokens, candidates.robot_row)
+            target, target_left = target_features(frames, tokens, candidates.robot_row)
             parts = [frames.scalars(), target]
             if self.sizes.observed_visibility:
                 crop = crop_clouds(clouds, robots, _VISIBILITY_POINTS)
                 parts.append(_visibility(frames, crop, candidates))
             scalars = torch.cat(parts, dim=1)
-        steered = self._steered(tokens)
-        condition = self.condition(scalars)
-        tile = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
-        cut = tiles(candidates.robot_row, tile)
+        same, left = self._steered(tokens)
+        condition, condition_left = self.condition(scalars), self.condition_left(target_left)
+        cut = tiles(candidates.robot_row, _TILE_CUDA if scalars.is_cuda else _TILE_CPU)
         pooled = [
             self._pool(
-                steered[robot],
+                same[robot],
+                left[robot],
                 frames.take(rows),
                 condition[rows],
+                condition_left[rows],
                 tokens.centres_m[robot],
                 tokens.valid[robot],
             )
             for robot, rows in cut
         ]
         rows = torch.cat([rows.flatten() for _, rows in cut])
-        seen = self.pooled(torch.cat([p.flatten(0, 1) for p in pooled])[torch.argsort(rows)])
+        sides = torch.cat([p.flatten(0, 1) for p in pooled])[torch.argsort(rows)]  # (N, 1 or 2, F)
+        seen = self.pooled(sides).mean(1)
         return self.head(torch.cat([seen, self.scalars(scalars)], dim=1)).float()
 
     def _frames(
@@ -170,34 +180,61 @@ class SharedModel(Model):
         of_robots = (t[row] for t in (rise_m, camera_rise_m, reach_m, tokens.target_radius_m))
         return frames_of(candidates.base_xy_m, *of_robots)
 
-    def _steered(self, tokens: Tokens) -> Tensor:
-        """(R, 5, J, W): what `Frames.steering` is multiplied with to give the tokens' linear part."""
+    def _steered(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
+        """The tokens' linear part, to be multiplied with 1 and `Frames.steering`.
+
+        (R, 5, J, W) of what is the same in a mirror, (R, 4, J, W) of what changes its sign.
+        """
         hidden = self.token[:-1](tokens.numbers)
         gates = 2 * torch.sigmoid(self.gates(hidden))[..., None]
         n_vectors = tokens.vectors.shape[2]
-        vectors = tokens.vectors * gates[:, :, :n_vectors]
-        tensors = tokens.tensors * gates[:, :, n_vectors:]
-        return torch.stack(
-            [self.token[-1](hidden), *_turning(self.vectors, vectors), *_turning(self.tensors, tensors)],
-            dim=1,
-        )
+        same, left = [self.token[-1](hidden)], []
+        for layer, pairs in (
+            (self.vectors, tokens.vectors * gates[:, :, :n_vectors]),
+            (self.tensors, tokens.tensors * gates[:, :, n_vectors:]),
+        ):
+            # In the frame a pair (x, y) is (x cos + y sin, y cos - x sin).
+            weight, weight_left = layer.weight.chunk(2, dim=1)
+            x, y = pairs.unbind(-1)
+            same += [x @ weight.T, y @ weight.T]
+            left += [y @ weight_left.T, -x @ weight_left.T]
+        return torch.stack(same, dim=1), torch.stack(left, dim=1)
 
     def _pool(
-        self, steered: Tensor, frames: Frames, condition: Tensor, centres_m: Tensor, valid: Tensor
+        self,
+        same: Tensor,
+        left: Tensor,
+        frames: Frames,
+        condition: Tensor,
+        condition_left: Tensor,
+        centres_m: Tensor,
+        valid: Tensor,
     ) -> Tensor:
-        """(r, c, F) of c candidates each of r robots."""
-        r, _, j, w = steered.shape
-        linear = torch.bmm(frames.steering(), steered.flatten(2)).view(r, -1, j, w)
+        """(r, c, 1 or 2, F) of c candidates each of r robots: what tokens say, and in a mirror."""
+        steering = frames.steering()
         pairs = pair_features(frames, centres_m[:, None])
-        features = torch.relu(linear + self.pair(pairs) + condition[:, :, None])
-        features = self.seen(features) * valid[:, None, :, None]
+        weight = self.pair.weight
+        even = same[:, None, 0] + _product(steering, same[:, 1:]) + condition[:, :, None]
+        even = even + pairs[..., 1:] @ weight[:, 1:].T
+        odd = _product(steering, left) + condition_left[:, :, None] + pairs[..., :1] * weight[:, 0]
+        sides = (even + odd, even - odd) if self.sizes.mirrored else (even + odd,)
+        return torch.stack([self._pool_side(torch.relu(side), valid) for side in sides], dim=2)
+
+    def _pool_side(self, tokens: Tensor, valid: Tensor) -> Tensor:
+        """Maximum and mean (r, c, F) over each kind of tokens (r, c, J, W)."""
+        seen = self.seen(tokens) * valid[:, None, :, None]
         parts: list[Tensor] = []
         for of_kind, there in zip(
-            features.split(self.sizes.tokens, dim=2), valid.split(self.sizes.tokens, dim=1), strict=True
+            seen.split(self.sizes.tokens, dim=2), valid.split(self.sizes.tokens, dim=1), strict=True
         ):
             n = there.sum(1).clamp(min=1)[:, None, None]
             parts += [of_kind.amax(2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
+
+
+def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:
+    """(r, c, J, W) of steering (r, c, n) and (r, n, J, W)."""
+    return torch.bmm(steering, of_tokens.flatten(2)).unflatten(2, of_tokens.shape[2:])
 
 
 def _visibility(frames: Frames, crop: Crop, candidates: Candidates[Tensor]) -> Tensor:
@@ -216,13 +253,3 @@ def _visibility(frames: Frames, crop: Crop, candidates: Candidates[Tensor]) -> T
         )
     share = torch.from_numpy(rho).to(candidates.base_xy_m.device)
     return torch.stack([share, (share / 0.04).clamp(max=1), (share - 0.8).clamp(min=0) / 0.2], dim=1)
-
-
-def _turning(layer: nn.Linear, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    """What of `layer` on turned pairs (R, J, n, 2) is multiplied with cos and sin of the frame's angle.
-
-    A pair (x, y) is (x cos + y sin, y cos - x sin) in the frame; the layer's weight has its columns so.
-    """
-    along, left = layer.weight.chunk(2, dim=1)
-    x, y = pairs.unbind(-1)
-    return x @ along.T + y @ left.T, y @ along.T - x @ left.T

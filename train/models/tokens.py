@@ -2,7 +2,8 @@
 
 Nothing here depends on a candidate or has parameters. What a token says is sorted by how it turns when the
 scene is turned about the vertical: numbers that stay, vectors that turn along, and second-order tensors
-that turn twice as fast; so a candidate's own frame can be had by a product (`train.models.frames`).
+that turn twice as fast; so a candidate's own frame can be had by a product (`train.models.frames`). In a
+mirror along a candidate's line to the target numbers stay as well, and what is to the left changes its sign.
 """
 
 from __future__ import annotations
@@ -105,7 +106,8 @@ def tokens_of(crop: Crop, counts: tuple[int, int, int], near_m: float, scales_m:
         tensors += [stretch]
     outward_twice = doubled(outward)
     for v, axis in [*((v, outward) for v in vectors), *((t, outward_twice) for t in tensors)]:
-        numbers += turned(v, axis).unbind(2)
+        along, aside = turned(v, axis).unbind(2)
+        numbers += [along, aside.abs()]  # in a mirror `aside` changes its sign, and numbers must not
     kind_of = torch.eye(N_KINDS, device=points.device).repeat_interleave(
         torch.tensor(counts, device=points.device), dim=0
     )

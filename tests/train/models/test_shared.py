@@ -40,6 +40,19 @@ def test_turning_cloud_and_candidates_together_changes_nothing(model: Model, ang
     torch.testing.assert_close(turned, logits, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("mirrored", [True, False])
+@torch.no_grad()
+def test_left_and_right_are_the_same_to_a_mirrored_model_alone(mirrored: bool):
+    model = small_model("shared", mirrored=mirrored)
+    clouds, candidates, robots = drawn_tables(4)
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    before = model.score(clouds, candidates, robots)
+    clouds = replace(clouds, points_m=clouds.points_m * flip)
+    candidates = replace(candidates, base_xy_m=candidates.base_xy_m * flip[:2])
+    change = float((model.score(clouds, candidates, robots) - before).abs().amax())
+    assert change < 1e-5 if mirrored else change > 1e-3
+
+
 @torch.no_grad()
 def test_turning_the_candidates_alone_changes_much(model: Model):
     clouds, candidates, robots = drawn_tables(0)
