@@ -134,8 +134,6 @@ def _specifications(
     places: Sequence[str], candidates: Sets, split_check: bool
 ) -> tuple[list[Specification], list[str]]:
     """Those of all runs, and what is odd about them. InputError where labels do not belong together."""
-    if not places:
-        raise InputError("datagen calibrate", "RUN", "no run is named", "Name one or more run folders")
     found: list[tuple[str, Specification]] = [
         (place, run.manifest.spec) for place in places for run in open_runs(place)
     ]
