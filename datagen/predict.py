@@ -40,9 +40,7 @@ def predict(
     click: Annotated[str | None, Parameter(help="A pixel u,v on the target of the first frame.")] = None,
     frame: Annotated[
         list[Path] | None,
-        Parameter(
-            help="A frame's folder, .npz or .ply; may be given several times, with poses.", negative=()
-        ),
+        Parameter(help="A frame's folder, .npz or .ply; several with poses are fused.", negative=()),
     ] = None,
     frame_dir: Annotated[Path | None, Parameter(help="A folder of such frames, taken by name.")] = None,
     camera_height: Annotated[float | None, Parameter(help="Of the camera that took the frame, m.")] = None,
@@ -76,8 +74,8 @@ def predict(
     from train.prediction import predict as scored
     from train.prediction.answer import document, told
 
-    for name, value in (("--base-height", base_height), ("--reach", reach), ("--camera-height", camera_height),
-                        ("--robot-camera-height", robot_camera_height)):  # fmt: skip
+    lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
+    for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
         _refuse_length(name, value)
     if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
         mend = "Give metres a step: 0.001 for millimetres"

@@ -16,10 +16,6 @@ from workers.geometry.mesh import F32, F64
 _LARGEST_M = 0.30
 # Of a mask's pixels, those with depth that must be there to stand for the others.
 _LEAST_SHARE, _LEAST_POINTS = 0.25, 30
-# A target is at least so deep along the sight line as this share of its width across it, or of its height
-# where that is less. It balances boxes, whose tops show their depth, and round things, whose backs are
-# hidden; what lies flat hides nothing (docs/predict.md).
-_DEPTH_OVER_WIDTH = 0.8
 _RIM_PERCENT = 1.0  # left out at either end: noise at the rims
 
 
@@ -76,8 +72,8 @@ def from_nearest(values: F32, known: Bools) -> F32:
 def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     """The box of the target from its visible points (N, 3), the others (M, 3) and the camera (3,), world.
 
-    Across the sight line the middle of what is seen; along it as deep as seen, at least a share of its
-    width or height; in height from the support to the top. InputError where too few points are seen.
+    Across the sight line the middle of what is seen; along it as deep as seen, at least as the
+    smaller of width and height; in height from the support to the top. InputError for too few points.
     """
     middle = np.median(target_m, axis=0)
     kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
@@ -95,7 +91,8 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     )
     width = left - right
     support = _support_under(others_m, kept[:, :2].mean(axis=0), width / 2 + 0.12, low)
-    deep = max(back - front, _DEPTH_OVER_WIDTH * min(width, top - support))
+    # Tops show how deep boxes are; the backs of round things are hidden; what lies flat hides nothing.
+    deep = max(back - front, min(width, top - support))
     centre_xy = (front + deep / 2) * ahead + (left + right) / 2 * across
     centre = np.array([*centre_xy, (top + support) / 2])
     corners = np.concatenate([kept, np.column_stack([kept[:, :2], np.full(len(kept), support)])])

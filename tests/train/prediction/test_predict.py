@@ -1,0 +1,260 @@
+"""The whole way from a frame to scores, held against the stored cloud of the same scene."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.specification import CandidateParams
+from tests.train.prediction.seen_scenes import Seen, draw_seen, sensor_frame, write_frame
+from train.baselines.analytic import Analytic
+from train.inputs import Array, Batch
+from train.prediction import RobotSize, load_scorer, predict, read_place
+from train.prediction.candidates import STATES
+from train.prediction.ground import level_pose
+from train.prediction.predict import Prediction
+from train.scorers import ModelScorer, Scorer
+from workers.bases.clearance import base_clearance_m
+from workers.geometry.mesh import F64
+from workers.geometry.transforms import inverse, yaw_pose
+
+ROBOT = RobotSize(camera_height_m=1.2, base_height_m=0.7, arm_reach_m=0.9)
+GRID = 9
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "predict.md"
+
+
+def of(scorer: Scorer, *frames: object, **more: object) -> Prediction:
+    return predict(scorer, list(frames), ROBOT, grid=GRID, **more)  # type: ignore[arg-type]
+
+
+def stored_scores(scorer: Scorer, seen: Seen, prediction: Prediction) -> F64:
+    """Scores on the cloud that the scene stores, of bases at the same offsets from the target."""
+
+    class Kept:
+        name, threshold = "kept", 0.5
+        batch: Batch[Array]
+
+        def score(self, batch: Batch[Array]) -> F64:
+            cloud = seen.scene.cloud
+            clouds = replace(
+                batch.clouds,
+                points_m=cloud.points_m[None].astype(np.float32),
+                rgb=cloud.rgb[None],
+                target_mask=cloud.target_mask[None],
+                n_points=np.array([cloud.n], np.int64),
+                target_height_m=np.array([seen.scene.target_center_m[2]], np.float32),
+                target_radius_m=np.array([seen.scene.rays.radii_m[0]], np.float32),
+            )
+            return scorer.score(replace(batch, clouds=clouds))
+
+    return predict(Kept(), prediction.frames, ROBOT, grid=GRID).score
+
+
+def off(ours: F64, theirs: F64) -> float:
+    """How far apart two score maps of one grid are: mean difference over what they vary by."""
+    assert theirs.std() > 1e-3
+    return float(np.abs(ours - theirs).mean() / theirs.std())
+
+
+@pytest.fixture(scope="module")
+def sampling(seen: Seen, scorer: ModelScorer) -> float:
+    """What another random sample of the same points does to the scores of this untrained model."""
+    maps = [of(scorer, sensor_frame(seen), seed=seed).score for seed in range(4)]
+    return max(off(a, b) for a, b in combinations(maps, 2))
+
+
+def test_a_frame_gives_the_scores_of_the_stored_cloud(
+    seen: Seen, scorer: ModelScorer, sampling: float
+) -> None:
+    centre = seen.scene.target_center_m
+    exact = of(scorer, sensor_frame(seen), target_center_m=centre)
+    theirs = stored_scores(scorer, seen, exact)
+    assert off(exact.score, theirs) < 1.3 * sampling
+    assert exact.cloud.n == seen.scene.cloud.n == 4096
+    assert exact.target_points >= 256
+    estimated = of(scorer, sensor_frame(seen))
+    assert np.linalg.norm(estimated.center_m - centre) < 0.015
+    assert estimated.target.radius_m == pytest.approx(seen.scene.rays.radii_m[0], rel=0.15)
+    assert off(estimated.score, theirs) < 1.5 * sampling
+    noisy = of(scorer, sensor_frame(seen.noisy()))
+    assert np.linalg.norm(noisy.center_m - centre) < 0.03
+    assert noisy.missing_depth is not None and noisy.missing_depth > 0.005
+    assert off(noisy.score, theirs) < 2 * sampling
+
+
+def test_a_rule_over_the_observed_cloud_says_the_same_of_both(seen: Seen) -> None:
+    rule = Analytic(only_clear=False)
+    for shot, centre, most in (
+        (seen, seen.scene.target_center_m, 0.1),
+        (seen, None, 0.15),
+        (seen.noisy(), None, 0.3),
+    ):
+        ours = of(rule, sensor_frame(shot), target_center_m=centre)
+        theirs = stored_scores(rule, seen, ours)
+        assert off(ours.score, theirs) < most
+        shifted = np.roll(theirs.reshape(GRID, GRID), 1, axis=1).ravel()
+        assert off(ours.score, shifted) > 2 * most or most > 0.2
+
+
+def test_the_cloud_has_the_form_of_a_stored_one(seen: Seen, scorer: ModelScorer) -> None:
+    stored, cloud = seen.scene.cloud, of(scorer, sensor_frame(seen)).cloud
+    assert cloud.points_m.dtype == stored.points_m.dtype and cloud.points_m.shape == stored.points_m.shape
+    points = cloud.points_m[:512].astype(np.float64)
+    gaps = [np.linalg.norm(points[:k] - points[k], axis=1).min() for k in range(1, 512)]
+    assert all(b <= a + 2e-3 for a, b in pairwise(gaps)), "not in farthest-point order"
+    assert np.linalg.norm(cloud.points_m.astype(np.float64), axis=1).max() < 1.001
+    share = cloud.target_mask.sum() / stored.target_mask.sum()
+    assert 0.9 < share < 1.1
+
+
+def test_a_real_house_gives_the_scores_of_its_stored_cloud(assets: Path, scorer: ModelScorer) -> None:
+    real = draw_seen(5, 77, f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}")
+    answer = of(scorer, sensor_frame(real))
+    assert np.linalg.norm(answer.center_m - real.scene.target_center_m) < 0.03
+    again = of(scorer, sensor_frame(real), seed=1)
+    theirs = stored_scores(scorer, real, answer)
+    assert off(answer.score, theirs) < 2 * max(off(again.score, answer.score), off(again.score, theirs))
+    rule = Analytic(only_clear=False)
+    by_rule = of(rule, sensor_frame(real))
+    assert off(by_rule.score, stored_scores(rule, real, by_rule)) < 0.3
+
+
+@pytest.mark.parametrize(("quarters", "x", "y"), [(1, 0.0, 0.0), (2, -3.0, 17.5), (3, 8.0, -0.3)])
+def test_scores_turn_with_the_world(
+    quarters: int, x: float, y: float, seen: Seen, scorer: ModelScorer
+) -> None:
+    before = of(scorer, sensor_frame(seen))
+    T = yaw_pose(x, y, 0.0, quarters * np.pi / 2)
+    after = of(scorer, sensor_frame(seen, T @ seen.camera.T_world_camera))
+    np.testing.assert_allclose(after.center_m, (T @ [*before.center_m, 1])[:3], atol=1e-4)
+    # The grid's places are turned into one another, and each takes its score along.
+    turned = before.places.offset_m @ T[:2, :2].T.astype(np.float32)
+    gaps = np.linalg.norm(turned[:, None] - after.places.offset_m, axis=2)
+    row = gaps.argmin(axis=1)
+    assert gaps.min(axis=1).max() < 1e-5
+    assert off(after.score[row], before.score) < 0.05
+    assert off(after.score, before.score) > 0.2
+    away = np.linalg.norm(before.places.offset_m, axis=1) > 0.01
+    turns = (after.yaw_rad[row] - before.yaw_rad - quarters * np.pi / 2)[away]
+    np.testing.assert_allclose(np.cos(turns), 1, atol=1e-5)
+    assert (after.places.state[row] == before.places.state).mean() > 0.95
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_the_floor_in_the_picture_serves_as_well_as_a_pose(
+    noise: bool, seen: Seen, scorer: ModelScorer, sampling: float
+) -> None:
+    shot = seen.noisy() if noise else seen
+    up = seen.camera.T_world_camera[2, :3]
+    level = of(scorer, sensor_frame(shot, level_pose(up, seen.height_m)))
+    found = of(scorer, sensor_frame(shot, posed=False), camera_height_m=seen.height_m + 0.01)
+    fallen = of(scorer, sensor_frame(shot, posed=False), camera_height_m=seen.height_m, gravity=-9.8 * up)
+    for other in (found, fallen):
+        T = other.grounds[0].T_world_camera
+        assert np.degrees(np.arccos(min(1.0, T[2, :3] @ up))) < 0.7
+        assert np.linalg.norm(other.center_m - level.center_m) < 0.02
+        assert off(other.score, level.score) < 1.5 * sampling
+    assert "floor's plane" in found.grounds[0].how
+    assert found.grounds[0].residual_m is not None and found.grounds[0].residual_m < 0.02
+
+
+def test_a_frame_fused_with_itself_says_the_same(seen: Seen, scorer: ModelScorer, sampling: float) -> None:
+    one, twice = of(scorer, sensor_frame(seen)), of(scorer, sensor_frame(seen), sensor_frame(seen))
+    assert len(twice.seen) < len(one.seen)
+    assert np.linalg.norm(twice.center_m - one.center_m) < 0.005
+    assert off(twice.score, one.score) < 2 * sampling
+
+
+def test_a_second_frame_shows_more(seen: Seen, scorer: ModelScorer) -> None:
+    centre, eye = seen.scene.target_center_m, seen.camera.T_world_camera[:3, 3]
+    across = np.array([-(eye - centre)[1], (eye - centre)[0], 0.6])
+    other = seen.turned_to(centre + across)
+    one = of(scorer, sensor_frame(seen))
+    both = of(scorer, sensor_frame(seen), sensor_frame(other, mask=False))
+    assert both.crop_seen > one.crop_seen
+    assert np.linalg.norm(both.center_m - centre) < 0.015
+    # The frame without a mask adds what it saw of the target's other side, and of nothing else.
+    singly = [of(scorer, sensor_frame(shot)).seen for shot in (seen, other)]
+    truth = np.concatenate([cloud.points_m[cloud.on_target] for cloud in singly])
+    marked = both.seen.points_m[both.seen.on_target]
+    gaps = np.linalg.norm(marked[:, None] - truth[None, ::3], axis=2).min(axis=1)
+    assert (gaps < 0.01).mean() > 0.95
+    assert len(marked) > int(one.seen.on_target.sum()) * 0.5
+
+
+def test_places_are_what_the_house_says(seen: Seen, scorer: ModelScorer) -> None:
+    answer = predict(scorer, [sensor_frame(seen)], ROBOT)
+    n = len(answer.score)
+    free = base_clearance_m(
+        answer.base_xy_m.astype(np.float32),
+        np.full(n, ROBOT.base_height_m, np.float32),
+        np.full(n, ROBOT.camera_height_m, np.float32),
+        seen.scene.house.obstacles,
+        CandidateParams(),
+    )
+    blocked, clear = (answer.places.state == STATES.index(name) for name in ("blocked", "clear"))
+    assert blocked.sum() > 20 and clear.sum() > 5
+    assert (free[blocked] < 0.02).mean() > 0.95
+    assert (free[clear] > -0.05).mean() > 0.95
+
+
+def test_the_best_is_clear_and_its_poses_agree(seen: Seen, scorer: ModelScorer) -> None:
+    answer = of(scorer, sensor_frame(seen))
+    assert answer.best is not None
+    clear = answer.rows("clear")
+    assert answer.best == clear[0] and answer.score[answer.best] == answer.score[clear].max()
+    T = answer.T_world_base(answer.best)
+    np.testing.assert_allclose(T[:3, 3], [*answer.base_xy_m[answer.best], ROBOT.base_height_m], atol=1e-6)
+    towards = answer.center_m[:2] - T[:2, 3]
+    np.testing.assert_allclose(T[:2, 0], towards / np.linalg.norm(towards), atol=1e-5)
+    back = answer.grounds[0].T_world_camera @ answer.T_camera_base(answer.best)
+    np.testing.assert_allclose(back, T, atol=1e-9)
+    np.testing.assert_allclose(inverse(T) @ back, np.eye(4), atol=1e-9)
+
+
+def test_unseen_places_are_chosen_only_when_asked(seen: Seen, scorer: ModelScorer) -> None:
+    table = sensor_frame(seen)
+    low = np.flatnonzero((table.points_m @ seen.camera.T_world_camera[:3, :3].T)[:, 2] + seen.height_m > 0.3)
+    assert table.on_target is not None
+    frame = replace(
+        table, points_m=table.points_m[low], rgb=table.rgb[low], on_target=table.on_target[low], image=None
+    )
+    strict, lax = of(scorer, frame), of(scorer, frame, allow_unseen=True)
+    assert strict.best is None and strict.margin is None and "no answer" in strict.sure
+    assert lax.best is not None and lax.best == strict.rows("unseen")[0]
+    assert "not seen" in lax.sure
+
+
+def test_missing_depth_on_the_target_is_filled_and_told(seen: Seen, scorer: ModelScorer) -> None:
+    whole = sensor_frame(seen)
+    assert whole.image is not None and whole.image.mask is not None
+    holes = whole.image.mask & (np.random.default_rng(0).random(whole.image.mask.shape) < 0.5)
+    shot = Seen(seen.scene, replace(seen.frame, depth_m=np.where(holes, np.float32(0), seen.frame.depth_m)))
+    answer = of(scorer, sensor_frame(shot))
+    assert answer.filled is not None and answer.filled.missing_pixels == holes.sum()
+    assert any("had no depth" in note for note in answer.notes)
+    assert np.linalg.norm(answer.center_m - of(scorer, whole).center_m) < 0.01
+
+
+def test_the_five_lines_of_the_page(seen: Seen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    from tests.train.prediction.checkpoints import write_untrained
+    from tests.train.prediction.seen_scenes import MODEL
+
+    folder = write_frame(tmp_path / "frame", seen)
+    write_untrained(folder / "model.ckpt", MODEL)
+    monkeypatch.chdir(folder)
+    code = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert code is not None
+    assert len([line for line in code[1].splitlines() if line.strip()]) <= 6
+    names: dict[str, object] = {}
+    exec(code[1], names)
+    assert isinstance(names["answer"], Prediction)
+    reread = read_place(folder)
+    assert isinstance(load_scorer(folder / "model.ckpt").model, torch.nn.Module) and reread.image is not None
