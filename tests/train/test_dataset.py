@@ -17,9 +17,9 @@ from schemas.errors import InputError
 from schemas.run import Run
 from schemas.sealing import seal
 from tests.train.stream_runs import HOUSES, ROBOT_FIELDS, make_stream_run, stream_rows
-from train.augment import Augmentation, ColourJitter, PointDropout, Rotation
+from train.augment import Augmentation, ColourJitter, PointDropout, Rotation, SensorNoise
 from train.dataset import SampleStream
-from train.inputs import Array, Batch
+from train.inputs import Array, Batch, mount_distance_m
 
 N, SCENES, SHARDS = 113, 19, 7
 CHANGES = Augmentation(dropout=PointDropout(), colour=ColourJitter(), rotation=Rotation())
@@ -110,6 +110,26 @@ def test_a_batch_has_the_stored_rows_in_the_targets_frame(run: Run, place: str):
             assert b.extra["object_name"][row].tolist() == scene["object_name"].tolist()
 
 
+def test_frames_of_a_real_run_are_those_that_a_batch_names(heuristic_run: Path):
+    """Distances that the run stores follow from a batch; its camera sees the cloud, which noise keeps."""
+    extra = ("mount_distance_m", "T_world_camera", "target_center_m")
+    plain, noisy = (
+        SampleStream([heuristic_run], extra=extra, augment=augment)
+        for augment in (None, Augmentation(noise=SensorNoise()))
+    )
+    (before,), (after,) = plain.epoch(0), noisy.epoch(0)
+    assert len(before.robots) == 4 * len(before.clouds) == 48
+    distance_m = mount_distance_m(before.clouds, before.robots, before.candidates)
+    np.testing.assert_allclose(distance_m, before.extra["mount_distance_m"], atol=1e-5)
+    for row, n in enumerate(before.clouds.n_points):
+        T = before.extra["T_world_camera"][row]
+        sight_m = before.clouds.points_m[row, :n] + before.extra["target_center_m"][row] - T[:3, 3]
+        depth_m = sight_m @ T[:3, 2]
+        assert depth_m.min() > 0.1
+        moved_m = np.linalg.norm(after.clouds.points_m[row, :n] - before.clouds.points_m[row, :n], axis=1)
+        assert 0 < moved_m.max() < 6 * 0.0026 * (depth_m * np.linalg.norm(sight_m, axis=1)).max()
+
+
 @given(OPTIONS, st.integers(1, 4), st.integers(0, 5))
 @few
 def test_ranks_together_give_every_sample_once(place: str, options: dict[str, Any], world: int, k: int):
@@ -196,11 +216,13 @@ def test_reading_ahead_is_bounded_and_ends_with_the_iterator(place: str):
 
 
 def test_houses_choose_the_scenes(place: str):
-    stream = SampleStream([place], houses=lambda house: house in ("house-1", "house-3"), extra=("house_id",))
+    extra = ("house_id", "scene_index")
+    stream = SampleStream([place], houses=lambda house: house in ("house-1", "house-3"), extra=extra)
     assert stream.house_ids() == {"house-1", "house-3"}
     assert {h for b in stream.epoch(0) for h in b.extra["house_id"]} == stream.house_ids()
     assert stream.n_scenes == sum(i % HOUSES in (1, 3) for i in range(SCENES))
-    whole = SampleStream([place])
+    whole = SampleStream([place], extra=extra)
+    assert scenes_of(stream.epoch(0)).items() <= scenes_of(whole.epoch(0)).items()
     labels = np.concatenate([b.label for b in whole.epoch(0)])
     assert whole.class_counts() == ((labels == 0).sum(), (labels == 1).sum())
     assert sum(stream.class_counts()) == stream.n_samples
