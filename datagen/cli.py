@@ -45,6 +45,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "show": ("datagen.show:show", "A picture of one scene of a run."),
     "train": ("datagen.train:train", "Train a model on labels: stage 1, stage 2, or sim labels alone."),
     "evaluate": ("datagen.evaluate:evaluate", "How good models are, beside baselines and the paper."),
+    "predict": ("datagen.predict:predict", "A base pose from a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
 }
