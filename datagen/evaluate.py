@@ -24,20 +24,22 @@ def evaluate(
     *,
     candidates: Annotated[
         list[Literal["grid", "clear", "in-range"]] | None,
-        Parameter(
-            negative=(), help="Sets of candidates to tell of; again for more [all that the runs hold]."
-        ),
+        Parameter(negative=(), help="A set of candidates to tell of; repeat it for more [all in the runs]."),
     ] = None,
     fit: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="Runs in validation houses, on which baselines are fitted."),
+        Parameter(negative=(), help="A run in validation houses, to fit baselines on; repeat it for more."),
     ] = None,
     baselines: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="Which baselines stand beside the models, or none [all that can]."),
+        Parameter(negative=(), help="A baseline beside the models, or none; repeat it for more [all]."),
     ] = None,
     detector: Annotated[
         Path | None, Parameter(help="Folder of a zero-shot object detector, for the baseline with one.")
+    ] = None,
+    heuristic: Annotated[
+        Path | None,
+        Parameter(help="Parameters of the analytic baseline, as `datagen calibrate` writes them."),
     ] = None,
     bootstrap: Annotated[
         int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
@@ -62,7 +64,7 @@ def evaluate(
     import numpy as np
 
     from datagen.evaluating.contestants import open_models
-    from datagen.evaluating.lineup import open_baselines
+    from datagen.evaluating.lineup import line_up, read_heuristic
     from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
     from datagen.evaluating.report import evaluation_report
     from datagen.evaluating.tables import print_evaluation
@@ -79,10 +81,9 @@ def evaluate(
     models = open_models(checkpoints)
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
-    others, fitted_on = open_baselines(baselines, fit or [], detector)
-    if not allow_seen_houses:
-        refuse_seen_houses(opened, [], fitted_on)
-    contestants = [*others, *models]
+    rule = read_heuristic(heuristic) if heuristic is not None else None
+    lineup = line_up(baselines, fit or [], detector, rule, seed, opened, allow_seen_houses)
+    contestants = [*lineup.baselines, *models]
     if not contestants:
         mend = "Name a checkpoint, or leave --baselines out"
         raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
@@ -96,10 +97,18 @@ def evaluate(
 
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
-        gathered = gather(batches, [c.scorer for c in contestants], rng, seen=step)
-    houses = fitted_on.union(*(model.houses for model in models))
+        gathered = gather(batches, {c.name: c.scorer for c in contestants}, rng, seen=step)
+    houses = lineup.houses.union(*(model.houses for model in models))
     report = evaluation_report(
-        gathered, contestants, opened, sets, seen_houses=houses, fit=fit or [], resamples=bootstrap, seed=seed
+        gathered,
+        contestants,
+        opened,
+        sets,
+        seen_houses=houses,
+        fit=fit or [],
+        left_out=lineup.left_out,
+        resamples=bootstrap,
+        seed=seed,
     )
     if html is not None:
         from datagen.evaluating.page import page_of

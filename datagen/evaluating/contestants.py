@@ -1,10 +1,10 @@
-"""Who is evaluated: models by their checkpoints, and baselines."""
+"""Who is evaluated: models by their checkpoints, and baselines by their names."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from schemas.errors import InputError
@@ -20,11 +20,18 @@ REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 
 @dataclass(frozen=True, eq=False)
 class Contestant:
-    """One method with where it comes from; baselines have neither place nor checkpoint."""
+    """One method with where it comes from.
 
+    Models have a place and a checkpoint, baselines their fitted numbers. `note` is what else has to be
+    said of it wherever it is named.
+    """
+
+    name: str
     scorer: Scorer
     place: str = ""
     head: CheckpointHead | None = None
+    state: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
 
     @property
     def regime(self) -> str:
@@ -34,7 +41,7 @@ class Contestant:
     @property
     def method(self) -> Method:
         """As metrics know it."""
-        return Method(self.scorer.name, self.scorer.threshold, self.regime)
+        return Method(self.name, self.scorer.threshold, self.regime)
 
     @property
     def houses(self) -> frozenset[str]:
@@ -49,12 +56,13 @@ class Contestant:
     def record(self) -> dict[str, Any]:
         """What the report says of it."""
         base = {
-            "name": self.scorer.name,
+            "name": self.name,
             "regime": self.regime or None,
             "threshold": None if self.method.only_picks else self.scorer.threshold,
+            "note": self.note or None,
         }
         if self.head is None:
-            return {**base, "checkpoint": None}
+            return {**base, "checkpoint": None, "state": dict(self.state)}
         head = self.head
         return {
             **base,
@@ -87,7 +95,7 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
             raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
         by_digest[head.digest] = place
     return [
-        Contestant(ModelScorer(model, name), place, head)
+        Contestant(name, ModelScorer(model, name), place, head)
         for (place, model, head), name in zip(loaded, names, strict=True)
     ]
 

@@ -1,15 +1,82 @@
-"""The baselines that stand beside the models."""
+"""The baselines that stand beside the models, fitted where runs to fit them on are named."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.evaluating.contestants import Contestant
+from datagen.evaluating.places import SCENES_PER_BATCH, Place, refuse_no_trials
+from datagen.specifying.specify import read_toml
+from schemas.errors import InputError
+from schemas.specification import HeuristicParams
+from train.baselines import BASELINES, FIELDS, fit_baselines, make_baselines
+from train.dataset import SampleStream
+from train.splits import refuse_shared_houses
+
+NONE = "none"
 
 
-def open_baselines(
-    asked: Sequence[str] | None, fit: Sequence[str], detector: Path | None
-) -> tuple[list[Contestant], frozenset[str]]:
-    """The baselines asked for (all that can be had for None), and the houses that they were fitted on."""
-    return [], frozenset()
+@dataclass(frozen=True, eq=False)
+class Lineup:
+    """Baselines in their order, those left out with the cause, and the houses that numbers come from."""
+
+    baselines: tuple[Contestant, ...]
+    left_out: dict[str, str]
+    houses: frozenset[str]
+
+
+def read_heuristic(path: Path) -> HeuristicParams:
+    """The rule's parameters in a file that `datagen calibrate` wrote. InputError where it has none."""
+    mend = "Give the file that `datagen calibrate` wrote"
+    section = read_toml(path, "--heuristic", mend).get("heuristic")
+    if not isinstance(section, dict):
+        raise InputError(path, "heuristic", "there is no such section", mend)
+    return HeuristicParams.model_validate(section)
+
+
+def line_up(
+    asked: Sequence[str] | None,
+    fit: Sequence[str],
+    detector: Path | None,
+    heuristic: HeuristicParams | None,
+    seed: int,
+    places: Sequence[Place],
+    allow_seen_houses: bool,
+) -> Lineup:
+    """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
+
+    InputError where one that was asked for cannot be had, and where a house of `fit` is one of `places`.
+    """
+    if asked and NONE in asked:
+        if len(asked) > 1:
+            raise InputError("--baselines", NONE, "stands beside others", "Give none alone, or leave it out")
+        return Lineup((), {}, frozenset())
+    names = list(dict.fromkeys(asked or BASELINES))
+    made = make_baselines(names, detector, heuristic, seed)
+    left_out: dict[str, str] = {}
+    houses: frozenset[str] = frozenset()
+    if fit:
+        for place in fit:
+            refuse_no_trials(place)
+        stream = SampleStream(fit, scenes_per_batch=SCENES_PER_BATCH, extra=FIELDS, shuffle=False)
+        if not allow_seen_houses:
+            for place in places:
+                refuse_shared_houses(stream, place.stream)
+        houses = frozenset(stream.house_ids())
+        made = fit_baselines(made, stream.epoch(0))
+    else:
+        why = "its numbers are fitted, and no run to fit them on is named (--fit)"
+        left_out = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
+        if asked and left_out:
+            name = next(iter(left_out))
+            raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
+        made = [b for b in made if not b.needs_fit]
+    # What has to be said of a name stands in brackets behind it.
+    told = [(b, *b.name.partition(" (")[::2]) for b in made]
+    return Lineup(
+        tuple(Contestant(name, b, state=b.state(), note=note.rstrip(")")) for b, name, note in told),
+        left_out,
+        houses,
+    )

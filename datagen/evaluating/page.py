@@ -81,6 +81,8 @@ def _about(report: Report) -> str:
     ]
     if any(record["threshold"] is None for record in report["methods"]):
         lines.append("* has no threshold: its pick of a robot's candidates is good, all others are bad.")
+    lines += [f"{escape(r['name'])}: {escape(r['note'])}." for r in report["methods"] if r["note"]]
+    lines += [f"{escape(name)} is left out: {escape(why)}." for name, why in report["left_out"].items()]
     return "".join(f"<p class=note>{line}</p>" for line in lines)
 
 

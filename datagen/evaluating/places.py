@@ -86,6 +86,7 @@ def open_places(places: Sequence[str]) -> list[Place]:
     by_scenes: dict[str, str] = {}
     kinds: dict[str, str] = {}
     for place in places:
+        refuse_no_trials(place)
         specs = tuple(run.manifest.spec for run in open_runs(place))
         for spec in specs:
             _refuse_other_labels(place, spec.label_source, kinds)
@@ -98,10 +99,16 @@ def open_places(places: Sequence[str]) -> list[Place]:
     return opened
 
 
+def refuse_no_trials(place: str) -> None:
+    """InputError where a run's labels are neither simulated nor planned."""
+    for run in open_runs(place):
+        source = run.manifest.spec.label_source
+        if source not in _WITH_OUTCOMES:
+            problem = f"{source} labels, and methods are held against simulated ones"
+            raise InputError(place, "label_source", problem, "Name a run of `datagen submit sim`, or plan")
+
+
 def _refuse_other_labels(place: str, source: str, kinds: dict[str, str]) -> None:
-    if source not in _WITH_OUTCOMES:
-        problem = f"{source} labels, and methods are held against simulated ones"
-        raise InputError(place, "label_source", problem, "Name a run of `datagen submit sim`, or plan")
     kinds.setdefault(source, place)
     if len(kinds) > 1:
         (first, at), (second, _) = kinds.items()
@@ -121,15 +128,13 @@ def sets_of(places: Sequence[Place], asked: Sequence[str]) -> list[str]:
     return [name for name in CANDIDATE_SETS if name in asked] if asked else offered
 
 
-def refuse_seen_houses(
-    places: Sequence[Place], contestants: Iterable[Contestant], fitted_on: frozenset[str] = frozenset()
-) -> None:
-    """InputError that names a house of these runs on which somebody was trained or fitted."""
+def refuse_seen_houses(places: Sequence[Place], contestants: Iterable[Contestant]) -> None:
+    """InputError that names a house of these runs on which somebody was trained."""
     mend = "Evaluate a run of another split, or say --allow-seen-houses, which tells of them apart"
-    by = [(f"{c.scorer.name} ({c.place})", c.houses) for c in contestants]
+    by = [(f"{c.name} ({c.place})", c.houses) for c in contestants]
     for place in places:
         here = place.stream.house_ids()
-        for who, houses in (*by, ("baselines (--fit)", fitted_on)):
+        for who, houses in by:
             if shared := sorted(here & houses):
                 problem = f"{shared[0]!r} and {len(shared) - 1} more: {who} has seen them in training"
                 if len(shared) == 1:

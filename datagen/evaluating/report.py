@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ def evaluation_report(
     *,
     seen_houses: frozenset[str],
     fit: Sequence[str],
+    left_out: Mapping[str, str],
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -52,11 +53,12 @@ def evaluation_report(
         "methods": [
             {
                 **c.record(),
-                "seconds": gathered.seconds[c.scorer.name],
-                "seconds_per_600": gathered.seconds[c.scorer.name] * paper.TIMED_CANDIDATES / n,
+                "seconds": gathered.seconds[c.name],
+                "seconds_per_600": gathered.seconds[c.name] * paper.TIMED_CANDIDATES / n,
             }
             for c in contestants
         ],
+        "left_out": dict(left_out),
         "bootstrap": {"resamples": resamples, "seed": seed, "level": LEVEL, "by": "scene"},
         "candidates": list(sets),
         "seen_houses": sorted(set(columns.house[is_seen].tolist())),

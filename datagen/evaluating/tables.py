@@ -48,6 +48,8 @@ def print_evaluation(report: Report) -> None:
     ]
     if any(record["threshold"] is None for record in report["methods"]):
         notes.append(("*", "has no threshold: its pick of a robot's candidates is good, all others are bad"))
+    notes += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]
+    notes += [(name, f"left out: {why}") for name, why in report["left_out"].items()]
     print_rows("notes", notes)
 
 

@@ -157,6 +157,32 @@ def test_houses_that_were_trained_on_are_refused_or_told_apart(
             assert part["left_out"] == {"grid": part["left_out"]["grid"]} and part["grids"] is None
 
 
+def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", str(grids), "--bootstrap", "20", "--candidates", "grid"]
+    report = json_of(capsys, words)
+    names = [method["name"] for method in report["methods"]]
+    assert names == ["proximity", "threshold", "threshold-visibility", "analytic"]
+    assert set(report["left_out"]) == {"distance", "scalars"}
+    assert all("--fit" in why for why in report["left_out"].values())
+    stored = arrays_of(grids)
+    feasible = stored["base_is_clear"] & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    told = report["parts"][0]["sets"]["grid"]["methods"]
+    right = (feasible == (stored["label"] == 1)).mean()
+    assert told["threshold"]["accuracy"]["value"] == pytest.approx(right)
+    assert report["methods"][0]["threshold"] is None and report["methods"][2]["note"]
+    assert cli.run([*words, "--fit", str(grids)]) == 2
+    assert "is trained on too" in capsys.readouterr().err
+    rule = tmp_path / "rule.toml"
+    rule.write_text("[heuristic]\nmu = 0.5\ntau = 0.4\n")
+    chosen = ["--baselines", "distance", "--baselines", "analytic", "--heuristic", str(rule)]
+    report = json_of(capsys, [*words, "--fit", str(grids), "--allow-seen-houses", *chosen])
+    assert [part["houses"] for part in report["parts"]] == ["seen"]
+    distance, analytic = report["methods"]
+    assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
+
+
 def test_models_of_one_regime_are_told_apart_by_number(tmp_path: Path) -> None:
     files = [checkpoint(tmp_path / f"{k}.pt", stage, k) for k, stage in enumerate(("stage2", "stage2", "x"))]
     assert [c.scorer.name for c in open_models(files)] == ["two-stage shared 1", "two-stage shared 2", "x"]
@@ -178,6 +204,10 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
         ([file, run, run], ["sample_id", "comes twice"]),
         ([file, run, "--bootstrap", "0"], ["--bootstrap"]),
         ([file, run, "--seed", "-1"], ["--seed"]),
+        ([file, run, "--baselines", "luck"], ["--baselines: luck: no such baseline"]),
+        ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
+        ([file, run, "--fit", heuristic, "--baselines", "distance"], ["heuristic labels"]),
+        ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
         ([file, run, "--threads", "0"], ["--threads"]),
         ([file, run, "--html", "page.pdf"], ["--html", "not an .html file"]),
         ([file, run, "--html", str(tmp_path / "no" / "page.html")], ["--html", "folder does not exist"]),

@@ -118,29 +118,30 @@ class Gathered:
 
 def gather(
     places: Sequence[tuple[int, Iterable[Batch[Array]]]],
-    scorers: Sequence[Scorer],
+    scorers: Mapping[str, Scorer],
     rng: np.random.Generator,
     n_examples: int = 4,
     seen: Callable[[int], None] = lambda scenes: None,
 ) -> Gathered:
     """Score every candidate of every place by every scorer, a batch at a time.
 
-    A place is (cells of its whole grids, or 0 where it has none; batches with `EXTRA`). Examples are
-    drawn evenly from the scenes with whole grids and a positive. `seen` is told of each batch's scenes.
-    InputError where a score is no number, and where a scene comes twice.
+    Scorers come by the names that they are to have. A place is (cells of its whole grids, or 0 where it
+    has none; batches with `EXTRA`). Examples are drawn evenly from the scenes with whole grids and a
+    positive. `seen` is told of each batch's scenes. InputError where a score is no number, and where a
+    scene comes twice.
     """
     parts: list[dict[str, Any]] = []
-    seconds = dict.fromkeys((s.name for s in scorers), 0.0)
+    seconds = dict.fromkeys(scorers, 0.0)
     kept = _Reservoir(n_examples, rng)
     known: set[bytes] = set()
     n_scenes = n_robots = 0
     for run, (cells, batches) in enumerate(places):
         for batch in batches:
             part = _rows(batch, n_scenes, n_robots)
-            for scorer in scorers:
+            for name, scorer in scorers.items():
                 started_s = time.perf_counter()
-                part[f"score {scorer.name}"] = _checked(scorer, batch)
-                seconds[scorer.name] += time.perf_counter() - started_s
+                part[f"score {name}"] = _checked(scorer, batch)
+                seconds[name] += time.perf_counter() - started_s
             scenes = len(batch.clouds)
             part |= _scenes(batch, run, cells)
             _refuse_twice(batch, part["scene"] - n_scenes, known)
@@ -149,7 +150,7 @@ def gather(
             n_scenes, n_robots = n_scenes + scenes, n_robots + len(batch.robots)
             seen(scenes)
     joined = {name: np.concatenate([p.pop(name) for p in parts]) for name in list(parts[0])}
-    scores = {s.name: joined.pop(f"score {s.name}") for s in scorers}
+    scores = {name: joined.pop(f"score {name}") for name in scorers}
     return Gathered(Columns(**joined, scores=scores), tuple(kept.examples), seconds)
 
 

@@ -14,8 +14,8 @@ SOURCE = "GBPP, arXiv:2509.11594"
 # Accuracy on labels of simulation, by method: Table I, and the three regimes of training of Table II.
 ACCURACY: Mapping[str, float] = {
     "proximity": 0.4691,
-    "geometric threshold": 0.5691,
-    "threshold + detector": 0.6873,
+    "threshold": 0.5691,
+    "threshold-detector": 0.6873,
     "stage1": 0.7675,
     "sim-only": 0.7911,
     "two-stage": 0.8413,

@@ -69,7 +69,7 @@ def test_scenes_and_robots_are_numbered_through_all_places() -> None:
     first, second, third = make_batch(0, [1, 2]), make_batch(2, [1]), make_batch(3, [1, 1])
     told: list[int] = []
     places = [(CELLS, [first, second]), (0, [third])]
-    found = gather(places, [ByX()], np.random.default_rng(0), seen=told.append)
+    found = gather(places, {"x": ByX()}, np.random.default_rng(0), seen=told.append)
     columns = found.columns
     assert told == [2, 1, 2]
     assert columns.scene.tolist() == np.repeat([0, 1, 1, 2, 3, 4], CELLS).tolist()
@@ -89,7 +89,7 @@ def test_scenes_and_robots_are_numbered_through_all_places() -> None:
 def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
     def drawn(seed: int) -> list[int]:
         batches = [make_batch(4 * k, [1, 1, 1, 1]) for k in range(5)]
-        found = gather([(CELLS, batches)], [ByX()], np.random.default_rng(seed), n_examples=5)
+        found = gather([(CELLS, batches)], {"x": ByX()}, np.random.default_rng(seed), n_examples=5)
         return [example.scene for example in found.examples]
 
     assert drawn(0) == drawn(0)
@@ -101,9 +101,9 @@ def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
 def test_a_score_that_is_no_number_and_a_run_named_twice_are_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="x: score: no score for sample 0301"):
-        gather([(0, [make_batch(3, [1])])], [ByX(broken=True)], rng)
+        gather([(0, [make_batch(3, [1])])], {"x": ByX(broken=True)}, rng)
     with pytest.raises(InputError, match="03000000000000000000000000000000 comes twice"):
-        gather([(0, [make_batch(3, [1])]), (0, [make_batch(3, [1])])], [ByX()], rng)
+        gather([(0, [make_batch(3, [1])]), (0, [make_batch(3, [1])])], {"x": ByX()}, rng)
 
 
 def test_candidate_sets_hold_what_their_names_say() -> None:
