@@ -30,7 +30,7 @@ def rate_at(step: int, steps: int, highest: float, warmup: float) -> float:
     """Rate of step 0 .. steps - 1: up on a line over the share `warmup`, then a cosine down to 1%."""
     rising = max(1, round(warmup * steps))
     if step < rising:
-        return highest * (step + 1) / rising
+        return highest * ((step + 1) / rising)
     along = (step - rising) / max(1, steps - rising)
     return highest * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * along)))
 
