@@ -28,9 +28,9 @@ Ints = npt.NDArray[np.integer[Any]]
 
 _CELLS = 16  # of a window, each way
 _TARGET_POINTS = 128  # that stand for the target's observed side
-# A disc reaches half as far as the eighth neighbour, where discs just close a surface: docs/baselines.md.
+# A disc reaches about half as far as the eighth neighbour, so that discs just close a surface.
 _NEIGHBOURS = 8
-_DISC_SHARE = 0.5
+_DISC_SHARE = 0.55
 _LARGEST_DISC_M = 0.06
 _MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
 _NEAREST_M = 0.02  # to an eye; points before it are the robot's own
@@ -81,11 +81,11 @@ def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) ->
     near = np.zeros(len(others_m), np.bool_)
     for view in views:
         near |= view.near_line(others_m, _LARGEST_DISC_M).any(0)
-    discs = _discs(others_m[near])
+    discs = _discs(others_m, near)
     for rows, view in zip(blocks, views, strict=True):
         front_m = _closed(view.nearest_m(whole_m))
         on_target = front_m > -np.inf
-        seen = on_target & ~view.hidden(discs, front_m)
+        seen = on_target & ~_majority(view.hidden(discs, front_m), on_target)
         share[rows] = seen.sum((1, 2)) / np.maximum(on_target.sum((1, 2)), 1)
     return share
 
@@ -102,17 +102,17 @@ class _Discs:
         return len(self.radius_m)
 
 
-def _discs(points_m: F32) -> _Discs:
-    """A disc for each point, in the plane of its neighbours and as large as they are far."""
-    n = len(points_m)
-    if n <= _NEIGHBOURS:  # too few to tell a surface
+def _discs(points_m: F32, asked: Bools) -> _Discs:
+    """A disc for each asked point (M,), in the plane of its neighbours and as large as they are far."""
+    if len(points_m) <= _NEIGHBOURS or not asked.any():  # too few to tell a surface
         return _Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
-    distance_m, row = KDTree(points_m).query(points_m, _NEIGHBOURS + 1)
+    centre_m = points_m[asked]
+    distance_m, row = KDTree(points_m).query(centre_m, _NEIGHBOURS + 1)
     around_m = points_m[row]
     around_m = around_m - around_m.mean(1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around_m, around_m))
     radius_m = np.minimum(_DISC_SHARE * distance_m[:, -1], _LARGEST_DISC_M)
-    return _Discs(points_m, axes[:, :, 0].astype(np.float32), radius_m.astype(np.float32))
+    return _Discs(centre_m, axes[:, :, 0].astype(np.float32), radius_m.astype(np.float32))
 
 
 class Views:
@@ -205,6 +205,16 @@ def _closed(depths_m: F32) -> F32:
     full = np.pad(grown > -np.inf, ((0, 0), (1, 1), (1, 1)), constant_values=True)
     inside = np.logical_and.reduce([full[:, 1:-1, 1:-1], *_beside(full)])
     return np.where((depths_m > -np.inf) | inside, grown, -np.inf).astype(np.float32)
+
+
+def _majority(hidden: Bools, on_target: Bools) -> Bools:
+    """Hidden where most of the target's cells around a cell are: holes between points close, specks go."""
+    counts: list[Array] = []
+    for cells in (hidden, on_target):
+        padded = np.pad(cells.astype(np.int8), ((0, 0), (1, 1), (1, 1)))
+        rows = padded[:, 2:] + padded[:, 1:-1] + padded[:, :-2]
+        counts.append(rows[:, :, 2:] + rows[:, :, 1:-1] + rows[:, :, :-2])
+    return 2 * counts[0] > counts[1]
 
 
 def _beside(padded: Array) -> list[Array]:

@@ -34,22 +34,27 @@ class Scorer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelScorer:
-    """A model in evaluation mode: its probability of label 1."""
+    """A model in evaluation mode, whatever mode it is in: its probability of label 1."""
 
     model: Model
     name: str
     threshold: float = 0.5
 
     def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
-        """Probabilities (N,); all of the batch goes through the model at once."""
+        """Probabilities (N,); the model itself goes through its candidates in parts that memory allows."""
         import torch
 
         from train.tensors import to_torch
 
-        with torch.inference_mode():
-            given = to_torch(batch, self.model.device)
-            logits = self.model.score(given.clouds, given.candidates, given.robots).double()
-            return torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
+        trained = self.model.training
+        self.model.eval()
+        try:
+            with torch.inference_mode():
+                given = to_torch(batch, self.model.device)
+                logits = self.model.score(given.clouds, given.candidates, given.robots).double()
+                return torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
+        finally:
+            self.model.train(trained)
 
 
 def use_threads(n: int) -> None:

@@ -25,7 +25,6 @@ FEATURES = (
     *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho", "is_clear"),
 )
 _WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
-_STEPS = 3000
 
 Layer = tuple[F64, F64]  # weights (out, in), bias (out,)
 
@@ -35,6 +34,7 @@ class Scalars:
     """Probability of a good label by two hidden layers of 32; fitted by cross-entropy."""
 
     seed: int = 0
+    steps: int = 3000
     layers: tuple[Layer, ...] = ()  # the first takes the features as they are
 
     name: str = field(default="scalars", init=False)
@@ -58,7 +58,7 @@ class Scalars:
         """Fitted anew; the same for the same batches and seed, whatever torch drew before."""
         label = labels(batches, self.name)
         rows = np.concatenate([features(b) for b in batches])
-        return replace(self, layers=_fitted(rows, label.astype(np.float32), self.seed))
+        return replace(self, layers=_fitted(rows, label.astype(np.float32), self.seed, self.steps))
 
     def state(self) -> dict[str, Any]:
         return {"features": FEATURES, "layers": [[w.tolist(), b.tolist()] for w, b in self.layers]}
@@ -85,7 +85,7 @@ def features(batch: Batch[Array]) -> F64:
     )
 
 
-def _fitted(rows: F64, label: Array, seed: int) -> tuple[Layer, ...]:
+def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]:
     import torch
     from torch import nn
 
@@ -105,8 +105,8 @@ def _fitted(rows: F64, label: Array, seed: int) -> tuple[Layer, ...]:
             nn.Linear(_WIDTH, 1),
         )
     optimiser = torch.optim.AdamW(net.parameters(), lr=_RATE, weight_decay=_DECAY)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
-    for _ in range(_STEPS):
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
         chosen = torch.randint(len(x), (min(_BATCH, len(x)),), generator=draw)
         loss = nn.functional.binary_cross_entropy_with_logits(net(x[chosen])[:, 0], y[chosen])
         optimiser.zero_grad()

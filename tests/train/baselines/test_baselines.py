@@ -1,0 +1,164 @@
+"""What each plain method says, how it is fitted, and that it does so on real runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.errors import InputError
+from schemas.specification import HeuristicParams
+from tests.train.baselines.scenes import make_batch, moved, take
+from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
+from train.baselines.analytic import Analytic
+from train.baselines.baseline import best_cut, is_clear, is_feasible, observed_rho, planar_distance_m
+from train.baselines.detection import ThresholdDetector, spoken_name
+from train.baselines.distance import DistanceBand
+from train.baselines.proximity import Proximity
+from train.baselines.scalars import Scalars
+from train.dataset import SampleStream
+from workers.labels.heuristic import heuristic
+
+
+def balanced(said: np.ndarray, label: np.ndarray) -> float:
+    return float(0.5 * (said[label].mean() + (~said)[~label].mean()))
+
+
+def made() -> list[Baseline]:
+    """One of each, with few steps where there is something to learn."""
+    return [replace(b, steps=100) if isinstance(b, Scalars) else b for b in make_baselines(list(BASELINES))]
+
+
+@pytest.fixture(scope="module")
+def fitted() -> list[Baseline]:
+    return fit_baselines(made(), [make_batch(seed) for seed in range(3)])
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_order_of_candidates_changes_no_score(fitted: list[Baseline], seed: int) -> None:
+    batch = make_batch(seed)
+    rows = np.random.default_rng(seed).permutation(len(batch))
+    for baseline in fitted:
+        shuffled = baseline.score(take(batch, rows))
+        np.testing.assert_allclose(shuffled, baseline.score(batch)[rows], atol=0.02, err_msg=baseline.name)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), share=st.floats(0.1, 0.99))
+def test_closer_is_better_by_proximity_and_never_infeasible_by_threshold(seed: int, share: float) -> None:
+    batch = make_batch(seed)
+    closer = moved(batch, batch.candidates.base_xy_m * share)
+    assert (Proximity().score(closer) > Proximity().score(batch)).all()
+    geometric = BASELINES["threshold"]()
+    assert (geometric.score(closer) >= geometric.score(batch)).all()
+
+
+def test_proximity_picks_the_nearest_clear_one() -> None:
+    batch = make_batch(1)
+    score = Proximity().score(batch)
+    clear = is_clear(batch)
+    best = int(score.argmax())
+    assert clear[best] and planar_distance_m(batch)[best] == planar_distance_m(batch)[clear].min()
+    assert score[~clear].max() < score[clear].min()
+    assert np.isnan(Proximity().threshold)
+
+
+def test_threshold_says_reach_and_clearance() -> None:
+    batch = make_batch(2)
+    geometric = BASELINES["threshold"]()
+    said = geometric.score(batch) >= geometric.threshold
+    assert np.array_equal(said, is_feasible(batch)) and 0 < said.sum() < len(said)
+
+
+def test_analytic_is_the_label_sources_rule_on_the_estimated_visibility() -> None:
+    batch = make_batch(3)
+    params = HeuristicParams(mu=0.6, tau=0.5)
+    d = planar_distance_m(batch).astype(np.float32)
+    expected = heuristic(d, d, d, observed_rho(batch).astype(np.float32), params)[1]
+    everywhere = Analytic(params, only_clear=False)
+    assert np.array_equal(everywhere.score(batch) >= everywhere.threshold, expected == 1)
+    clear_only = Analytic(params)
+    assert np.array_equal(clear_only.score(batch) >= clear_only.threshold, (expected == 1) & is_clear(batch))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), min_size=2, max_size=30))
+def test_best_cut_is_what_trying_all_would_find(rows: list[tuple[int, bool]]) -> None:
+    score, label = np.array([float(s) for s, _ in rows]), np.array([y for _, y in rows])
+    if label.all() or not label.any():
+        return
+    found = balanced(score >= best_cut(score, label), label)
+    assert found == pytest.approx(max(balanced(score >= cut, label) for cut in [*score, 99.0]))
+
+
+def test_distance_finds_the_kind_and_the_band_that_made_the_labels() -> None:
+    batches = [make_batch(seed) for seed in range(4)]
+    band = DistanceBand().fit(batches)
+    assert band.kind == "planar-over-reach" and band.high == pytest.approx(0.8, abs=0.05)
+    test = make_batch(50)
+    assert balanced(band.score(test) >= band.threshold, test.label == 1) > 0.95
+
+
+def test_scalars_learn_and_are_the_same_for_the_same_seed() -> None:
+    batches = [make_batch(seed, n_scenes=6) for seed in range(4)]
+    fitted = Scalars(seed=5, steps=300).fit(batches)
+    test = make_batch(50)
+    assert balanced(fitted.score(test) >= fitted.threshold, test.label == 1) > 0.9
+    again = Scalars(seed=5, steps=300).fit(batches)
+    assert np.array_equal(again.score(test), fitted.score(test))
+    assert not np.array_equal(Scalars(seed=6, steps=300).fit(batches).score(test), fitted.score(test))
+
+
+def test_stand_in_says_that_it_is_one_and_cuts_among_what_is_feasible() -> None:
+    batches = [make_batch(seed) for seed in range(2)]
+    stand_in = ThresholdDetector().fit(batches)
+    assert "stand-in" in stand_in.name
+    score = stand_in.score(batches[0])
+    feasible = is_feasible(batches[0])
+    assert np.array_equal(score[feasible], observed_rho(batches[0])[feasible])
+    assert (score[~feasible] == -1).all() and stand_in.threshold >= 0
+
+
+def test_states_are_json(fitted: list[Baseline]) -> None:
+    for baseline in fitted:
+        assert json.loads(json.dumps(baseline.state())) is not None
+
+
+def test_what_cannot_be_fitted_or_scored_is_said_in_one_line() -> None:
+    batch = make_batch(0)
+    one_class = replace(batch, label=np.zeros_like(batch.label))
+    for name in ("distance", "scalars", "threshold-detector"):
+        with pytest.raises(InputError, match="labels are alike"):
+            BASELINES[name]().fit([one_class])
+    with pytest.raises(InputError, match="no such baseline"):
+        make_baselines(["nearest"])
+    with pytest.raises(InputError, match="not fitted"):
+        Scalars().score(batch)
+    with pytest.raises(InputError, match="base_is_clear"):
+        Proximity().score(replace(batch, extra={}))
+
+
+def test_fits_on_a_run_and_scores_it(sim_run: Path) -> None:
+    batches = list(SampleStream([sim_run], extra=FIELDS, shuffle=False).epoch(0))
+    label = np.concatenate([b.label for b in batches])
+    assert 0 < label.sum() < len(label)
+    for baseline in fit_baselines(made(), batches):
+        score = np.concatenate([baseline.score(b) for b in batches])
+        assert score.shape == label.shape and np.isfinite(score).all()
+    scalars = Scalars(steps=500).fit(batches)
+    said = np.concatenate([scalars.score(b) for b in batches]) >= scalars.threshold
+    assert (said == (label == 1)).mean() > 0.9  # more numbers than samples: it can know them by heart
+
+
+@pytest.mark.parametrize(
+    ("name", "spoken"),
+    [("003_cracker_box", "cracker box"), ("mug", "mug"), ("063-a_marbles", "a marbles"), ("077", "077")],
+)
+def test_names_are_spoken(name: str, spoken: str) -> None:
+    assert spoken_name(name) == spoken

@@ -1,0 +1,150 @@
+"""The estimate of rho, held against rays through scenes simple enough to know everything of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from train.observed_visibility import visible_share
+
+RADIUS_M = 0.06
+WALL_M = 0.3  # from the target, across the x axis
+
+
+def sphere(n: int = 256) -> np.ndarray:
+    """Points of the half that a camera at +x sees, in an order of which any prefix covers it."""
+    rng = np.random.default_rng(1)
+    p = rng.normal(size=(n, 3))
+    p *= RADIUS_M / np.linalg.norm(p, axis=1, keepdims=True)
+    p[:, 0] = np.abs(p[:, 0])
+    return p.astype(np.float32)
+
+
+def wall(low_y: float, high_y: float, spacing_m: float = 0.01) -> np.ndarray:
+    """Random points of a wall from the floor to well above the target."""
+    rng = np.random.default_rng(2)
+    n = int((high_y - low_y) * 0.9 / spacing_m**2)
+    y, z = rng.uniform(low_y, high_y, n), rng.uniform(-0.4, 0.5, n)
+    return np.column_stack([np.full(n, WALL_M), y, z]).astype(np.float32)
+
+
+def table(height_m: float, spacing_m: float = 0.015) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    n = int(1.2**2 / spacing_m**2)
+    return np.column_stack([rng.uniform(-0.6, 0.6, (n, 2)), np.full(n, height_m)]).astype(np.float32)
+
+
+def true_share(eye: np.ndarray, low_y: float, high_y: float) -> float:
+    """Of the rays from the eye that hit the sphere, those that miss the wall."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    a, b = (np.array(g).ravel() for g in np.meshgrid(*[np.linspace(-1, 1, 61)] * 2))
+    sine = RADIUS_M / np.linalg.norm(eye)
+    half = sine / np.sqrt(1 - sine**2)
+    rays = forward + half * (a[:, None] * right + b[:, None] * up)
+    rays = rays[a**2 + b**2 < 1]
+    reached = (WALL_M - eye[0]) / np.where(rays[:, 0] == 0, 1e-12, rays[:, 0])
+    at = eye + reached[:, None] * rays
+    stopped = (reached > 0) & (at[:, 1] > low_y) & (at[:, 1] < high_y) & (at[:, 2] > -0.4) & (at[:, 2] < 0.5)
+    # What lies behind the sphere stops no ray to it.
+    stopped &= reached * np.linalg.norm(rays, axis=1) < np.linalg.norm(eye)
+    return 1 - stopped.mean()
+
+
+def share(others: np.ndarray, eye: tuple[float, float, float], target: np.ndarray | None = None) -> float:
+    eyes = np.array([eye], np.float32)
+    return float(visible_share(others, sphere() if target is None else target, RADIUS_M, eyes)[0])
+
+
+NOTHING = np.zeros((0, 3), np.float32)
+
+
+def test_seen_where_nothing_stands_before_it() -> None:
+    assert share(NOTHING, (0.8, 0.1, 0.4)) == 1
+    assert share(wall(-0.3, 0.3), (-0.8, 0.1, 0.4)) == 1  # from the other side
+
+
+def test_hidden_behind_a_wall() -> None:
+    assert share(wall(-0.3, 0.3), (0.8, 0.05, 0.1)) < 0.04
+
+
+def test_half_behind_the_end_of_a_wall() -> None:
+    assert share(wall(0.0, 0.4), (0.8, 0.0, 0.0)) == pytest.approx(0.5, abs=0.12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    low=st.floats(-0.3, 0.1),
+    width=st.floats(0.1, 0.5),
+    angle=st.floats(-0.6, 0.6),
+    eye_m=st.floats(0.6, 1.1),
+    height=st.floats(-0.1, 0.4),
+)
+def test_as_rays_have_it(low: float, width: float, angle: float, eye_m: float, height: float) -> None:
+    eye = np.array([eye_m * np.cos(angle), eye_m * np.sin(angle), height])
+    found = share(wall(low, low + width), tuple(eye))
+    assert found == pytest.approx(true_share(eye, low, low + width), abs=0.2)
+
+
+def test_a_table_hides_what_stands_on_it_only_from_below() -> None:
+    below = table(-RADIUS_M - 0.002)
+    assert share(below, (0.7, 0.1, 0.5)) > 0.95
+    assert share(below, (0.7, 0.1, 0.2)) > 0.9
+    assert share(below, (0.5, 0.1, -0.4)) < 0.3  # its foot is no farther than the margin
+
+
+@settings(max_examples=15, deadline=None)
+@given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 100))
+def test_turning_the_scene_with_the_eyes_changes_nothing(angle: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    eyes = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(0, 0.6, 20)])
+    others, target = wall(-0.2, 0.2), sphere()
+    plain = visible_share(others, target, RADIUS_M, eyes.astype(np.float32))
+    turned = [(a @ turn.T).astype(np.float32) for a in (others, target, eyes)]
+    np.testing.assert_allclose(visible_share(turned[0], turned[1], RADIUS_M, turned[2]), plain, atol=0.06)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 100))
+def test_order_and_company_of_eyes_change_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    eyes = np.column_stack([rng.uniform(-1, 1, (40, 2)), rng.uniform(0, 0.6, 40)]).astype(np.float32)
+    others = np.concatenate([wall(-0.2, 0.2), table(-0.07)])
+    whole = visible_share(others, sphere(), RADIUS_M, eyes)
+    order = rng.permutation(40)
+    np.testing.assert_allclose(
+        visible_share(others, sphere(), RADIUS_M, eyes[order]), whole[order], atol=0.03
+    )
+    alone = [visible_share(others, sphere(), RADIUS_M, eyes[k : k + 1])[0] for k in range(5)]
+    np.testing.assert_allclose(alone, whole[:5], atol=0.03)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 100))
+def test_more_walls_never_show_more(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    eyes = np.column_stack([rng.uniform(0.4, 1, 20), rng.uniform(-0.5, 0.5, 20), rng.uniform(0, 0.5, 20)])
+    left, far = (
+        wall(-0.3, 0.0),
+        wall(0.0, 0.3) + np.array([0.1, 0, 0], np.float32),
+    )  # 10 cm behind: no neighbours
+    one = visible_share(left, sphere(), RADIUS_M, eyes.astype(np.float32))
+    both = visible_share(np.concatenate([left, far]), sphere(), RADIUS_M, eyes.astype(np.float32))
+    assert (both <= one + 1e-9).all()
+
+
+def test_nothing_is_seen_of_what_was_not_observed_or_holds_the_camera() -> None:
+    assert share(NOTHING, (0.8, 0, 0.4), target=NOTHING) == 0
+    assert share(NOTHING, (0.0, 0.0, 0.05)) == 0
+    assert share(NOTHING, (0.0, 0.0, 0.8)) == 1  # straight above: no way is right, and any will do
+
+
+def test_points_that_are_no_numbers_are_left_out() -> None:
+    bad = np.full((3, 3), np.nan, np.float32)
+    assert share(np.concatenate([bad, wall(-0.3, 0.3)]), (0.8, 0.05, 0.1)) < 0.04
+    assert share(bad, (0.8, 0.05, 0.1), target=np.concatenate([bad, sphere()])) == 1
