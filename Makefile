@@ -6,11 +6,13 @@ JOBS ?= 2
 BIN := .venv/bin
 DEMO := build/demo
 
-.PHONY: help demo test faults lint format docs venv clean
+.PHONY: help demo paper-small paper test faults lint format docs venv clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
+	@echo "make paper-small  labels, training and tables on real houses, small (DATAGEN_ASSETS; in build/paper-small)"
+	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make test    format check, lint, types, layers, tests"
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
@@ -32,6 +34,13 @@ demo: venv
 	$(BIN)/datagen status $(DEMO)/run
 	$(BIN)/datagen audit $(DEMO)/run
 	@echo "the picture: $(DEMO)/scene-0.png"
+
+# Both go on where they were stopped.
+paper-small: venv
+	@BIN=$(BIN) scripts/paper.sh small
+
+paper: venv
+	@BIN=$(BIN) scripts/paper.sh full
 
 # Runs are made durable file by file, which a shared disk takes ten times as long for as memory does. What
 # failed stays there to be looked at.

@@ -1,0 +1,122 @@
+#!/usr/bin/env bash
+# The whole story on real houses and objects: labels, a calibrated rule, two stages of training, tables.
+#
+#   scripts/paper.sh small|full [FOLDER]        (make paper-small, make paper)
+#
+# Everything lies below FOLDER (build/paper-small, build/paper). What is done is not made again: the same
+# command goes on where it was stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can
+# be set from outside (HEURISTIC=6000 scripts/paper.sh small FOLDER).
+set -euo pipefail
+ROOT=$(realpath "$(dirname "$0")/..")
+ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
+BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
+SIZE=${1:-small}
+OUT=$(realpath -m "${2:-$ROOT/build/paper$([ "$SIZE" = full ] || echo -small)}")
+
+case $SIZE in
+small)
+    HEURISTIC=${HEURISTIC:-24000}       # labels of the rule, in training houses
+    SIM_IN_RANGE=${SIM_IN_RANGE:-3000}  # trials at clear candidates within reach, in training houses
+    SIM_CLEAR=${SIM_CLEAR:-3000}        # trials at clear candidates, in training houses
+    VAL_IN_RANGE=${VAL_IN_RANGE:-1500}  # the same in validation houses: for the rule, and to stop by
+    VAL_CLEAR=${VAL_CLEAR:-1500}
+    TEST_SCENES=${TEST_SCENES:-24}      # whole grids, in test houses with objects that nothing was trained on
+    EPOCHS_1=${EPOCHS_1:-8}             # at most, of stage 1 ...
+    EPOCHS_2=${EPOCHS_2:-20}            # ... and of the two trainings on trials
+    ;;
+full)
+    HEURISTIC=${HEURISTIC:-180000}
+    SIM_IN_RANGE=${SIM_IN_RANGE:-6000}
+    SIM_CLEAR=${SIM_CLEAR:-6000}
+    VAL_IN_RANGE=${VAL_IN_RANGE:-3000}
+    VAL_CLEAR=${VAL_CLEAR:-3000}
+    TEST_SCENES=${TEST_SCENES:-100}
+    EPOCHS_1=${EPOCHS_1:-12}
+    EPOCHS_2=${EPOCHS_2:-30}
+    ;;
+*)
+    echo "error: $SIZE: no such size. Say small or full" >&2
+    exit 2
+    ;;
+esac
+PER_SCENE=15  # trials in a scene, but for whole grids
+CELLS=625     # of a whole grid
+SEED=100      # each run has one of its own, counted from here
+WORKERS=${WORKERS:-$(nproc)}  # processes that make labels; 0 for none but this one
+FORM=any      # the distance that the calibrated rule may be a function of
+
+if ! [ -f "$ASSETS/ycb/objects.json" ] || ! [ -d "$ASSETS/procthor" ]; then
+    echo "error: $ASSETS: no ycb/ and procthor/ there. Set DATAGEN_ASSETS to a folder that has both" >&2
+    exit 2
+fi
+if ! [ -x "$BIN/datagen" ]; then
+    echo "error: $BIN/datagen: no such program. Call \`make venv\`, or set BIN to an environment's bin/" >&2
+    exit 2
+fi
+mkdir -p "$OUT/runs" "$OUT/models"
+
+step() { printf '\n== %s  (%d min %d s)\n' "$*" $((SECONDS / 60)) $((SECONDS % 60)); }
+datagen() { "$BIN/datagen" "$@"; }
+# submit NAME LABELS SPLIT SEED OBJECTS, then the label source and its options: a run of that name.
+submit() {
+    local name=$1 n=$2 split=$3 seed=$4 objects=$5
+    shift 5
+    step "$name"
+    datagen submit "$@" --n "$n" --split "$split" --seed $((SEED + seed)) --out "$OUT/runs/$name" \
+        --houses "procthor:$ASSETS/procthor" --objects "ycb:$OUT/objects/$objects" --workers "$WORKERS"
+}
+# made_after FILE SOURCE...: whether the file is there and newer than all of them.
+made_after() {
+    local file=$1 source
+    shift
+    [ -s "$file" ] || return 1
+    for source in "$@"; do [ "$file" -nt "$source" ] || return 1; done
+}
+
+# 1. Objects: four fifths to train on, and every fifth, which only the test run has.
+if ! [ -f "$OUT/objects/test/objects.json" ]; then
+    "$BIN/python" "$ROOT/scripts/split_objects.py" "$ASSETS/ycb" "$OUT/objects"
+fi
+
+# 2. Labels: the paper's rule, which is cheap, and trials, which are not. No house is in two splits.
+SOME=(--candidates-per-scene "$PER_SCENE")
+submit heuristic "$HEURISTIC" train 0 train heuristic
+submit train-in-range "$SIM_IN_RANGE" train 1 train sim --candidates in-range "${SOME[@]}"
+submit train-clear "$SIM_CLEAR" train 2 train sim --candidates clear "${SOME[@]}"
+submit val-in-range "$VAL_IN_RANGE" val 3 train sim --candidates in-range "${SOME[@]}"
+submit val-clear "$VAL_CLEAR" val 4 train sim --candidates clear "${SOME[@]}"
+submit test-grid $((TEST_SCENES * CELLS)) test 5 test sim --candidates grid
+
+# 3. What the paper leaves open in its rule, fitted to the trials in validation houses; and labels by it.
+if ! [ -f "$OUT/rule.toml" ]; then
+    step "calibrate"
+    datagen calibrate "$OUT/runs/val-in-range" "$OUT/runs/val-clear" --out "$OUT/rule.toml" \
+        --candidates in-range --distance "$FORM" --split-check
+fi
+step "relabel"
+datagen relabel "$OUT/runs/heuristic" --config "$OUT/rule.toml" --out "$OUT/runs/calibrated"
+
+# 4. Three regimes: the rule's labels alone, trials alone, and trials after the rule's labels.
+TRAIN_SIM=("$OUT/runs/train-in-range" "$OUT/runs/train-clear")
+VAL_SIM=(--val "$OUT/runs/val-in-range" --val "$OUT/runs/val-clear")
+step "stage 1"
+datagen train stage1 "$OUT/runs/calibrated" --out "$OUT/models/stage1.ckpt" --epochs "$EPOCHS_1"
+step "stage 2"
+datagen train stage2 "${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --out "$OUT/models/stage2.ckpt" \
+    --init "$OUT/models/stage1.ckpt" --epochs "$EPOCHS_2"
+step "sim only"
+datagen train sim-only "${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --out "$OUT/models/sim-only.ckpt" \
+    --epochs "$EPOCHS_2"
+
+# 5. Tables I to III, in houses and on objects of which no model and no baseline has seen any.
+MODELS=("$OUT"/models/{stage1,sim-only,stage2}.ckpt)
+FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "$OUT/rule.toml")
+if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then
+    step "evaluate"
+    datagen evaluate "${MODELS[@]}" "$OUT/runs/test-grid" "${FITTED[@]}" --html "$OUT/tables.html" \
+        | tee "$OUT/tables.txt.new"
+    datagen evaluate "${MODELS[@]}" "$OUT/runs/test-grid" "${FITTED[@]}" --json > "$OUT/tables.json.new"
+    mv "$OUT/tables.txt.new" "$OUT/tables.txt"
+    mv "$OUT/tables.json.new" "$OUT/tables.json"
+fi
+step "done: $OUT/tables.html, tables.txt and tables.json; the rule in $OUT/rule.toml"
