@@ -75,7 +75,7 @@ class SharedConfig(ModelConfig):
     width: Width = 64
     embedding: Width = 128
     head: tuple[Width, ...] = Field(default=(128, 64), max_length=8)
-    dropout: float = Field(default=0.2, ge=0, lt=1)
+    dropout: float = Field(default=0.4, ge=0, lt=1)
     camera: Literal["given", "unknown"] = "given"
     observed_visibility: bool = False
     mirrored: bool = True
