@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 
@@ -30,15 +31,12 @@ Bools = npt.NDArray[np.bool_]
 def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
     """A regular file of at most `most` bytes. InputError for what is missing, larger or no file."""
     mend = "Give the path of a file that exists"
-    try:
-        if not path.exists():
-            raise InputError(path, "", "no such file", mend)
-        if not path.is_file():
-            raise InputError(path, "", "not a file", mend)
-        with open(path, "rb") as file:
-            data = file.read(most + 1)
-    except ValueError:  # a NUL in the name
-        raise InputError(repr(str(path)), "", "not the name of a file", mend) from None
+    if "\0" in str(path):
+        raise InputError(repr(str(path)), "", "not the name of a file", mend)
+    if not path.is_file():
+        raise InputError(path, "", "not a file" if path.exists() else "no such file", mend)
+    with open(path, "rb") as file:
+        data = file.read(most + 1)
     if len(data) > most:
         raise InputError(path, "", f"more than {most:,} bytes", "Give a smaller file")
     return data
@@ -128,12 +126,12 @@ def _document(path: Path) -> Node:
 def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
     """A decoded picture. Its size is checked before its pixels are decoded."""
     kinds = " or ".join(formats)
-    read_bytes(path, MAX_FILE_BYTES)
+    data = io.BytesIO(read_bytes(path))
     try:
         with warnings.catch_warnings():
             # Our own limit, checked below, is stricter than the one that warns.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=formats) as image:
+            with Image.open(data, formats=formats) as image:
                 _refuse_size(path, *image.size)
                 image.load()
                 return image.copy() if mode is None else image.convert(mode)

@@ -1,0 +1,326 @@
+"""`datagen predict` as a user meets it: what it writes, and what it refuses in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from datagen import cli
+from tests.refusals import refused
+from tests.small_runs import files_of, json_of
+from tests.train.prediction.checkpoints import write_untrained
+from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
+
+HEIGHT_M = 0.8197  # of the scene's camera
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a frame and a checkpoint. Tests only read it."""
+    folder = tmp_path_factory.mktemp("predict")
+    seen = draw_seen(0)
+    assert seen.height_m == pytest.approx(HEIGHT_M, abs=0.01)
+    write_frame(folder / "frame", seen)
+    write_untrained(folder / "model.ckpt", MODEL)
+    return folder
+
+
+def arguments(folder: Path, *more: str, drop: tuple[str, ...] = ()) -> list[str]:
+    """A whole command line of pictures, with options left out, replaced or added."""
+    frame = folder / "frame"
+    chosen = {
+        "--rgb": str(frame / "color.png"),
+        "--depth": str(frame / "depth.png"),
+        "--intrinsics": str(frame / "intrinsics.json"),
+        "--mask": str(frame / "mask.png"),
+        "--camera-height": str(HEIGHT_M),
+        "--base-height": "0.7",
+        "--reach": "0.9",
+        "--grid": "7",
+    }
+    chosen |= dict(zip(more[::2], more[1::2], strict=True))
+    pairs = [text for name, value in chosen.items() if name not in drop for text in (name, value)]
+    return ["predict", str(folder / "model.ckpt"), *pairs]
+
+
+def test_an_answer_as_json_picture_and_page(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, page = tmp_path / "a.png", tmp_path / "a.html"
+    answer = json_of(capsys, arguments(made, "--out", str(out), "--html", str(page)))
+    assert len(answer["candidates"]) == 49 and answer["best"]["state"] == "clear"
+    scores = [c["score"] for c in answer["candidates"] if c["state"] == "clear"]
+    assert answer["best"]["score"] == max(scores)
+    T = np.array(answer["T_world_camera"][0]) @ answer["best"]["T_camera_base"]
+    np.testing.assert_allclose(T, answer["best"]["T_world_base"], atol=1e-9)
+    assert T[2, 3] == pytest.approx(0.7)
+    assert "ahead" in answer["world"] and answer["floor"]["residual_m"] < 0.02
+    with Image.open(out) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(np.int64)
+    assert (np.abs(pixels - (255, 196, 0)).max(axis=2) < 8).sum() > 200  # the gold pose
+    text = page.read_text()
+    assert "Plotly.newPlot" in text and "score 0." in text and 'src="http' not in text
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
+
+
+def test_a_click_and_the_same_frame_as_folder_archive_and_cloud(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = made / "frame"
+    pose = json.loads((frame / "pose.json").read_text())["T_world_camera"]
+    mask = np.asarray(Image.open(frame / "mask.png")) > 0
+    depth = np.asarray(Image.open(frame / "depth.png"))
+    rgb = np.asarray(Image.open(frame / "color.png"))
+    numbers = json.loads((frame / "intrinsics.json").read_text())
+    four = np.array([numbers[k] for k in ("fx", "fy", "ppx", "ppy")])
+    np.savez(tmp_path / "a.npz", rgb=rgb, depth=depth, mask=mask, intrinsics=four, T_world_camera=pose)
+    v, u = np.nonzero(depth)
+    z = depth[v, u] / 1000
+    xyz = np.stack([(u - four[2]) / four[0] * z, (v - four[3]) / four[1] * z, z], axis=1)
+    rows = np.zeros(len(z), [("p", "<f4", 3), ("c", "u1", 3), ("target", "u1")])
+    rows["p"], rows["c"], rows["target"] = xyz, rgb[v, u], mask[v, u]
+    names = [*(f"float {a}" for a in "xyz"), *(f"uchar {c}" for c in ("red", "green", "blue", "target"))]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(z)}"]
+    head += [f"property {name}" for name in names] + ["element face 0", "end_header", ""]
+    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+
+    rest = ["--base-height", "0.7", "--reach", "0.9", "--grid", "7", "--robot-camera-height", "1.2"]
+    checkpoint = str(made / "model.ckpt")
+    poses = ["--camera-pose", str(frame / "pose.json")]
+    answers = {
+        "folder": ["--frame", str(frame)],
+        "npz": ["--frame", str(tmp_path / "a.npz")],
+        "ply": ["--frame", str(tmp_path / "a.ply"), *poses],
+        "click": arguments(made, drop=("--mask", "--camera-height"))[2:8],
+    }
+    middle = np.argmin((v - np.nonzero(mask)[0].mean()) ** 2 + (u - np.nonzero(mask)[1].mean()) ** 2)
+    answers["click"] += ["--click", f"{u[middle]},{v[middle]}", *poses]
+    found = {name: json_of(capsys, ["predict", checkpoint, *given, *rest]) for name, given in answers.items()}
+    whole = found["folder"]
+    for name, answer in found.items():
+        gap = np.subtract(answer["target"]["center_m"], whole["target"]["center_m"])
+        assert np.linalg.norm(gap) < (0.01 if name == "click" else 1e-5), name
+        if name != "click":
+            ours, theirs = ([c["score"] for c in a["candidates"]] for a in (answer, whole))
+            np.testing.assert_allclose(ours, theirs, atol=1e-4, err_msg=name)
+    assert found["click"]["target"]["mask_pixels"] == pytest.approx(mask.sum(), rel=0.15)
+
+
+def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(arguments(made, "--half-width", "0.1", "--grid", "3")) == 1
+    told = capsys.readouterr().out
+    assert "no answer" in told and "0 clear" in told
+
+
+def write_png(file: Path, width: int, height: int) -> None:
+    """A PNG of a few bytes that claims a size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    body = zlib.compress(b"\0" * 1000)
+    file.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    )
+
+
+def write_npy(file: Path, data: bytes) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth.npy", data)
+
+
+def npy_header(text: str) -> bytes:
+    file = io.BytesIO()
+    padded = text.encode().ljust(117) + b"\n"
+    file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded)
+    return file.getvalue()
+
+
+def bad_files(folder: Path) -> None:
+    """Files of every kind that must be refused."""
+    size = (240, 320)
+    Image.fromarray(np.zeros(size, np.uint8)).save(folder / "black.png")
+    Image.fromarray(np.full((120, 160), 255, np.uint8)).save(folder / "small.png")
+    Image.fromarray(np.zeros(size, np.uint16)).save(folder / "nothing.png")
+    (folder / "cut.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 40)
+    (folder / "text.png").write_text("no picture")
+    write_png(folder / "huge.png", 100_000, 100_000)
+    numbers = {"fx": 307.5, "fy": 307.5, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}
+    for name, change in (
+        ("keys", {"fx": None, "width": None}),
+        ("other", {"width": 640}),
+        ("words", {"fx": "wide"}),
+        ("nan", {"cx": float("nan")}),
+    ):
+        (folder / f"{name}.json").write_text(json.dumps({**numbers, **change}))
+    (folder / "list.json").write_text("[1, 2")
+    T = np.eye(4)
+    T[2, 3] = 1.0
+    poses = {"pose_nan": T * np.nan, "pose_mirror": T * [[-1], [1], [1], [1]], "pose_wide": T * 2}
+    for name, pose in poses.items():
+        (folder / f"{name}.json").write_text(json.dumps({"T_world_camera": pose.tolist()}))
+    (folder / "pose_rows.json").write_text(json.dumps([[1, 0, 0], [0, 1, 0]]))
+
+    vertex = "property float x\nproperty float y\nproperty float z\n"
+    for name, head, body in (
+        ("none", "format ascii 1.0\nelement vertex 0\n" + vertex, b""),
+        ("many", "format binary_little_endian 1.0\nelement vertex 1000000000000\n" + vertex, b"\0" * 100),
+        ("short", "format binary_little_endian 1.0\nelement vertex 1000000\n" + vertex, b"\0" * 100),
+        ("flat", "format ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n", b"0 0\n"),
+        ("words", "format ascii 1.0\nelement vertex 2\n" + vertex, b"1 2 3\n1 b 3 \n"),
+        ("lists", "format ascii 1.0\nelement vertex 2\nproperty list uchar int x\n", b"1 2\n"),
+        ("minus", "format ascii 1.0\nelement vertex -2\n" + vertex, b"1 2\n"),
+    ):
+        (folder / f"{name}.ply").write_bytes(b"ply\n" + head.encode() + b"end_header\n" + body)
+    (folder / "noply.ply").write_text("solid\n")
+
+    np.savez(folder / "objects.npz", depth=np.array([{}, 1], object), allow_pickle=True)
+    np.savez(folder / "other.npz", colours=np.zeros(3))
+    np.savez(folder / "norgb.npz", depth=np.ones((4, 4), np.uint16))
+    write_npy(
+        folder / "claim.npz",
+        npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }"),
+    )
+    write_npy(
+        folder / "bomb.npz",
+        npy_header("{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }") + bytes(200_000_000),
+    )
+    write_npy(folder / "junk.npz", b"junk")
+    (folder / "noarchive.npz").write_text("no archive")
+
+
+# The option that is changed, its value, and words of the refusal. `-` leaves the option out.
+REFUSED: list[tuple[str, str, str]] = [
+    ("--mask", "{bad}/black.png", "selects nothing"),
+    ("--mask", "{bad}/small.png", "160x120"),
+    ("--rgb", "{bad}/small.png", "160x120"),
+    ("--depth", "{bad}/black.png", "16-bit"),
+    ("--depth", "{bad}/nothing.png", "no pixel has depth"),
+    ("--depth", "{bad}/huge.png", "pixels"),
+    ("--depth", "{bad}/cut.png", "not a readable"),
+    ("--depth", "{bad}/text.png", "not a readable"),
+    ("--depth", "{bad}/missing.png", "no such file"),
+    ("--depth", "{bad}", "not a file"),
+    ("--depth", "-", "--depth"),
+    ("--intrinsics", "-", "--intrinsics"),
+    ("--intrinsics", "{bad}/keys.json", "fx, width"),
+    ("--intrinsics", "{bad}/other.json", "640x240"),
+    ("--intrinsics", "{bad}/words.json", "fx"),
+    ("--intrinsics", "{bad}/nan.json", "cx"),
+    ("--intrinsics", "{bad}/list.json", "not JSON"),
+    ("--mask", "-", "--click"),
+    ("--camera-height", "-", "--camera-height"),
+    ("--camera-height", "-1", "--camera-height"),
+    ("--camera-height", "1.9", "--camera-height"),
+    ("--base-height", "nan", "--base-height"),
+    ("--reach", "900", "metres"),
+    ("--depth-scale", "0", "--depth-scale"),
+    ("--grid", "1", "--grid"),
+    ("--half-width", "nan", "--half-width"),
+    ("--gravity", "0,0,0", "--gravity"),
+    ("--gravity", "0,1", "--gravity"),
+    ("--gravity", "0,nan,1", "--gravity"),
+    ("--gravity", "0,-9.8,0", "sign"),
+    ("--camera-pose", "{bad}/pose_nan.json", "nan is not within"),
+    ("--camera-pose", "{bad}/pose_mirror.json", "rotation"),
+    ("--camera-pose", "{bad}/pose_wide.json", "rotation"),
+    ("--camera-pose", "{bad}/pose_rows.json", "four"),
+    ("--click", "10,10", "mask already"),
+    ("--frame", "{bad}/missing", "--frame"),
+    ("--frame", "{bad}/none.ply", "no vertices"),
+    ("--frame", "{bad}/many.ply", "1,000,000,000,000"),
+    ("--frame", "{bad}/short.ply", "in the file"),
+    ("--frame", "{bad}/flat.ply", "no property z"),
+    ("--frame", "{bad}/words.ply", "numbers"),
+    ("--frame", "{bad}/lists.ply", "not understood"),
+    ("--frame", "{bad}/minus.ply", "-2"),
+    ("--frame", "{bad}/noply.ply", "not a PLY"),
+    ("--frame", "{bad}/objects.npz", "object"),
+    ("--frame", "{bad}/other.npz", "holds none"),
+    ("--frame", "{bad}/norgb.npz", "rgb"),
+    ("--frame", "{bad}/claim.npz", "promises"),
+    ("--frame", "{bad}/bomb.npz", "unpacks"),
+    ("--frame", "{bad}/junk.npz", "not an array"),
+    ("--frame", "{bad}/noarchive.npz", "not a .npz"),
+    ("--frame", "{made}/frame", "pose"),  # one more, where the first has none
+    ("--frame-dir", "{bad}/missing", "no such folder"),
+    ("--out", "{bad}/a.jpg", ".png"),
+    ("--out", "{bad}/missing/a.png", "folder"),
+    ("--out", "{made}/frame/color.png", "read"),
+    ("--html", "{bad}/a.png", ".html"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bad")
+    bad_files(folder)
+    return folder
+
+
+@pytest.mark.parametrize(("option", "value", "words"), REFUSED, ids=lambda v: str(v)[-24:])
+def test_bad_input_is_refused_in_one_line(
+    option: str, value: str, words: str, made: Path, bad: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files_of(made)
+    given = value.format(made=made, bad=bad)
+    drop = (option,) if value == "-" else ()
+    refused(arguments(made, option, given, drop=drop), capsys, words)
+    assert files_of(made) == before
+
+
+@pytest.mark.parametrize(
+    ("click", "words"), [("320,10", "outside"), ("4,x", "u,v"), ("9", "u,v"), ("{hole}", "no depth")]
+)
+def test_a_click_that_hits_nothing(
+    click: str, words: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
+    depth[40:60, 50:70] = 0
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    given = arguments(
+        made, "--depth", str(tmp_path / "depth.png"), "--click", click.format(hole="60,50"), drop=("--mask",)
+    )
+    refused(given, capsys, "--click", words)
+
+
+def test_a_target_without_depth_is_refused(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
+    mask = np.asarray(Image.open(made / "frame" / "mask.png")) > 0
+    depth[mask & (np.random.default_rng(0).random(mask.shape) < 0.9)] = 0
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    refused(
+        arguments(made, "--depth", str(tmp_path / "depth.png")), capsys, "pixels have depth", "add frames"
+    )
+
+
+def test_a_floor_out_of_sight_is_asked_for(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
+    pose = np.array(json.loads((made / "frame" / "pose.json").read_text())["T_world_camera"])
+    n = json.loads((made / "frame" / "intrinsics.json").read_text())
+    v, u = np.indices(depth.shape)
+    rays = np.stack([(u - n["ppx"]) / n["fx"], (v - n["ppy"]) / n["fy"], np.ones(depth.shape)], axis=2)
+    height = (rays * (depth / 1000)[..., None]) @ pose[2, :3] + pose[2, 3]
+    depth[height < 0.3] = 0
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    refused(arguments(made, "--depth", str(tmp_path / "depth.png")), capsys, "floor", "--gravity")
+
+
+def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad.ckpt").write_bytes(b"not a checkpoint")
+    given = arguments(made)
+    given[1] = str(tmp_path / "bad.ckpt")
+    refused(given, capsys, "bad.ckpt")
