@@ -29,10 +29,11 @@ from train.tensors import to_torch
 # Name -> changes of the configuration, and the layers whose output is held at zero.
 VARIANTS: dict[str, tuple[Mapping[str, Any], Sequence[str]]] = {
     "default": ({}, ()),
-    "no tokens: scalars and the target's shape": ({}, ("pooled",)),
+    "no tokens": ({}, ("pooled",)),  # scalars and the target's shape
     "tokens without directions": ({}, ("vectors", "tensors")),
     "tokens without lines of sight and arm": ({}, ("pair",)),
-    "half the tokens": ({"tokens": (16, 32, 32)}, ()),
+    "left and right told apart": ({"mirrored": False}, ()),
+    "twice the tokens": ({"tokens": (32, 64, 64)}, ()),
     "camera unknown": ({"camera": "unknown"}, ()),
     "visibility estimated": ({"observed_visibility": True}, ()),
 }
@@ -54,12 +55,12 @@ def main() -> None:
     learn = _batches(options.train, options.scenes_per_batch, options.samples)
     judge = _batches(options.judge, 16, 10**9)
     print(f"{sum(map(len, learn))} samples to learn from, {sum(map(len, judge))} to judge by")
-    print(f"{'variant':<44} {'accuracy':>8} {'balanced':>8} {'AUC':>6} {'CPU s':>6}")
+    print(f"{'variant':<38} {'accuracy':>8} {'balanced':>8} {'AUC':>6} {'CPU s':>6}")
     for words in options.only:
         config, silent = VARIANTS[words]
         rows = [_trained(config, silent, learn, judge, options.epochs, seed) for seed in range(options.seeds)]
         right, balanced, area, cpu_s = np.mean(rows, axis=0)
-        print(f"{words:<44} {right:>8.4f} {balanced:>8.4f} {area:>6.4f} {cpu_s:>6.0f}", flush=True)
+        print(f"{words:<38} {right:>8.4f} {balanced:>8.4f} {area:>6.4f} {cpu_s:>6.0f}", flush=True)
 
 
 def _batches(places: Sequence[str], scenes: int, most: int) -> list[Batch[Tensor]]:
