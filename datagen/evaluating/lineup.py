@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.console.steps import steps
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import SCENES_PER_BATCH, Place, refuse_no_trials
 from datagen.specifying.specify import read_toml
 from schemas.errors import InputError
 from schemas.specification import HeuristicParams
-from train.baselines import BASELINES, FIELDS, fit_baselines, make_baselines
+from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
 from train.dataset import SampleStream
 from train.splits import refuse_shared_houses
 
@@ -65,7 +66,13 @@ def line_up(
             for place in places:
                 refuse_shared_houses(stream, place.stream)
         houses = frozenset(stream.house_ids())
-        made = fit_baselines(made, stream.epoch(0))
+        batches = list(stream.epoch(0))
+        fitted: list[Baseline] = []
+        with steps("baselines fitted", len(made)) as step:
+            for baseline in made:
+                fitted += fit_baselines([baseline], batches)
+                step()
+        made = fitted
     else:
         why = "its numbers are fitted, and no run to fit them on is named (--fit)"
         left_out = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
