@@ -7,11 +7,13 @@ tensors lie in the JSON, which holds a float to its last bit.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -144,6 +146,27 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+@contextmanager
+def only_writer(path: str | Path) -> Generator[None]:
+    """Hold the checkpoint for this process. InputError while another on this machine holds it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.with_name(f".{path.name}.lock")
+    with open(lock, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.path.samestat(os.fstat(file.fileno()), lock.stat())
+        except (BlockingIOError, FileNotFoundError):
+            mine = False
+        if not mine:
+            mend = "Wait for it, stop it, or give another --out"
+            raise InputError(path, "", "another process is training it", mend)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def _own(tensor: Tensor) -> Tensor:

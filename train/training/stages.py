@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from train.splits import HouseSide, refuse_one_class, refuse_shared_houses, spli
 from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
+    only_writer,
     put_weights,
     read_checkpoint,
     write_checkpoint,
@@ -55,12 +57,13 @@ def train_job(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
     InputError for data, checkpoints or options that do not go together, before anything is written.
     """
     torch.set_num_threads(job.threads)
-    training, head = prepare(job, ranks)
-    watcher = _watchers(job, training)
-    try:
-        return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
-    finally:
-        watcher.close()
+    with only_writer(job.out) if ranks.leads else nullcontext():
+        training, head = prepare(job, ranks)
+        watcher = _watchers(job, training)
+        try:
+            return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
+        finally:
+            watcher.close()
 
 
 def _watchers(job: Job, training: Training) -> Watchers:

@@ -24,6 +24,7 @@ from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
     load_model,
+    only_writer,
     read_checkpoint,
     write_checkpoint,
 )
@@ -253,6 +254,18 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
         write_checkpoint(path, checkpoint_of(step=2))
     assert read_checkpoint(path).head.step == 1
     assert [p.name for p in tmp_path.iterdir()] == ["c.ckpt"]
+
+
+def test_one_process_at_a_time_writes_it(tmp_path: Path):
+    path = tmp_path / "c.ckpt"
+    with only_writer(path), only_writer(tmp_path / "other.ckpt"):
+        with pytest.raises(InputError, match=r"c\.ckpt: another process is training it"), only_writer(path):
+            pass
+        with pytest.raises(InputError), only_writer(path):
+            pass
+    with only_writer(path):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_view_is_kept_without_what_it_is_a_view_of(tmp_path: Path):
