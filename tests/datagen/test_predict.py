@@ -7,10 +7,12 @@ import json
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from datagen import cli
@@ -20,6 +22,15 @@ from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
 
 HEIGHT_M = 0.8197  # of the scene's camera
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Test processes share the cores: threads of one would wait for those of another."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -120,17 +131,15 @@ def test_a_frame_without_a_clear_place_ends_with_1(made: Path, capsys: pytest.Ca
     assert "no answer" in told and "0 clear" in told
 
 
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
 def write_png(file: Path, width: int, height: int) -> None:
     """A PNG of a few bytes that claims a size."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    body = zlib.compress(b"\0" * 1000)
-    file.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
-    )
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0" * 1000)), chunk(b"IEND", b"")
+    file.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
 
 
 def write_npy(file: Path, data: bytes) -> None:
@@ -138,10 +147,10 @@ def write_npy(file: Path, data: bytes) -> None:
         archive.writestr("depth.npy", data)
 
 
-def npy_header(text: str) -> bytes:
+def npy_header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """The first bytes of an array's file, which promise so much."""
     file = io.BytesIO()
-    padded = text.encode().ljust(117) + b"\n"
-    file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded)
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
     return file.getvalue()
 
 
@@ -186,14 +195,8 @@ def bad_files(folder: Path) -> None:
     np.savez(folder / "objects.npz", depth=np.array([{}, 1], object), allow_pickle=True)
     np.savez(folder / "other.npz", colours=np.zeros(3))
     np.savez(folder / "norgb.npz", depth=np.ones((4, 4), np.uint16))
-    write_npy(
-        folder / "claim.npz",
-        npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }"),
-    )
-    write_npy(
-        folder / "bomb.npz",
-        npy_header("{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }") + bytes(200_000_000),
-    )
+    write_npy(folder / "claim.npz", npy_header("<f4", (1_000_000, 1_000_000)))
+    write_npy(folder / "bomb.npz", npy_header("|u1", (70_000_000,)) + bytes(70_000_000))
     write_npy(folder / "junk.npz", b"junk")
     (folder / "noarchive.npz").write_text("no archive")
 
@@ -279,44 +282,47 @@ def test_bad_input_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("click", "words"), [("320,10", "outside"), ("4,x", "u,v"), ("9", "u,v"), ("{hole}", "no depth")]
+    ("click", "words"), [("320,10", "outside"), ("4,x", "u,v"), ("9", "u,v"), ("60,50", "no depth")]
 )
 def test_a_click_that_hits_nothing(
     click: str, words: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
+    depth, _ = pictures(made)
     depth[40:60, 50:70] = 0
-    Image.fromarray(depth).save(tmp_path / "depth.png")
-    given = arguments(
-        made, "--depth", str(tmp_path / "depth.png"), "--click", click.format(hole="60,50"), drop=("--mask",)
-    )
+    given = arguments(made, "--depth", saved(depth, tmp_path), "--click", click, drop=("--mask",))
     refused(given, capsys, "--click", words)
+
+
+def pictures(made: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and mask of the frame, to be changed."""
+    depth, mask = (np.array(Image.open(made / "frame" / f"{name}.png")) for name in ("depth", "mask"))
+    return depth, mask > 0
+
+
+def saved(depth: np.ndarray, folder: Path) -> str:
+    Image.fromarray(depth).save(folder / "depth.png")
+    return str(folder / "depth.png")
 
 
 def test_a_target_without_depth_is_refused(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
-    mask = np.asarray(Image.open(made / "frame" / "mask.png")) > 0
+    depth, mask = pictures(made)
     depth[mask & (np.random.default_rng(0).random(mask.shape) < 0.9)] = 0
-    Image.fromarray(depth).save(tmp_path / "depth.png")
-    refused(
-        arguments(made, "--depth", str(tmp_path / "depth.png")), capsys, "pixels have depth", "add frames"
-    )
+    refused(arguments(made, "--depth", saved(depth, tmp_path)), capsys, "pixels have depth", "add frames")
 
 
 def test_a_floor_out_of_sight_is_asked_for(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    depth = np.asarray(Image.open(made / "frame" / "depth.png")).copy()
+    depth, _ = pictures(made)
     pose = np.array(json.loads((made / "frame" / "pose.json").read_text())["T_world_camera"])
     n = json.loads((made / "frame" / "intrinsics.json").read_text())
     v, u = np.indices(depth.shape)
     rays = np.stack([(u - n["ppx"]) / n["fx"], (v - n["ppy"]) / n["fy"], np.ones(depth.shape)], axis=2)
     height = (rays * (depth / 1000)[..., None]) @ pose[2, :3] + pose[2, 3]
     depth[height < 0.3] = 0
-    Image.fromarray(depth).save(tmp_path / "depth.png")
-    refused(arguments(made, "--depth", str(tmp_path / "depth.png")), capsys, "floor", "--gravity")
+    refused(arguments(made, "--depth", saved(depth, tmp_path)), capsys, "floor", "--gravity")
 
 
 def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from schemas.errors import InputError
 from train.prediction.files import MAX_FILE_BYTES, MAX_PIXELS, read_bytes
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
-_MAX_ARRAY_BYTES = 8 * MAX_PIXELS
+_MAX_ARRAY_BYTES = 4 * MAX_PIXELS
 _MEND = (
     "Write it with numpy.savez: depth, rgb, intrinsics (fx, fy, cx, cy), and if you like mask, T_world_camera"
 )
