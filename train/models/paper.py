@@ -34,7 +34,7 @@ from train.models.layers import PointMlp, empty_logits
 from train.models.model import Model, ModelConfig, read_config
 
 CANDIDATE_POINTS = 50
-# Candidates that go through the network together where no gradient is kept: some 30 MB each at full size.
+# Candidates that go through the network together where no gradient is kept: some 20 MB each at full size.
 _CHUNK = 8
 
 Width = Annotated[int, Field(ge=1, le=4096)]
@@ -80,7 +80,7 @@ class PaperModel(Model):
     """PointNet++ over cloud and candidate.
 
     In training all candidates of a batch go through together, because BatchNorm looks at all of them,
-    and keep some 100 MB each at full size; in evaluation memory is bounded.
+    and keep some 90 MB each at full size; in evaluation memory is bounded.
     """
 
     name = "paper"
