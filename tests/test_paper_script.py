@@ -1,0 +1,100 @@
+"""scripts/paper.sh: its commands are commands of ours, in an order in which each finds what it reads."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from datagen.cli import build_app
+
+SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "paper.sh"
+
+# In place of the program, which would take a quarter of an hour: it notes what it is called with, refuses
+# inputs that nobody made, and makes what is asked for, empty.
+NOTING = """#!/bin/bash
+printf '%q ' "$@" >> "$NOTES"; echo >> "$NOTES"
+made=; json=
+while [ $# -gt 0 ]; do
+    case $1 in
+    --out) made=$2; shift ;;
+    --html) echo page > "$2"; shift ;;
+    --json) json={} ;;
+    */runs/*|*.ckpt|*.toml) [ -e "$1" ] || { echo "nobody made $1" >&2; exit 2; } ;;
+    esac
+    shift
+done
+echo $json
+[ -n "$made" ] && ! [ -e "$made" ] || exit 0
+case $made in */runs/*) mkdir "$made" ;; *) echo made > "$made" ;; esac
+"""
+
+
+def tell(folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "BIN": str(folder / "bin"), "NOTES": str(folder / "notes"), **more}
+    return subprocess.run(
+        [SCRIPT, *words], env=environment, cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with empty assets, and with the program that notes its calls."""
+    for folder in ("bin", "assets/ycb", "assets/procthor"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "assets/ycb/objects.json").write_text("[]")
+    for name, text in (("datagen", NOTING), ("python", f'#!/bin/sh\nexec {sys.executable} "$@"\n')):
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    return tmp_path
+
+
+def notes(place: Path) -> list[list[str]]:
+    return [shlex.split(line) for line in (place / "notes").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("size", ["small", "full"])
+def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, size: str) -> None:
+    done = tell(place, size, "out", DATAGEN_ASSETS="assets")
+    assert done.returncode == 0, done.stderr
+    called = notes(place)
+    for words in called:
+        build_app(words[0]).parse_args(words, exit_on_error=False, print_error=False)
+    verbs = [words[0] for words in called]
+    assert verbs == ["submit"] * 6 + ["calibrate", "relabel"] + ["train"] * 3 + ["evaluate"] * 2
+    splits = {words[words.index("--out") + 1]: words[words.index("--split") + 1] for words in called[:6]}
+    assert sorted(splits.values()) == ["test", "train", "train", "train", "val", "val"]
+    trained = {word for words in called if words[0] == "train" for word in words}
+    for run, split in splits.items():
+        assert (run in trained) == (split != "test" and not run.endswith("heuristic")), run
+    assert (place / "out" / "tables.json").read_text() == "{}\n"
+
+    (place / "notes").unlink()
+    assert tell(place, size, "out", DATAGEN_ASSETS="assets").returncode == 0
+    again = [words[0] for words in notes(place)]  # those that go on by themselves
+    assert again == ["submit"] * 6 + ["relabel"] + ["train"] * 3
+
+
+def test_it_stops_where_a_step_fails(place: Path) -> None:
+    (place / "bin/datagen").write_text("#!/bin/sh\nexit 130\n")
+    assert tell(place, "small", "out", DATAGEN_ASSETS="assets").returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("words", "assets", "told"),
+    [(["small"], "nowhere", "DATAGEN_ASSETS"), (["big"], "assets", "small or full")],
+)
+def test_what_is_missing_is_said_in_one_line(place: Path, words: list[str], assets: str, told: str) -> None:
+    done = tell(place, *words, DATAGEN_ASSETS=assets)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and told in done.stderr
+
+
+def test_it_passes_its_linter() -> None:
+    program = Path(sys.executable).parent / "shellcheck"
+    done = subprocess.run([program, SCRIPT], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
