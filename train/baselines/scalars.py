@@ -22,7 +22,7 @@ from train.inputs import Array, Batch
 
 FEATURES = (
     *("distance_m", "mount_distance_m", "reach_m", "distance_over_reach", "mount_over_reach"),
-    *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho", "is_clear"),
+    *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho"),
 )
 _WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
 
@@ -31,7 +31,10 @@ Layer = tuple[F64, F64]  # weights (out, in), bias (out,)
 
 @dataclass(frozen=True, eq=False)
 class Scalars:
-    """Probability of a good label by two hidden layers of 32; fitted by cross-entropy."""
+    """Probability of a good label by two hidden layers of 32; 0 where the base does not fit.
+
+    Fitted by cross-entropy on places where it does.
+    """
 
     seed: int = 0
     steps: int = 3000
@@ -52,20 +55,28 @@ class Scalars:
         for weights, bias in self.layers[:-1]:
             hidden = np.maximum(hidden @ weights.T + bias, 0)
         weights, bias = self.layers[-1]
-        return 1 / (1 + np.exp(-np.clip((hidden @ weights.T + bias)[:, 0], -50, 50)))
+        chance = 1 / (1 + np.exp(-np.clip((hidden @ weights.T + bias)[:, 0], -50, 50)))
+        return np.where(is_clear(batch), chance, 0.0)
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Scalars:
         """Fitted anew; the same for the same batches and seed, whatever torch drew before."""
         label = labels(batches, self.name)
+        clear = np.concatenate([is_clear(b) for b in batches])
         rows = np.concatenate([features(b) for b in batches])
-        return replace(self, layers=_fitted(rows, label.astype(np.float32), self.seed, self.steps))
+        if not clear.any():
+            problem = "no base fits anywhere, and nothing can be fitted"
+            raise InputError(
+                "baseline scalars", "base_is_clear", problem, "Fit on runs with clear candidates"
+            )
+        label = label[clear].astype(np.float32)
+        return replace(self, layers=_fitted(rows[clear], label, self.seed, self.steps))
 
     def state(self) -> dict[str, Any]:
         return {"features": FEATURES, "layers": [[w.tolist(), b.tolist()] for w, b in self.layers]}
 
 
 def features(batch: Batch[Array]) -> F64:
-    """The numbers (N, 11) of every candidate, in the order of `FEATURES`."""
+    """The numbers (N, 10) of every candidate, in the order of `FEATURES`."""
     robot = batch.candidates.robot_row
     cloud = batch.robots.cloud_row[robot]
     height_m = batch.clouds.target_height_m[cloud].astype(np.float64)

@@ -110,6 +110,9 @@ def test_scalars_learn_and_are_the_same_for_the_same_seed() -> None:
     fitted = Scalars(seed=5, steps=300).fit(batches)
     test = make_batch(50)
     assert balanced(fitted.score(test) >= fitted.threshold, test.label == 1) > 0.9
+    # Trained where every base fits, it still rules out where one does not.
+    clear_only = [take(b, np.flatnonzero(is_clear(b))) for b in batches]
+    assert (Scalars(steps=100).fit(clear_only).score(test)[~is_clear(test)] == 0).all()
     again = Scalars(seed=5, steps=300).fit(batches)
     assert np.array_equal(again.score(test), fitted.score(test))
     assert not np.array_equal(Scalars(seed=6, steps=300).fit(batches).score(test), fitted.score(test))
