@@ -210,28 +210,42 @@ class Run:
             if data is not None:  # else it was withdrawn since the listing
                 yield self.decode_commit(shard, data)
 
-    def write_shard(self, shard: int, attempt: str, files: Mapping[str, bytes]) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; its entries for the commit. Nothing counts before it."""
+    def write_shard(
+        self, shard: int, attempt: str, files: Mapping[str, bytes], ours: bool = False
+    ) -> tuple[FileEntry, ...]:
+        """Write an attempt's files durably; its entries for the commit. Nothing counts before it.
+
+        `ours`: nobody else can commit an attempt of this name.
+        """
         folder = shard_folder(shard, attempt)
         entries = tuple(
             FileEntry(path=path, size=len(data), sha256=sha256(data).hexdigest())
             for path, data in files.items()
         )
-        with self.nothing_left_behind(shard, attempt):
+        with self.nothing_left_behind(shard, attempt, ours):
             self.storage.put_many({f"{folder}/{path}": data for path, data in files.items()})
             self.storage.sync(f"{folder}/{path}" for path in files)
         return entries
 
     @contextmanager
-    def nothing_left_behind(self, shard: int, attempt: str) -> Generator[None]:
-        """Remove what the block wrote of an attempt where the disk refuses: a full one gets its room back."""
+    def nothing_left_behind(self, shard: int, attempt: str, ours: bool = False) -> Generator[None]:
+        """Remove what the block wrote of an attempt where the disk refuses: a full one gets its room back.
+
+        An attempt that is `ours` goes at once; another one by a mark, for which a full disk may lack
+        room, so that its files may stay until `gc`.
+        """
+        folder = shard_folder(shard, attempt)
         try:
             yield
         except StoreFailure:
             raise  # it would not delete either
         except InputError:
             with suppress(InputError):
-                self.remove_attempt(shard, attempt)
+                if ours:
+                    self.storage.delete([file.key for file in self.storage.list(folder)])
+                    self.storage.remove_empty(folder)
+                else:
+                    self.remove_attempt(shard, attempt)
             raise
 
     def remove_attempt(self, shard: int, attempt: str) -> Removal:
