@@ -109,3 +109,27 @@ def test_an_attempt_is_removed_unless_its_shards_commit_may_name_it(tmp_path: Pa
     (tmp_path / commit_key(0)).write_bytes(b"{}")
     assert run.remove_attempt(0, "a-0") == "spared"
     assert {file.key for file in run.storage.list(shard_folder(0, "a-0"))} == before
+
+
+@pytest.mark.parametrize("written", [0, 1, 5])
+def test_an_attempt_of_its_own_goes_from_a_full_disk_that_takes_no_mark(
+    written: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, plain = make_run(tmp_path, shards=[]), Storage.put
+
+    def full(storage: Storage, key: str, data: bytes) -> None:
+        raise FULL
+
+    def fills_up(storage: Storage, contents: Any) -> None:
+        for key in list(contents)[:written]:
+            plain(storage, key, contents[key])
+        raise FULL
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="No space left"):
+        patch.setattr(Storage, "put_many", fills_up)
+        patch.setattr(Storage, "put", full)
+        write(run, 0, "a")
+    assert list(run.storage.list("shards")) == []
+    assert run.committed() == set()
+    attempt(run, 0, "b")
+    assert run.committed() == {0}
