@@ -115,7 +115,11 @@ class Prediction:
             return "no answer: no place around the target was seen to be clear"
         score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
         if score < _LIKELY:
-            return "doubtful: the scorer calls even the best place bad"
+            unseen = self.rows(UNSEEN)
+            better = len(unseen) > 0 and float(self.score[unseen[0]]) >= _LIKELY
+            return "doubtful: the scorer calls even the best place bad" + (
+                "; there are better ones whose floor was not seen" if better else ""
+            )
         if self.places.state[self.best] == STATES.index(UNSEEN):
             return "good if the floor there is free, which was not seen"
         if score < _SURE or thin or self.crop_seen < 0.1:
