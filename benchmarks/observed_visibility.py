@@ -1,0 +1,45 @@
+"""The visibility that a cloud tells, against the one that rays through the whole scene told.
+
+python -m benchmarks.observed_visibility RUN...
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from schemas.specification import HeuristicParams
+from train.baselines.baseline import mount_m, planar_distance_m, reach_m
+from train.dataset import SampleStream
+from train.observed_visibility import observed_visibility
+from workers.labels.heuristic import heuristic
+
+
+def main(places: list[str]) -> None:
+    """Print correlation, errors, the rule's agreement, and CPU time, run by run."""
+    for place in places:
+        rho, found, labels, ruled, seconds = [], [], [], [], 0.0
+        for batch in SampleStream([place], extra=("visibility",), shuffle=False).epoch(0):
+            began = time.process_time()
+            estimate = observed_visibility(batch.clouds, batch.robots, batch.candidates)
+            seconds += time.process_time() - began
+            true = batch.extra["visibility"]
+            d = [f(batch).astype(np.float32) for f in (planar_distance_m, mount_m, reach_m)]
+            labels.append(heuristic(d[0], d[1], d[2], true, HeuristicParams())[1])
+            ruled.append(heuristic(d[0], d[1], d[2], estimate.astype(np.float32), HeuristicParams())[1])
+            rho.append(true)
+            found.append(estimate)
+        true, estimate = np.concatenate(rho), np.concatenate(found)
+        label, said = np.concatenate(labels) == 1, np.concatenate(ruled) == 1
+        print(f"{place}: {len(true):,} candidates, {1e3 * seconds / len(true):.2f} CPU ms each")
+        print(f"  correlation with rho         {np.corrcoef(true, estimate)[0, 1]:.3f}")
+        print(f"  mean absolute error          {np.abs(estimate - true).mean():.3f}")
+        print(f"  mean error                   {(estimate - true).mean():+.3f}")
+        print(f"  accuracy of the rule         {(said == label).mean():.3f}")
+        print(f"  balanced accuracy            {(said[label].mean() + (~said)[~label].mean()) / 2:.3f}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
