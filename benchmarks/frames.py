@@ -33,6 +33,7 @@ from workers.world import assemble_world
 
 
 def main() -> None:
+    """Draw the scenes and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scenes", type=int, default=80)
     parser.add_argument("--houses", default="builtin")
@@ -115,7 +116,7 @@ def _overlap(scene: Scene, frame: SensorFrame) -> float:
 
 
 def _floor(scene: Scene, frame: SensorFrame) -> tuple[F64 | None, bool]:
-    """(tilt in degrees and error of the target's height in mm, or None), and whether a floor is to be seen."""
+    """(tilt in degrees and error of the target's height in mm) or None; whether a floor is in sight."""
     true = scene.camera.T_world_camera
     world = frame.points_m @ true[:3, :3].T + true[:3, 3]
     there = bool(floor_points(world, true[:3, 3]).mean() > 0.03)
