@@ -23,6 +23,8 @@ SEEN_SHARE = 0.8
 # One stray pixel of a stereo camera is no obstacle.
 _LEAST_POINTS = 3
 _CELL_M = 0.04
+_GAP_CELLS = 4  # gaps up to twice as wide are closed
+_AROUND_M = 3.0  # farther from the grid's middle nothing matters
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ def look_at_places(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Ca
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
     low = _counts(seen.points_m[above & (z < mount)], base_xy, params.base_radius_m)
     high = _counts(seen.points_m[above & (z >= mount) & (z < top)], base_xy, params.mast_radius_m)
-    blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS)
+    tops = seen.points_m[above & (z >= mount) & (z < top)]
+    blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
     share = _floor_share(seen.points_m[is_floor], base_xy, params.base_radius_m)
     state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
     state[~blocked & (share >= SEEN_SHARE)] = STATES.index(CLEAR)
@@ -90,11 +93,24 @@ def _counts(points_m: F32, base_xy: F64, radius_m: float) -> npt.NDArray[np.int6
     """Points (N, 3) within the radius of each base, seen from above."""
     if not len(points_m):
         return np.zeros(len(base_xy), np.int64)
-    near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < 3.0
+    near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < _AROUND_M
     if not near.any():
         return np.zeros(len(base_xy), np.int64)
     counts = KDTree(points_m[near, :2]).query_ball_point(base_xy, radius_m, return_length=True)
     return np.asarray(counts, np.int64)
+
+
+def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
+    """Which bases (N,) stand in a gap of a surface above the mount: what stands there hides part of it."""
+    n = int(2 * _AROUND_M / _CELL_M)
+    low = base_xy.mean(axis=0) - _AROUND_M
+    cells = np.floor((tops_m[:, :2] - low) / _CELL_M).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < n)).all(axis=1)]
+    hit = np.zeros((n, n), np.bool_)
+    hit[cells[:, 0], cells[:, 1]] = True
+    closed = np.asarray(ndimage.binary_closing(hit, iterations=_GAP_CELLS), np.bool_)
+    rows = np.clip(np.floor((base_xy - low) / _CELL_M).astype(np.int64), 0, n - 1)
+    return closed[rows[:, 0], rows[:, 1]]
 
 
 def _floor_share(floor_m: F32, base_xy: F64, radius_m: float) -> F64:

@@ -72,7 +72,7 @@ class RgbdImage:
         known = (self.depth_m > 0).astype(np.float32)
         weight = np.asarray(ndimage.uniform_filter(known, 7), np.float32)
         smooth = np.asarray(ndimage.uniform_filter(self.depth_m, 7), np.float32) / np.maximum(weight, 1e-6)
-        grid = self.world_grid(T, smooth)
+        grid = self.world_grid(T, smooth.astype(np.float32))
         facets = np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1))
         towards = np.einsum("ijk,ijk->ij", facets, T[:3, 3] - grid)
         return facets * np.sign(towards)[..., None]

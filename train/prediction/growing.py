@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from schemas.errors import InputError
@@ -41,10 +42,11 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     around = (depth_m > 0) & (far_m < _GROWS_M)
     joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
     level = around & (grid[..., 2] < seed[2] - 0.003)
+    allowed = grown = np.zeros((h, w), np.bool_)
     for _ in range(_ROUNDS):
         lowest_m = _above_support(grid, facets, level, seed)
         allowed = around & (grid[..., 2] > min(lowest_m, seed[2] - 1e-4))
-        labels = np.asarray(ndimage.label(allowed & joined)[0], np.int64)
+        labels = _pieces(allowed & joined)
         grown = (labels == labels[v, u]) & allowed & joined
         if not grown.any() or far_m[grown].max() < _RAN_OUT * _GROWS_M:
             break
@@ -74,6 +76,13 @@ def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
     height_m = float(np.median(z[np.abs(z - (edges[k] + edges[k + 1]) / 2) < 1.5 * _BIN_M]))
     near = np.abs(z[np.abs(z - height_m) < 0.015] - height_m)
     return height_m + 0.004 + 3 * 1.48 * float(np.median(near))
+
+
+def _pieces(mask: Bools) -> npt.NDArray[np.int64]:
+    """Number (H, W) of the connected piece that each pixel belongs to, 0 outside."""
+    labels = np.zeros(mask.shape, np.int64)
+    ndimage.label(mask, output=labels)
+    return labels
 
 
 def _step_m(depth_m: F32) -> F64:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -72,13 +73,13 @@ def _draw_above(axes: Axes, prediction: Prediction) -> ScalarMappable:
     rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # what is higher hides what is lower
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.scatter(points[:, 0], points[:, 1], c=colours, s=2.5, lw=0, zorder=1)
-    scale = ScalarMappable(Normalize(0, 1), COLOURS)
+    palette, scale = colormaps[COLOURS], ScalarMappable(Normalize(0, 1), COLOURS)
     side = _side_m(prediction)
     for state in STATES:
         for row in prediction.rows(state):
             x, y = prediction.base_xy_m[row]
             size = side * (0.92 if state != BLOCKED else 0.28)
-            colour = scale.to_rgba(float(prediction.score[row]), alpha=_ALPHA[state])
+            colour = (*palette(float(prediction.score[row]))[:3], _ALPHA[state])
             corner = (x - size / 2, y - size / 2)
             axes.add_patch(Rectangle(corner, size, size, fc=colour, ec=_EDGE[state], lw=0.9, zorder=3))
     target = prediction.seen.points_m[prediction.seen.on_target]
@@ -109,9 +110,9 @@ def _draw_aslant(axes: Any, prediction: Prediction) -> None:
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.computed_zorder = False
     tiles = [_square(xy, 0.92 * _side_m(prediction)) for xy in prediction.base_xy_m]
-    scale = ScalarMappable(Normalize(0, 1), COLOURS)
+    palette = colormaps[COLOURS]
     drawn = prediction.places.state != STATES.index(BLOCKED)
-    faces = [scale.to_rgba(float(s), alpha=0.85) for s in prediction.score[drawn]]
+    faces = [(*palette(float(s))[:3], 0.85) for s in prediction.score[drawn]]
     kept = [tile for tile, keep in zip(tiles, drawn, strict=True) if keep]
     if kept:
         axes.add_collection3d(Poly3DCollection(kept, facecolors=faces, edgecolors="none", zorder=1))
