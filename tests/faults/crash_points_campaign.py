@@ -267,7 +267,7 @@ def _different(one: Units, other: Units) -> list[str]:
 
 def _look(folder: Path, operation: Operation) -> Units:
     """The units, seen by a process that has never seen the run."""
-    status, told = in_child(lambda: json.dumps(units(folder, operation.places)))
+    status, told = in_child(lambda: json.dumps(units(folder, operation.places, operation.by_file)))
     return json.loads(told) if status == 0 else {"readers": told}
 
 
@@ -275,12 +275,14 @@ def _look_and_resume(folder: Path, operation: Operation) -> tuple[Units, Units, 
     """(units, units when it was resumed, what `verify` finds then)."""
 
     def go() -> str:
-        now = units(folder, operation.places)
+        now = units(folder, operation.places, operation.by_file)
         try:
             (operation.resume or operation.act)(folder)
         except InputError as e:
             return json.dumps([now, {"resuming": str(e)}, []])
-        return json.dumps([now, units(folder, operation.places), damage(folder, operation.places)])
+        return json.dumps(
+            [now, units(folder, operation.places, operation.by_file), damage(folder, operation.places)]
+        )
 
     status, told = in_child(go)
     now, resumed, damaged = json.loads(told) if status == 0 else ({"readers": told}, {}, [])

@@ -49,7 +49,8 @@ class Operation:
     the user does then (the same again, where it is not given). `places` are the runs in the folder;
     `exact` operations, resumed, leave the very files that they leave undisturbed. Attempts of merges have
     the names that they have in the sources, and another merge may be at them: `shared` ones are not taken
-    back when the disk refuses, as they are links and take no room."""
+    back when the disk refuses, as they are links and take no room. Where an operation mends a sealed store,
+    each of the store's files is a unit (`by_file`), and else the whole store."""
 
     name: str
     prepare: Callable[[Path], None]
@@ -59,6 +60,7 @@ class Operation:
     fields: tuple[str, ...] = _KEPT
     exact: bool = False
     shared: bool = False
+    by_file: bool = False
 
 
 def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
@@ -71,16 +73,22 @@ def small_schema(fields: Iterable[str] = _KEPT) -> RecordSchema:
     )
 
 
-def units(folder: Path, places: Iterable[str] = ("",)) -> Units:
+def units(folder: Path, places: Iterable[str] = ("",), by_file: bool = False) -> Units:
     """What readers see of runs or of merged runs, unit by unit; each must be as before or as after.
 
     A record that is refused, or a shard whose bytes are not those committed, is a unit of its own value.
     """
-    return {f"{place}:{name}": value for place in places for name, value in _units(folder / place).items()}
+    return {
+        f"{place}:{name}": value
+        for place in places
+        for name, value in _units(folder / place, by_file).items()
+    }
 
 
-def _units(folder: Path) -> Units:
-    found: Units = {"sealed": _sealed(folder)}
+def _units(folder: Path, by_file: bool) -> Units:
+    found = _sealed(folder)
+    if not by_file:
+        found = {"sealed": sha256(json.dumps(found).encode()).hexdigest() if found else ""}
     if not (folder / MERGED).exists() and not (folder / "manifest.json").exists():
         return found
     try:
@@ -135,14 +143,11 @@ def _commit(run: Run, shard: int) -> str:
     return sha256(json.dumps(rows).encode()).hexdigest()
 
 
-def _sealed(folder: Path) -> str:
+def _sealed(folder: Path) -> Units:
+    """The sealed store's files, by their digests."""
     store = folder / SEALED
-    if not store.exists():
-        return ""
-    digest = sha256()
-    for path in sorted(p for p in store.rglob("*") if p.is_file()):
-        digest.update(f"{path.relative_to(store)} {sha256(path.read_bytes()).hexdigest()}\n".encode())
-    return digest.hexdigest()
+    files = sorted(path for path in store.rglob("*") if path.is_file())
+    return {f"sealed {path.relative_to(store)}": sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 # Operations ----------------------------------------------------------------------------------
@@ -299,7 +304,7 @@ OPERATIONS = (
     Operation("merge several", lambda f: _apart(f, (0, 1)), _merge, places=("out",), shared=True),
     Operation("repair manifest", _damaged_manifest, _repair),
     Operation("repair records", _damaged_records, _repair),
-    Operation("repair files", _damaged_files, _repair),
+    Operation("repair files", _damaged_files, _repair, by_file=True),
     Operation("gc", _littered, _collect, exact=True),
     Operation("relabel", _relabelled, _relabel, places=("out",), fields=_KEPT_TO_RELABEL),
 )
