@@ -21,8 +21,8 @@ small)
     VAL_IN_RANGE=${VAL_IN_RANGE:-1500}  # the same in validation houses: for the rule, and to stop by
     VAL_CLEAR=${VAL_CLEAR:-1500}
     TEST_SCENES=${TEST_SCENES:-24}      # whole grids, in test houses with objects that nothing was trained on
-    EPOCHS_1=${EPOCHS_1:-8}             # at most, of stage 1 ...
-    EPOCHS_2=${EPOCHS_2:-20}            # ... and of the two trainings on trials
+    EPOCHS_1=${EPOCHS_1:-6}             # at most, of stage 1 ...
+    EPOCHS_2=${EPOCHS_2:-12}            # ... and of the two trainings on trials
     ;;
 full)
     HEURISTIC=${HEURISTIC:-180000}
