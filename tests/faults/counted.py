@@ -189,9 +189,13 @@ def check_run(run: Run, counted: Path) -> dict[str, float]:
     starts = {name.removesuffix(".start") for name in ledger if name.endswith(".start")}
     ends = {name: entry for name, entry in ledger.items() if not name.endswith(".start")}
     seen = executions(counted)
-    # A kill between the two lines of a beginning leaves the record of the start, or does not.
-    assert seen.begun <= starts <= seen.begins, "executions and starts differ"
+    # A kill between the two lines of a beginning leaves the record of the start, or does not. One before
+    # the first line leaves no execution, and the driver's account of an attempt that came to nothing.
+    unseen = starts - seen.begins
+    assert seen.begun <= starts, f"executions without a start: {seen.begun - starts}"
     assert starts <= set(ends), "an attempt has no end"
+    odd = {name: ends[name]["outcome"] for name in unseen if ends[name]["outcome"] != "crashed"}
+    assert not odd, f"starts without an execution: {odd}"
 
     winners: set[str] = set()
     wall_s: list[float] = []
@@ -217,6 +221,7 @@ def check_run(run: Run, counted: Path) -> dict[str, float]:
         "shards": shards,
         "executions": len(seen.begun),
         "cut at their beginning": len(seen.begins - seen.begun),
+        "killed before it": len(unseen),
         "attempts wasted": waste,
         "of these without account": sum(account.unaccounted for account in books.waste.values()),
         "waste share of time": 1 - useful.wall_s / books.total_wall_s,
