@@ -114,9 +114,7 @@ FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "
 if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then
     step "evaluate"
     datagen evaluate "${MODELS[@]}" "$OUT/runs/test-grid" "${FITTED[@]}" --html "$OUT/tables.html" \
-        | tee "$OUT/tables.txt.new"
-    datagen evaluate "${MODELS[@]}" "$OUT/runs/test-grid" "${FITTED[@]}" --json > "$OUT/tables.json.new"
-    mv "$OUT/tables.txt.new" "$OUT/tables.txt"
+        --json > "$OUT/tables.json.new"
     mv "$OUT/tables.json.new" "$OUT/tables.json"
 fi
-step "done: $OUT/tables.html, tables.txt and tables.json; the rule in $OUT/rule.toml"
+step "done: tables.html, tables.json and rule.toml in $OUT"
