@@ -65,9 +65,9 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     for words in called:
         build_app(words[0]).parse_args(words, exit_on_error=False, print_error=False)
     verbs = [words[0] for words in called]
-    assert verbs == ["submit"] * 6 + ["calibrate", "relabel"] + ["train"] * 3 + ["evaluate"]
-    splits = {words[words.index("--out") + 1]: words[words.index("--split") + 1] for words in called[:6]}
-    assert sorted(splits.values()) == ["test", "train", "train", "train", "val", "val"]
+    assert verbs == ["submit"] * 7 + ["calibrate", "relabel"] + ["train"] * 3 + ["evaluate"]
+    splits = {words[words.index("--out") + 1]: words[words.index("--split") + 1] for words in called[:7]}
+    assert sorted(splits.values()) == ["test"] * 2 + ["train"] * 3 + ["val"] * 2
     trained = {word for words in called if words[0] == "train" for word in words}
     for run, split in splits.items():
         assert (run in trained) == (split != "test" and not run.endswith("heuristic")), run
@@ -76,7 +76,7 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     (place / "notes").unlink()
     assert tell(place, size, "out", DATAGEN_ASSETS="assets").returncode == 0
     again = [words[0] for words in notes(place)]  # those that go on by themselves
-    assert again == ["submit"] * 6 + ["relabel"] + ["train"] * 3
+    assert again == ["submit"] * 7 + ["relabel"] + ["train"] * 3
 
 
 def test_it_stops_where_a_step_fails(place: Path) -> None:
