@@ -144,6 +144,8 @@ def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
     program = (
         "import os, signal, sys, schemas.merging.writing as w\n"
         "from datagen import cli\n"
+        # What a shell starts in the background ignores it.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "link = w._link\n"
         "w._link = lambda *given: (link(*given), os.kill(os.getpid(), signal.SIGINT))[0]\n"
         "sys.exit(cli.run(sys.argv[1:]))"

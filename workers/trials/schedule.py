@@ -26,7 +26,9 @@ def timed(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -
     steps, lengths = steps[kept], lengths[kept]
     if len(steps) == 0:
         ticks = max(1, int(np.ceil(at_least_s / period_s - 1e-9)))
-        return np.repeat(path_rad[:1], ticks + 1, axis=0)
+        joints = np.repeat(path_rad[:1], ticks + 1, axis=0)
+        joints[-1] = path_rad[-1]
+        return joints
     corners = np.vstack([path_rad[:1], path_rad[1:][kept]])
     directions = steps / lengths[:, None]
     acceleration = speed_radps / SPEED_UP_S
@@ -36,6 +38,8 @@ def timed(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -
     at_corner = (acceleration * period_s / np.maximum(turns, 1e-12)).min(axis=1)
 
     cells = np.maximum(1, np.ceil(lengths / _GRID_RAD).astype(int))
+    if cells.sum() == 1:
+        cells += 1  # at rest at both ends: there must be a point between them that moves
     line = np.repeat(np.arange(len(lengths)), cells)  # of each grid cell
     ds = np.repeat(lengths / cells, cells)
     s = np.concatenate([[0.0], np.cumsum(ds)])

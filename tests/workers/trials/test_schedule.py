@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from workers.trials.schedule import SPEED_UP_S, led, timed
@@ -18,6 +18,9 @@ corners = st.lists(st.tuples(*[st.floats(-2, 2, allow_subnormal=False)] * 3), mi
 
 
 @settings(max_examples=60, deadline=None)
+@example(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.4e-277)]), 0.0)
+@example(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 0.015625)]), 0.0)
+@example(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.0, 0.0)]), 0.6)
 @given(corners, st.sampled_from([0.0, 0.6, 3.0]))
 def test_speeds_jumps_and_ends(path: np.ndarray, at_least_s: float) -> None:
     q = timed(path, SPEED, PERIOD_S, at_least_s)
