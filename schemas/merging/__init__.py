@@ -76,8 +76,8 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     hashes = tuple(sorted(groups))
     _refuse_other_place(existing, hashes, layout)
     if place is not None and not existing:
-        # A merge that was cut short at once may have left parts that nothing names yet.
-        refuse_foreign(place, *(("parts/",) if len(hashes) > 1 else ()))
+        # A merge that was cut short at once may have left parts that nothing names yet, and drafts of the name.
+        refuse_foreign(place, *(("parts/", MERGED) if len(hashes) > 1 else ()))
     here = {run.manifest.spec_hash for run in existing}
     unions = tuple(
         plan_union(groups[spec_hash], 0 if spec_hash in here else None, layout, tick)

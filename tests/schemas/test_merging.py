@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -152,6 +153,21 @@ def test_a_merge_that_was_cut_short_is_finished_by_the_same_command(tmp_path: Pa
             carry_out(plan_merge([f"{tmp_path}/{name}" for name in "abc"], f"{tmp_path}/{out}"), step)
         merge(tmp_path, "abc", out)
         assert files_of(tmp_path / out) == wanted_files, after
+
+
+def test_a_merge_that_was_killed_while_it_named_its_parts_is_finished_by_the_same_command(tmp_path: Path):
+    fill(tmp_path, [0, 1], "a")
+    fill(tmp_path, [0, 1], "b", seed=1)
+    merge(tmp_path, "ab", "done")
+    planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
+    carry_out(planned)
+    # Its copy was there, and its draft half written.
+    named = (tmp_path / "out" / MERGED).read_bytes()
+    (tmp_path / "out" / MERGED).unlink()
+    (tmp_path / "out" / f"{MERGED}.0123456789abcdef.part").write_bytes(named[:20])
+    shutil.rmtree(tmp_path / "out" / "data.zarr")
+    merge(tmp_path, "ab")
+    assert sealed_root(open_storage(tmp_path / "out")) == sealed_root(open_storage(tmp_path / "done"))
 
 
 def test_what_was_known_of_an_attempt_grows_with_its_source(tmp_path: Path):
