@@ -76,7 +76,7 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     hashes = tuple(sorted(groups))
     _refuse_other_place(existing, hashes, layout)
     if place is not None and not existing:
-        # A merge that was cut short at once may have left parts that nothing names yet, and drafts of the name.
+        # A merge that was cut short may have left parts that nothing names yet, and a draft of what would.
         refuse_foreign(place, *(("parts/", MERGED) if len(hashes) > 1 else ()))
     here = {run.manifest.spec_hash for run in existing}
     unions = tuple(
