@@ -67,12 +67,12 @@ submit() {
     datagen submit "$@" --n "$n" --split "$split" --seed $((SEED + seed)) --out "$OUT/runs/$name" \
         --houses "procthor:$ASSETS/procthor" --objects "ycb:$OUT/objects/$objects" --workers "$WORKERS"
 }
-# made_after FILE SOURCE...: whether the file is there and newer than all of them.
+# made_after FILE SOURCE...: whether the file is there and none of them is newer.
 made_after() {
     local file=$1 source
     shift
     [ -s "$file" ] || return 1
-    for source in "$@"; do [ "$file" -nt "$source" ] || return 1; done
+    for source in "$@"; do ! [ "$source" -nt "$file" ] || return 1; done
 }
 
 # 1. Objects: four fifths to train on, and every fifth, which only the test runs have.
