@@ -14,11 +14,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from datagen.reports.agreement import CANDIDATE_SETS, Bools, Labelled, agreement, confusion
+from datagen.reports.agreement import Labelled, agreement, confusion
 from datagen.reports.labelled import read_labelled
 from schemas.errors import InputError
 from schemas.run import Run
 from schemas.specification import HeuristicParams
+from workers.bases.candidate_sets import CANDIDATE_SETS, Bools
 from workers.labels.heuristic import heuristic
 
 # Distances in reaches of the arm: nothing beyond one can be grasped.
@@ -38,7 +39,7 @@ def main() -> None:
     scenes = len(np.unique(labelled.scene))
     print(f"{len(labelled):,} {run.manifest.spec.label_source} labels of {scenes} scenes")
     rules = rules_of(labelled)
-    for name in CANDIDATE_SETS:
+    for name in reversed(CANDIDATE_SETS):
         print_set(labelled, rules, name)
 
 

@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.columns import CANDIDATE_SETS
 from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+from workers.bases.candidate_sets import CANDIDATE_SETS
 
 
 def main() -> None:

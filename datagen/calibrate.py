@@ -18,6 +18,7 @@ from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.specification import HeuristicParams, Specification
+from workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 
 if TYPE_CHECKING:
     from train.calibration import Agreement, Trials
@@ -27,7 +28,6 @@ Sets = Literal["grid", "clear", "in-range"]
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
 
 _MOST_RESAMPLES = 10_000
-_SETS: tuple[Sets, ...] = ("in-range", "clear", "grid")  # from the narrowest
 _SAMPLE_FIELDS = ("distance_m", "mount_distance_m", "arm_reach_m", "visibility", "base_is_clear", "label")
 _COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative")
 _METRICS = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
@@ -156,7 +156,7 @@ def _specifications(
             raise InputError(place, "scenes", problem, "Name every run once, and labels of its scenes once")
         scenes.add(spec.scenes_hash)
         held = spec.candidates.within or "grid"
-        if _SETS.index(candidates) > _SETS.index(held):
+        if CANDIDATE_SETS.index(candidates) > CANDIDATE_SETS.index(held):
             problem = f"the run was made of {held} candidates, not of {candidates}"
             raise InputError(place, "--candidates", problem, f"Give --candidates {held}")
         if spec.split != "val":
@@ -189,12 +189,8 @@ def _read(places: Sequence[str], candidates: Sets) -> Trials:
         **{name: joined[name] for name in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")},
         label=joined["label"] == 1,
     )
-    rows = np.ones(len(all_trials), np.bool_)
-    if candidates != "grid":
-        rows &= joined["base_is_clear"].astype(np.bool_)
-    if candidates == "in-range":
-        rows &= all_trials.mount_distance_m <= all_trials.arm_reach_m
-    return all_trials.at(rows)
+    is_clear = joined["base_is_clear"].astype(np.bool_)
+    return all_trials.at(in_set(candidates, is_clear, all_trials.mount_distance_m, all_trials.arm_reach_m))
 
 
 def _calibrate(

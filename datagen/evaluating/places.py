@@ -12,7 +12,8 @@ from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.specification import Specification
 from train.dataset import SampleStream
-from train.evaluation.columns import CANDIDATE_SETS, EXTRA
+from train.evaluation.columns import EXTRA
+from workers.bases.candidate_sets import CANDIDATE_SETS
 
 # Whole scenes with all their candidates: a few of 625 are what a model scores at once.
 SCENES_PER_BATCH = 8

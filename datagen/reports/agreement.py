@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from schemas.outcomes import OUTCOMES
+from workers.bases.candidate_sets import (
+    DISTANCE_EDGES_M,
+    TENTHS,
+    VISIBILITY_EDGES,
+    Bools,
+    Edges,
+    Floats,
+    bands,
+    in_set,
+)
 
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
 Rows = npt.NDArray[np.intp]
 
-# Which candidates are counted: on a whole grid most are far away or stand in a table, which any rule
-# gets right, so accuracy says little without the name of the set.
-CANDIDATE_SETS = ("grid", "clear", "in-range")
-
-_TENTHS = tuple(round(0.1 * k, 1) for k in range(11))
-DISTANCE_EDGES_M = (*_TENTHS, None)
-REACH_EDGES_M = (0.0, *_TENTHS[3:], None)
-HEIGHT_EDGES_M = (0.0, *_TENTHS[5:], None)
-# Those of the visibility score: hidden, partly seen, nearly free.
-VISIBILITY_EDGES = (0.0, 0.04, 0.2, 0.4, 0.6, 0.8, None)
+REACH_EDGES_M: Edges = (0.0, *TENTHS[3:], None)
+HEIGHT_EDGES_M: Edges = (0.0, *TENTHS[5:], None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +52,7 @@ class Labelled:
 
     def is_in(self, candidates: str) -> Bools:
         """Which (N,) belong to a set of CANDIDATE_SETS."""
-        match candidates:
-            case "clear":
-                return self.is_clear
-            case "in-range":
-                return self.is_clear & (self.mount_distance_m <= self.reach_m)
-            case _:
-                return np.ones(len(self), np.bool_)
+        return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
 
 
 # The arrays that every label has.
@@ -103,24 +95,10 @@ def agreement(said: Bools, true: Bools) -> dict[str, Any]:
     }
 
 
-def bands(values: Floats, edges: Sequence[float | None]) -> list[tuple[float, float | None, Bools]]:
-    """Rows (N,) in each band [low, high) that holds any; an edge None is beyond all values."""
-    found: list[tuple[float, float | None, Bools]] = []
-    for low, high in pairwise(edges):
-        assert low is not None
-        # Stored numbers are float32: a reach of 0.7 m belongs to the band that begins at 0.7.
-        inside = values >= np.float32(low)
-        if high is not None:
-            inside &= values < np.float32(high)
-        if inside.any():
-            found.append((low, high, inside))
-    return found
-
-
 def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
     """How the labels of `said` stand to those of `true`; both hold the same candidates, row by row."""
 
-    def by_band(values: Floats, edges: Sequence[float | None]) -> list[dict[str, Any]]:
+    def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
         return [
             {"low": low, "high": high, **agreement(said.label[rows], true.label[rows])}
             for low, high, rows in bands(values, edges)
@@ -168,7 +146,7 @@ def outcome_report(labelled: Labelled) -> dict[str, Any]:
         if row["outcome"] != "success":
             stages[row["stage"]] += row["count"]
 
-    def share_by(values: Floats, edges: Sequence[float | None]) -> list[dict[str, Any]]:
+    def share_by(values: Floats, edges: Edges) -> list[dict[str, Any]]:
         return [
             {"low": low, "high": high, "count": int(rows.sum()), "positive": int(labelled.label[rows].sum())}
             for low, high, rows in bands(values, edges)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from schemas.outcomes import OUTCOMES
 from train.evaluation.columns import Columns
 from train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
-_TENTHS = tuple(round(0.1 * k, 1) for k in range(11))
-DISTANCE_EDGES_M = (*_TENTHS, None)
-RATIO_EDGES = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
-# Those of the visibility score: hidden, partly seen, nearly free.
-VISIBILITY_EDGES = (0.0, 0.04, 0.2, 0.4, 0.6, 0.8, None)
+RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 # Heading of a breakdown -> the groups of its candidates, each with its name.
 Groups = Mapping[str, list[tuple[str, Bools]]]
@@ -30,9 +25,9 @@ def groups_of(columns: Columns, trained_objects: Collection[str]) -> Groups:
     target = columns.target.astype(str)
     return {
         "object": [(name, (target == name)[columns.scene]) for name in np.unique(target[columns.scene])],
-        "distance (m)": list(_bands(columns.distance_m, DISTANCE_EDGES_M)),
-        "mount distance / reach": list(_bands(ratio, RATIO_EDGES)),
-        "visibility": list(_bands(columns.visibility, VISIBILITY_EDGES)),
+        "distance (m)": _named_bands(columns.distance_m, DISTANCE_EDGES_M),
+        "mount distance / reach": _named_bands(ratio, RATIO_EDGES),
+        "visibility": _named_bands(columns.visibility, VISIBILITY_EDGES),
         "outcome": [
             (name, rows) for code, name in enumerate(OUTCOMES) if (rows := columns.outcome == code).any()
         ],
@@ -60,17 +55,9 @@ def _accuracies(said: F64, true: Bools) -> dict[str, float]:
     return {"accuracy": float(accuracy(counts)), "balanced_accuracy": float(balanced_accuracy(counts))}
 
 
-def _bands(
-    values: npt.NDArray[np.floating[Any]], edges: Sequence[float | None]
-) -> Iterator[tuple[str, Bools]]:
-    for low, high in pairwise(edges):
-        assert low is not None
-        # Stored numbers are float32: a distance of 0.7 m belongs to the band that begins at 0.7.
-        inside = values >= np.float32(low)
-        if high is not None:
-            inside &= values < np.float32(high)
-        if inside.any():
-            yield (f"{low:g} on" if high is None else f"{low:g} to {high:g}"), inside
+def _named_bands(values: Floats, edges: Edges) -> list[tuple[str, Bools]]:
+    found = bands(values, edges)
+    return [(f"{low:g} on" if high is None else f"{low:g} to {high:g}", rows) for low, high, rows in found]
 
 
 def _yes_no(rows: Bools) -> list[tuple[str, Bools]]:

@@ -14,12 +14,10 @@ from schemas.errors import InputError
 from train.evaluation.metrics import F64, Bools
 from train.inputs import Array, Batch
 from train.scorers import Scorer
+from workers.bases.candidate_sets import in_set
 
 F32 = npt.NDArray[np.float32]
 
-# On a whole grid most candidates are far away or stand in a table, which any rule gets right: accuracy says
-# little without the name of the set.
-CANDIDATE_SETS = ("in-range", "clear", "grid")
 # Columns of the store that a batch has to bring along, beside those that scorers ask for.
 EXTRA = (
     *("base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
@@ -84,13 +82,7 @@ class Columns:
 
     def is_in(self, candidates: str) -> Bools:
         """Which (N,) belong to a set of `CANDIDATE_SETS`."""
-        match candidates:
-            case "clear":
-                return self.is_clear
-            case "in-range":
-                return self.is_clear & self.is_reachable
-            case _:
-                return np.ones(len(self), np.bool_)
+        return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
 
 
 _SCENE_COLUMNS = ("house", "target", "target_digest", "run", "is_grid")

@@ -10,13 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.reports.agreement import (
-    CANDIDATE_SETS,
-    DISTANCE_EDGES_M,
     REACH_EDGES_M,
-    VISIBILITY_EDGES,
     Labelled,
     agreement,
-    bands,
     common_candidates,
     compare,
     confusion,
@@ -24,6 +20,7 @@ from datagen.reports.agreement import (
 )
 from datagen.reports.labelled import join_labelled
 from schemas.outcomes import OUTCOMES
+from workers.bases.candidate_sets import CANDIDATE_SETS, DISTANCE_EDGES_M, VISIBILITY_EDGES, bands
 
 CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
@@ -96,7 +93,7 @@ def test_stored_lengths_on_an_edge_belong_to_the_band_that_begins_there() -> Non
 
 def test_candidate_sets_are_nested() -> None:
     side = labelled([0] * 4, is_clear=bools(1, 1, 0, 0), mount_distance_m=[0.7, 0.71, 0.5, 2.0])
-    counts = [side.is_in(name).tolist() for name in CANDIDATE_SETS]
+    counts = [side.is_in(name).tolist() for name in reversed(CANDIDATE_SETS)]
     assert counts == [[True] * 4, [True, True, False, False], [True, False, False, False]]
 
 
