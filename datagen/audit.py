@@ -14,6 +14,7 @@ from datagen.reports.accounts import Account, Books, account_for
 from datagen.reports.agreement import common_candidates, compare, outcome_report
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
 from datagen.reports.labelled import join_labelled, read_labelled
+from datagen.reports.specified import is_disturbed
 from schemas.cost import STAGES
 from schemas.errors import InputError
 from schemas.merged import open_runs
@@ -115,16 +116,12 @@ def pairs(runs: Sequence[Run], candidates: str) -> list[dict[str, Any]]:
 
 def _fidelity(spec: Specification) -> tuple[int, bool]:
     known = spec.label_source in _FIDELITY
-    return (_FIDELITY.index(spec.label_source) if known else 0, _is_disturbed(spec))
-
-
-def _is_disturbed(spec: Specification) -> bool:
-    return spec.arm is not None and spec.arm.disturbance is not None
+    return (_FIDELITY.index(spec.label_source) if known else 0, is_disturbed(spec))
 
 
 def _who(run: Run) -> dict[str, Any]:
     spec = run.manifest.spec
-    return {"run": run.storage.url, "label_source": spec.label_source, "disturbed": _is_disturbed(spec)}
+    return {"run": run.storage.url, "label_source": spec.label_source, "disturbed": is_disturbed(spec)}
 
 
 def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import steps
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.reports.specified import specification_record
 from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.specification import HeuristicParams, Specification
@@ -96,7 +97,7 @@ def calibrate(
         "positives": int(trials.label.sum()),
         "scenes": trials.n_scenes,
         "houses": len(set(trials.house)),
-        "runs": [_run_record(spec) for spec in specs],
+        "runs": [specification_record(spec) for spec in specs],
         "warnings": warnings,
         **_findings(made),
     }
@@ -218,17 +219,6 @@ def _calibrate(
     said = {"before": trials.said(before), "after": left_out.said, "fitted": trials.said(after)}
     found = agreements(trials, list(said.values()), resamples, seed)
     return _Calibrated(before, after, left_out.params, dict(zip(said, found, strict=True)))
-
-
-def _run_record(spec: Specification) -> dict[str, Any]:
-    return {
-        "spec_hash": spec.hash(),
-        "label_source": spec.label_source,
-        "disturbed": spec.arm is not None and spec.arm.disturbance is not None,
-        "split": spec.split,
-        "seed": spec.seed,
-        "candidates": spec.candidates.within or "grid",
-    }
 
 
 def _findings(made: _Calibrated) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.evaluating.contestants import Contestant
+from datagen.reports.specified import specification_record
 from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.specification import Specification
@@ -47,18 +48,7 @@ class Place:
             "scenes": self.stream.n_scenes,
             "samples": self.stream.n_samples,
             "whole_grids_of": self.cells or None,
-            "parts": [
-                {
-                    "spec_hash": spec.hash(),
-                    "label_source": spec.label_source,
-                    "disturbed": spec.arm is not None and spec.arm.disturbance is not None,
-                    "split": spec.split,
-                    "seed": spec.seed,
-                    "candidates": spec.candidates.within or "grid",
-                    "per_scene": spec.candidates.count,
-                }
-                for spec in self.specs
-            ],
+            "parts": [specification_record(spec) for spec in self.specs],
             "origin": self.stream.origin(),
         }
 
