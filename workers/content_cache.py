@@ -23,6 +23,8 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
+from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP
+
 Arrays = Mapping[str, npt.NDArray[Any]]
 # Type and shape of every array; lengths with one name are equal.
 Layout = Mapping[str, tuple[type[np.generic], tuple[int | str, ...]]]
@@ -85,8 +87,7 @@ def read_arrays(path: Path, layout: Layout, most_bytes: int) -> dict[str, npt.ND
                     return None
                 content = io.BytesIO(archive.read(info))  # checks the CRC before anything is parsed
                 arrays[info.filename[:-4]] = np.lib.format.read_array(content, allow_pickle=False)
-    # RuntimeError: an encrypted member. MemoryError: a header that promises more than there is.
-    except (OSError, EOFError, ValueError, RuntimeError, MemoryError, zipfile.BadZipFile):
+    except (OSError, *DAMAGED_ZIP, *DAMAGED_ARRAY):
         return None
     return arrays if _fits(arrays, layout) else None
 

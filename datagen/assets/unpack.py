@@ -7,12 +7,12 @@ import stat
 import tarfile
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
+from schemas.archives import DAMAGED_ZIP, open_member
 from schemas.errors import InputError
 
 _CHUNK_BYTES = 2**20
@@ -60,8 +60,7 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
                 total += _copy(archive, member, staging / relative, limits.total_bytes - total)
         except InputError:
             raise
-        except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError,
-                gzip.BadGzipFile, ValueError) as error:  # fmt: skip
+        except (tarfile.TarError, gzip.BadGzipFile, *DAMAGED_ZIP) as error:
             raise InputError(
                 archive,
                 "",
@@ -111,7 +110,7 @@ def _zip_members(archive: Path) -> Iterator[_Member]:
             if info.is_dir():
                 _safe_name(archive, info.filename)
                 continue
-            with packed.open(info) as stream:
+            with open_member(packed, info) as stream:
                 yield _Member(info.filename, info.file_size, stream)
 
 

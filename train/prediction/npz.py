@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from schemas.errors import InputError
 from train.prediction.files import MAX_FILE_BYTES, MAX_PIXELS, read_bytes
 
@@ -29,11 +29,13 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for name in NAMES:
-                if f"{name}.npy" in archive.NameToInfo:
-                    with archive.open(f"{name}.npy") as member:
+                if (info := archive.NameToInfo.get(f"{name}.npy")) is not None:
+                    with open_member(archive, info) as member:
                         unpacked = member.read(_MAX_ARRAY_BYTES + 1)
                     found[name] = _array(path, name, unpacked)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+    except InputError:
+        raise
+    except DAMAGED_ZIP as error:
         raise InputError(path, "", f"not a .npz archive ({type(error).__name__})", _MEND) from None
     if not found:
         raise InputError(path, "", f"holds none of {', '.join(NAMES)}", _MEND)
@@ -49,12 +51,13 @@ def _array(path: Path, name: str, data: bytes) -> npt.NDArray[Any]:
         version = np.lib.format.read_magic(file)
         reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         shape, _, dtype = reader[version](file)
-    except (ValueError, KeyError, SyntaxError, MemoryError, RecursionError, EOFError) as error:
+    except DAMAGED_ARRAY as error:
         raise InputError(path, name, f"not an array ({type(error).__name__})", _MEND) from None
     if dtype.hasobject or dtype.kind not in "buif":
         raise InputError(path, name, f"holds {dtype}, not numbers", _MEND)
     size = math.prod(shape) * dtype.itemsize
-    if size != len(data) - file.tell():
+    sound = all(type(length) is int and 0 <= length <= len(data) for length in shape)
+    if not sound or size != len(data) - file.tell():
         raise InputError(path, name, f"promises {size:,} bytes of {len(data) - file.tell():,}", _MEND)
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)

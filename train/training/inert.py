@@ -15,11 +15,13 @@ import zipfile
 from dataclasses import dataclass
 from typing import Any
 
+from schemas.archives import DAMAGED_ZIP
 from schemas.errors import InputError
 
 MAX_BYTES = 2 << 30
 _MAX_PICKLE_BYTES = 64 << 20
 _MAX_RECORDS = 100_000
+_MAX_AXES = 64
 _ITEM_BYTES = {f"torch {k}Storage": n for k, n in {"Float": 4, "Long": 8, "Byte": 1, "Bool": 1}.items()}
 _REBUILD, _HOOKS = "torch._utils _rebuild_tensor_v2", "collections OrderedDict"
 _MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
@@ -49,7 +51,7 @@ def refuse_foreign(place: str, data: bytes) -> None:
         _check(data)
     except zipfile.BadZipFile as e:
         raise InputError(place, "", f"no checkpoint, or one that was cut ({e})", _MEND) from None
-    except (ValueError, IndexError, KeyError, TypeError, NotImplementedError, RuntimeError, EOFError) as e:
+    except (*DAMAGED_ZIP, IndexError, KeyError, TypeError) as e:
         raise InputError(place, "", f"not a checkpoint of this program ({e})", _MEND) from None
 
 
@@ -87,10 +89,12 @@ def _declared(pickle: bytes, sizes: dict[str, int]) -> Any:
     memo: dict[int, Any] = {}
 
     def down_to_mark() -> list[Any]:
-        at = max(i for i, value in enumerate(stack) if value is _MARK)
-        values = stack[at + 1 :]
-        del stack[at:]
-        return values
+        for at in reversed(range(len(stack))):
+            if stack[at] is _MARK:
+                values = stack[at + 1 :]
+                del stack[at:]
+                return values
+        raise ValueError("it closes what it never opened")
 
     for opcode, argument, _ in pickletools.genops(pickle):
         match opcode.name:
@@ -154,7 +158,9 @@ def _called(function: Any, arguments: Any) -> Any:
     if function != _Name(_REBUILD):
         raise ValueError("it calls what no checkpoint needs")
     storage, offset, shape, stride, requires_grad, hooks = arguments
-    if not isinstance(storage, _Storage) or any(type(n) is not int or n < 0 for n in (*shape, *stride)):
+    if not isinstance(storage, _Storage) or len(shape) > _MAX_AXES:
+        raise ValueError("a tensor of no shape")
+    if any(type(n) is not int or n < 0 for n in (*shape, *stride)):
         raise ValueError("a tensor of no shape")
     dense = tuple(math.prod(shape[k + 1 :]) for k in range(len(shape)))
     # The stride of an axis with one entry, or of no entries at all, says nothing.

@@ -35,12 +35,12 @@ def _plain(name: str, data: bytes = b"x") -> tuple[str, bytes, bytes, str]:
     return name, data, tarfile.REGTYPE, ""
 
 
-def _zip(name: str, data: bytes = b"x", mode: int = 0o100644) -> bytes:
+def _zip(name: str, data: bytes = b"x", mode: int = 0o100644, method: int = zipfile.ZIP_DEFLATED) -> bytes:
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as packed:
+    with zipfile.ZipFile(out, "w") as packed:
         info = zipfile.ZipInfo(name)
         info.external_attr = mode << 16
-        packed.writestr(info, data, zipfile.ZIP_DEFLATED)
+        packed.writestr(info, data, method)
     return out.getvalue()
 
 
@@ -74,6 +74,8 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "zip, device": lambda: _zip("a", b"", stat.S_IFBLK | 0o600),
     "zip, bomb": lambda: _zip("a", bytes(10**6)),
     "zip, bad checksum": lambda: _zip("a", b"hello").replace(b"\xcbH\xcd\xc9\xc9", b"\xcbH\xcd\xc9\xc8"),
+    "zip, bzip2": lambda: _zip("a", method=zipfile.ZIP_BZIP2),
+    "zip, LZMA": lambda: _zip("a", method=zipfile.ZIP_LZMA),
     "no archive": lambda: b"hello world" * 100,
     "empty file": lambda: b"",
 }

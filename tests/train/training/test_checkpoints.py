@@ -167,6 +167,18 @@ def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path)
             read_checkpoint(path)
 
 
+def test_a_shape_without_end_is_refused(written: Path, tmp_path: Path):
+    """Its strides are products over the shape, so that a million axes would take hours."""
+    axes = b"K\x01" * 1_000_000
+
+    def longer(data: bytes) -> bytes:
+        at = data.index(b"K\x04\x85")  # BININT1 n, TUPLE1: the shape of a bias
+        return data[:at] + b"(" + axes + b"t" + data[at + 3 :]
+
+    with pytest.raises(InputError, match="a tensor of no shape"):
+        read_checkpoint(with_pickle(tmp_path / "long.ckpt", written, longer))
+
+
 def test_bombs_are_refused_by_their_sizes(written: Path, tmp_path: Path):
     packed = tmp_path / "packed.ckpt"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as out:

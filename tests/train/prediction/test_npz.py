@@ -1,0 +1,74 @@
+"""Archives of arrays that are damaged or made to do harm: one line each, whatever zipfile or numpy raise."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.errors import InputError
+from train.prediction.npz import read_arrays
+
+DEPTH = np.arange(6, dtype=np.float32).reshape(2, 3)
+
+
+def packed(content: bytes, method: int = zipfile.ZIP_STORED) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        archive.writestr("depth.npy", content)
+    return out.getvalue()
+
+
+def saved(array: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+def refused(path: Path, data: bytes) -> bool:
+    path.write_bytes(data)
+    try:
+        read_arrays(path)
+    except InputError as error:
+        assert error.place == str(path) and "\n" not in str(error)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_no_changed_byte_and_no_cut_gives_more_than_a_line(tmp_path: Path, method: int):
+    good = packed(saved(DEPTH), method)
+    path = tmp_path / "a.npz"
+    assert not refused(path, good)
+    for at in range(len(good)):
+        assert refused(path, good[:at])
+        for bit in (0x01, 0x10, 0x80):
+            refused(path, good[:at] + bytes([good[at] ^ bit]) + good[at + 1 :])
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_methods_that_numpy_never_writes_are_refused(tmp_path: Path, method: int):
+    assert refused(tmp_path / "a.npz", packed(saved(DEPTH), method))
+
+
+@pytest.mark.parametrize(
+    ("descr", "shape", "size"),
+    [
+        ("'<f4'", "(2, 3", 24),
+        ("'''<f4'", "(2, 3)", 24),
+        ("'<f4'", "(-2, -3)", 24),
+        ("'<f4'", "(2, 3), 8: 1", 24),
+        ("'<f4', []: 8", "(2, 3)", 24),
+        ("('<f4',)", "(2, 3)", 24),
+        ("'<f4'", "(0, 99999999999999999999)", 0),
+        ("'|u1'", "(True,)", 1),
+        ("(" * 9000, "(2, 3)", 24),
+    ],
+)
+def test_headers_that_are_no_arrays_are_refused(tmp_path: Path, descr: str, shape: str, size: int):
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
+    start = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+    assert refused(tmp_path / "a.npz", packed(start + bytes(size)))
