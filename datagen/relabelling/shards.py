@@ -147,7 +147,7 @@ def _write(
         else:
             kept.append((f"{old}/{entry.path}", f"{new}/{entry.path}"))
     largest = max((entry.size for entry in before.files), default=0)
-    with run.nothing_left_behind(before.shard, attempt):
+    with run.nothing_left_behind(before.shard, attempt, ours=True):
         run.storage.adopt_many(source.storage, kept, largest)
         run.storage.put_many(fresh)
         run.storage.sync(f"{new}/{entry.path}" for entry in entries)

@@ -90,7 +90,7 @@ def make_counted(task: CountedRows, meter: Meter) -> Product:
         scenes, samples = rows_of(run, task.shard)
     with clock.stage("write"):
         files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
-        entries = run.write_shard(task.shard, task.attempt, files)
+        entries = run.write_shard(task.shard, task.attempt, files, ours=True)
     cost = meter.cost(clock, written_bytes=sum(entry.size for entry in entries))
     commit = commit_of(run, task.shard, task.attempt, entries, int(samples["label"].sum()))
     won = run.commit(commit.model_copy(update={"cost": cost, "host": this_host()}))
@@ -171,10 +171,11 @@ def _is_worker(pid: int) -> bool:
         return False
 
 
-def check_run(run: Run, counted: Path) -> dict[str, float]:
+def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
     """Hold a finished run against an uninterrupted one, and its ledger against the executions.
 
-    Returns what a report shows. AssertionError names what does not agree.
+    `kills` is how many workers and drivers were killed. Returns what a report shows. AssertionError names
+    what does not agree.
     """
     run = Run.open(run.storage.url)
     shards = len(run.planned())
@@ -196,6 +197,7 @@ def check_run(run: Run, counted: Path) -> dict[str, float]:
     assert starts <= set(ends), "an attempt has no end"
     odd = {name: ends[name]["outcome"] for name in unseen if ends[name]["outcome"] != "crashed"}
     assert not odd, f"starts without an execution: {odd}"
+    assert len(unseen) <= kills, f"{len(unseen)} starts without an execution of {kills} kills"
 
     winners: set[str] = set()
     wall_s: list[float] = []

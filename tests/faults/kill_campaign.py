@@ -46,7 +46,7 @@ def kill_at_random(
         driver.join()
         assert left or driver.exitcode == 0, f"a driver ended with {driver.exitcode}"
     await_ends(counted)
-    told = check_run(Run.open(run.storage.url), counted)
+    told = check_run(Run.open(run.storage.url), counted, killed_workers + killed_drivers)
     return {"workers killed": killed_workers, "drivers killed": killed_drivers, "drivers": drivers} | told
 
 
