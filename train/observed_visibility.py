@@ -34,7 +34,8 @@ _DISC_SHARE = 0.55
 _LARGEST_DISC_M = 0.06
 _MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
 _NEAREST_M = 0.02  # to an eye; points before it are the robot's own
-_PAIRS = 1 << 18  # of eye and point at once: bounds memory, and stays in the cache
+_PARTY = 32  # eyes that look at the target from about one side are dealt with together
+_AT_ONCE = 1 << 13  # pairs of eye and point: bounds memory, and stays in the cache
 
 
 def observed_visibility(clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]) -> F64:
@@ -75,23 +76,57 @@ def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) ->
         return share
     whole_m = np.concatenate([side_m, side_m * np.array([-1, -1, 1], np.float32)])
     others_m = others_m[np.isfinite(others_m).all(1)].astype(np.float32)
-    block = max(1, _PAIRS // max(len(others_m), len(whole_m)))
-    blocks = [usable[start : start + block] for start in range(0, len(usable), block)]
-    views = [Views(eyes_m[rows], radius_m) for rows in blocks]
-    near = np.zeros(len(others_m), np.bool_)
-    for view in views:
-        near |= view.near_line(others_m, _LARGEST_DISC_M).any(0)
-    discs = _discs(others_m, near)
-    for rows, view in zip(blocks, views, strict=True):
-        front_m = _closed(view.nearest_m(whole_m))
-        on_target = front_m > -np.inf
-        seen = on_target & ~_majority(view.hidden(discs, front_m), on_target)
-        share[rows] = seen.sum((1, 2)) / np.maximum(on_target.sum((1, 2)), 1)
+    views = Views(eyes_m[usable].astype(np.float32), radius_m)
+    front_m = closed(views.nearest_m(whole_m))
+    on_target = front_m > -np.inf
+    hidden = _hidden(views, others_m, front_m)
+    seen = on_target & ~majority(hidden, on_target)
+    share[usable] = seen.sum((1, 2)) / np.maximum(on_target.sum((1, 2)), 1)
     return share
 
 
+def _hidden(views: Views, others_m: F32, front_m: F32) -> Bools:
+    """In which cells (N, cells, cells) something lies clearly before what is there at `front_m`."""
+    hidden = np.zeros(front_m.size, np.bool_)
+    limit_m = np.where(front_m > -np.inf, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
+    nearest_m = limit_m.min((1, 2))
+    parties = [rows for rows in _parties(views.towards) if np.isfinite(nearest_m[rows]).any()]
+    beside = [views.beside(others_m, rows, _LARGEST_DISC_M) for rows in parties]
+    asked = np.zeros(len(others_m), np.bool_)
+    for rows, points in zip(parties, beside, strict=True):
+        _, point = views.before(others_m[points], _LARGEST_DISC_M, rows, nearest_m[rows])
+        asked[points[point]] = True
+    discs, disc_of = fit_discs(others_m, asked), np.cumsum(asked) - 1
+    pairs, n_pairs = list[tuple[Ints, Ints]](), 0
+    for rows, points in zip(parties, beside, strict=True):
+        near = disc_of[points[asked[points]]] if len(discs) else np.zeros(0, np.int64)
+        eye, disc = views.before(discs.centre_m[near], discs.radius_m[near], rows, nearest_m[rows])
+        pairs.append((rows[eye], near[disc]))
+        n_pairs += len(eye)
+        if n_pairs >= _AT_ONCE or rows is parties[-1]:
+            eye, disc = (np.concatenate(part) for part in zip(*pairs, strict=True))
+            for k in range(0, n_pairs, _AT_ONCE):
+                views.hide(discs, eye[k : k + _AT_ONCE], disc[k : k + _AT_ONCE], limit_m.reshape(-1), hidden)
+            pairs, n_pairs = [], 0
+    return hidden.reshape(front_m.shape)
+
+
+def _parties(towards: F32) -> list[Ints]:
+    """Rows of directions (N, 3), split at the middle of their widest axis until each party is small."""
+    parties, open_ = list[Ints](), [np.arange(len(towards))]
+    while open_:
+        rows = open_.pop()
+        if len(rows) <= _PARTY:
+            parties.append(rows)
+            continue
+        some = towards[rows]
+        order = rows[np.argsort(some[:, int(np.ptp(some, axis=0).argmax())], kind="stable")]
+        open_ += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return parties
+
+
 @dataclass(frozen=True, eq=False)
-class _Discs:
+class Discs:
     """Small pieces of surface around points: where, which way, how large."""
 
     centre_m: F32  # (M, 3)
@@ -102,17 +137,17 @@ class _Discs:
         return len(self.radius_m)
 
 
-def _discs(points_m: F32, asked: Bools) -> _Discs:
+def fit_discs(points_m: F32, asked: Bools) -> Discs:
     """A disc for each asked point (M,), in the plane of its neighbours and as large as they are far."""
     if len(points_m) <= _NEIGHBOURS or not asked.any():  # too few to tell a surface
-        return _Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
+        return Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
     centre_m = points_m[asked]
     distance_m, row = KDTree(points_m).query(centre_m, _NEIGHBOURS + 1)
     around_m = points_m[row]
     around_m = around_m - around_m.mean(1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around_m, around_m))
     radius_m = np.minimum(_DISC_SHARE * distance_m[:, -1], _LARGEST_DISC_M)
-    return _Discs(centre_m, axes[:, :, 0].astype(np.float32), radius_m.astype(np.float32))
+    return Discs(centre_m, axes[:, :, 0].astype(np.float32), radius_m.astype(np.float32))
 
 
 class Views:
@@ -129,75 +164,109 @@ class Views:
         self.up = np.cross(self.towards, self.right)
         sine = np.minimum(radius_m / self.distance_m, 0.99)
         self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), of the window at the target's centre
+        self.per_depth = 2 / _CELLS * self.half_m / self.distance_m  # (N,), of a cell's width, by depth
 
-    def near_line(self, points_m: F32, slack_m: float | F32 = 0.0) -> Bools:
-        """Which points (N, M) lie before the eye, in the cone around its window or within slack_m of it."""
-        along_m = self.towards @ points_m.T
-        across2 = np.einsum("ij,ij->i", points_m, points_m) - along_m * along_m
-        ahead_m = self.distance_m[:, None] - along_m
-        limit_m = (np.sqrt(2.0, dtype=np.float32) * self.half_m / self.distance_m)[
-            :, None
-        ] * ahead_m + slack_m
-        return (ahead_m > _NEAREST_M) & (across2 <= limit_m * limit_m)
+    def beside(self, points_m: F32, rows: Ints, slack_m: float) -> Ints:
+        """Points that may lie between the target and any of some eyes, or within slack_m of that; or more.
+
+        All lie in a cone around the eyes' common direction, widened by how wide a window's pyramid gets.
+        """
+        middle = self.towards[rows].mean(0)
+        middle /= max(float(np.linalg.norm(middle)), 1e-6)
+        spread = float(np.arccos(np.clip(self.towards[rows] @ middle, -1, 1).min()))
+        behind_m = float(self.half_m[rows].max()) + _MARGIN_M + slack_m
+        slope = np.sqrt(2) * self.half_m[rows] / self.distance_m[rows]
+        wide_m = float((slope * (self.distance_m[rows] + behind_m)).max()) + slack_m
+        far_m = np.sqrt(np.einsum("ij,ij->i", points_m, points_m))
+        close = far_m <= np.hypot(wide_m, behind_m)
+        angle = spread + np.arcsin(np.minimum(wide_m / np.maximum(far_m, 1e-6), 1)) + 1e-3
+        return np.flatnonzero(close | (points_m @ middle >= far_m * np.cos(np.minimum(angle, np.pi))))
+
+    def before(self, points_m: F32, slack_m: F32 | float, rows: Ints, nearest_m: F32) -> tuple[Ints, Ints]:
+        """Pairs of eye (an index into `rows`) and point that lies in the cone around the eye's window, or
+        within its slack_m (M,) of it, nearer to the eye than nearest_m (len(rows),).
+        """
+        along_m = self.towards[rows] @ points_m.T
+        ahead_m = self.distance_m[rows, None] - along_m
+        slope = np.sqrt(2.0, dtype=np.float32) * self.half_m[rows] / self.distance_m[rows]
+        limit_m = slope[:, None] * ahead_m + slack_m
+        inside = np.einsum("ij,ij->i", points_m, points_m) - along_m * along_m <= limit_m * limit_m
+        inside &= ahead_m > _NEAREST_M
+        inside &= along_m + slack_m > nearest_m[:, None]
+        eye, point = np.nonzero(inside)
+        return eye, point
 
     def nearest_m(self, points_m: F32) -> F32:
         """How far towards the eye the nearest point of each cell (N, cells, cells) is, or -inf."""
         depths = np.full((len(self.distance_m), _CELLS, _CELLS), -np.inf, np.float32)
-        eye, point = np.nonzero(self.near_line(points_m))
-        x, y, along_m, _ = self._seen(eye, points_m[point])
-        column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        inside = (column >= 0) & (column < _CELLS) & (row >= 0) & (row < _CELLS)
-        cell = (eye * _CELLS + row) * _CELLS + column
-        np.maximum.at(depths.reshape(-1), cell[inside], along_m[inside])
+        step = max(1, _AT_ONCE // max(len(points_m), 1))
+        for start in range(0, len(depths), step):
+            rows = slice(start, start + step)
+            along_m = self.towards[rows] @ points_m.T
+            ahead_m = self.distance_m[rows, None] - along_m
+            per_cell_m = self.per_depth[rows, None] * np.maximum(ahead_m, _NEAREST_M)
+            x = (self.right[rows] @ points_m.T) / per_cell_m + _CELLS / 2
+            y = (self.up[rows] @ points_m.T) / per_cell_m + _CELLS / 2
+            inside = (ahead_m > _NEAREST_M) & (x >= 0) & (x < _CELLS) & (y >= 0) & (y < _CELLS)
+            eye, point = np.nonzero(inside)
+            cell = (eye * _CELLS + y[eye, point].astype(np.int64)) * _CELLS + x[eye, point].astype(np.int64)
+            np.maximum.at(depths[rows].reshape(-1), cell, along_m[eye, point])
         return depths
 
-    def hidden(self, discs: _Discs, front_m: F32) -> Bools:
-        """In which cells (N, cells, cells) a disc lies clearly before what is there at `front_m`."""
-        eye, disc = np.nonzero(self.near_line(discs.centre_m, discs.radius_m))
-        front = np.where(front_m > -np.inf, front_m, np.inf)
-        ahead = (discs.centre_m[disc] * self.towards[eye]).sum(1) + discs.radius_m[disc]
-        eye, disc = (a[ahead > front.min((1, 2))[eye] + _MARGIN_M] for a in (eye, disc))
-        x, y, along_m, cell_m = self._seen(eye, discs.centre_m[disc])
-        normal, radius_m = discs.normal[disc], discs.radius_m[disc]
-        pair, column, row = _cells_within(x, y, radius_m / cell_m)
-        dx, dy = column + np.float32(0.5) - x[pair], row + np.float32(0.5) - y[pair]
-        # The plane's rise towards the eye, by cell; a disc seen from its edge is one cell thick.
-        facing = (normal * self.towards[eye]).sum(1)
+    def hide(self, discs: Discs, eye: Ints, disc: Ints, limit_m: F32, hidden: Bools) -> None:
+        """Set the cells of `hidden` (N * cells * cells,) in which a pair's disc is nearer than limit_m.
+
+        A disc is seen as an ellipse: in each row of cells it covers those from one root of a quadratic
+        equation to the other. One seen from its edge is one cell thick.
+        """
+        centre_m, towards = discs.centre_m[disc], self.towards[eye]
+        along_m = np.einsum("ij,ij->i", centre_m, towards)
+        cell_m = self.per_depth[eye] * (self.distance_m[eye] - along_m)
+        x = np.einsum("ij,ij->i", centre_m, self.right[eye]) / cell_m + np.float32(_CELLS / 2)
+        y = np.einsum("ij,ij->i", centre_m, self.up[eye]) / cell_m + np.float32(_CELLS / 2)
+        own_x, own_y = np.floor(x), np.floor(y)
+        inside = (own_x >= 0) & (own_x < _CELLS) & (own_y >= 0) & (own_y < _CELLS)
+        own = np.where(inside, (eye * _CELLS + own_y.astype(np.int64)) * _CELLS + own_x.astype(np.int64), -1)
+        hidden[own[inside & (along_m > limit_m[own])]] = True
+        # The plane's rise towards the eye, by cell.
+        normal = discs.normal[disc]
+        facing = np.einsum("ij,ij->i", normal, towards)
         facing = np.where(np.abs(facing) < 1e-3, np.float32(1e-3), facing)
-        rise_x = -(normal * self.right[eye]).sum(1) / facing * cell_m
-        rise_y = -(normal * self.up[eye]).sum(1) / facing * cell_m
-        own = (np.abs(dx) <= 0.5) & (np.abs(dy) <= 0.5)
-        rise_m = np.where(own, np.float32(0), rise_x[pair] * dx + rise_y[pair] * dy)
-        gap2 = (dx * dx + dy * dy) * (cell_m * cell_m)[pair] + rise_m * rise_m
-        cell = (eye[pair] * _CELLS + row) * _CELLS + column
-        before = along_m[pair] + rise_m > front.reshape(-1)[cell] + _MARGIN_M
-        hidden = np.zeros(front.size, np.bool_)
-        hidden[cell[before & (own | (gap2 <= (radius_m * radius_m)[pair]))]] = True
-        return hidden.reshape(front.shape)
-
-    def _seen(self, eye: Ints, points_m: F32) -> tuple[F32, F32, F32, F32]:
-        """Where eyes see points (K, 3): column and row, in cells; metres towards the eye; metres a cell."""
-        along_m = (points_m * self.towards[eye]).sum(1)
-        per_depth = 2 / _CELLS * self.half_m / self.distance_m
-        cell_m = per_depth[eye] * (self.distance_m[eye] - along_m)
-        x = (points_m * self.right[eye]).sum(1) / cell_m + _CELLS / 2
-        y = (points_m * self.up[eye]).sum(1) / cell_m + _CELLS / 2
-        return x, y, along_m, cell_m
+        rise_x = -np.einsum("ij,ij->i", normal, self.right[eye]) / facing * cell_m
+        rise_y = -np.einsum("ij,ij->i", normal, self.up[eye]) / facing * cell_m
+        # (dx^2 + dy^2) cell_m^2 + (rise_x dx + rise_y dy)^2 <= radius_m^2, solved for dx.
+        cell2, radius_m = cell_m * cell_m, discs.radius_m[disc]
+        a, whole = cell2 + rise_x * rise_x, cell2 + rise_x * rise_x + rise_y * rise_y
+        reach = radius_m / cell_m * np.sqrt(a / whole)
+        pair, row = _spread(*_within(y, reach))
+        dy = row + np.float32(0.5) - y[pair]
+        root = (a * radius_m * radius_m)[pair] - (cell2 * whole)[pair] * dy * dy
+        half = np.sqrt(np.maximum(root, 0)) / a[pair]
+        middle = x[pair] - (rise_x * rise_y / a)[pair] * dy
+        span, column = _spread(*_within(middle, half))
+        rows = pair[span]
+        cell = ((eye * _CELLS)[pair] + row)[span] * _CELLS + column
+        at_m = (along_m[pair] + rise_y[pair] * dy - (rise_x * x)[pair])[span]
+        at_m += rise_x[rows] * (column + np.float32(0.5))
+        hidden[cell[(at_m > limit_m[cell]) & (cell != own[rows])]] = True
 
 
-def _cells_within(x: F32, y: F32, reach: F32) -> tuple[Ints, Ints, Ints]:
-    """Pair, column and row of every cell in the squares of half-width `reach` around x, y (K,), in cells."""
-    low = [np.clip(np.floor(c - reach), 0, _CELLS).astype(np.int32) for c in (x, y)]
-    high = [np.clip(np.floor(c + reach) + 1, 0, _CELLS).astype(np.int32) for c in (x, y)]
-    width, height = high[0] - low[0], high[1] - low[1]
-    count = width * height
-    pair = np.repeat(np.arange(len(x), dtype=np.int32), count)
-    k = np.arange(len(pair), dtype=np.int32) - (np.cumsum(count, dtype=np.int32) - count)[pair]
-    down, across = np.divmod(k, width[pair])
-    return pair, low[0][pair] + across, low[1][pair] + down
+def _within(middle: F32, half: F32) -> tuple[Ints, Ints]:
+    """First and last of the cells whose centres lie within `half` of `middle` (K,), in cells."""
+    low = np.clip(np.ceil(middle - half - np.float32(0.5)), 0, _CELLS).astype(np.int32)
+    high = np.clip(np.floor(middle + half - np.float32(0.5)), -1, _CELLS - 1).astype(np.int32)
+    return low, high
 
 
-def _closed(depths_m: F32) -> F32:
+def _spread(low: Ints, high: Ints) -> tuple[Ints, Ints]:
+    """The row and the value of each whole number from low (K,) to high (K,), both included."""
+    count = np.maximum(high - low + 1, 0)
+    row = np.repeat(np.arange(len(low), dtype=np.int32), count)
+    begin = np.cumsum(count, dtype=np.int32) - count
+    return row, np.arange(len(row), dtype=np.int32) - (begin - low)[row]
+
+
+def closed(depths_m: F32) -> F32:
     """Gaps between points filled from the cells beside them; the outline does not grow."""
     padded = np.pad(depths_m, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     grown = np.maximum.reduce([padded[:, 1:-1, 1:-1], *_beside(padded)])
@@ -207,7 +276,7 @@ def _closed(depths_m: F32) -> F32:
     return np.where((depths_m > -np.inf) | inside, grown, -np.inf).astype(np.float32)
 
 
-def _majority(hidden: Bools, on_target: Bools) -> Bools:
+def majority(hidden: Bools, on_target: Bools) -> Bools:
     """Hidden where most of the target's cells around a cell are: holes between points close, specks go."""
     counts: list[Array] = []
     for cells in (hidden, on_target):
