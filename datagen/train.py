@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -17,7 +17,7 @@ from datagen.training.options import model_sizes, read_augmentation, share_cores
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
-    from train.training.checkpoints import CheckpointHead
+    from train.training.checkpoints import CheckpointHead, EpochRecord
     from train.training.stages import Job
 
 Whole = Annotated[int | None, WHOLE_NUMBER]
@@ -163,8 +163,13 @@ def _report(out: Path, finished: bool, json: bool) -> int:
     return 130
 
 
-def _rows(head: CheckpointHead, best: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str, str]]:
     yield "model", f"{head.model}, {head.stage}, sha256 {head.digest[:16]}"
+    for name, runs in (("learned from", head.data), ("judged on", head.val_data)):
+        for run in runs:
+            labels = f"{run['n_samples']:,} {run['schema']} labels of {run['n_scenes']:,} scenes"
+            specified = "+".join(spec_hash[:12] for spec_hash in run["spec_hashes"])
+            yield name, f"{labels}, by {specified}, samples {run['samples_sha256'][:12]}"
     yield "trained", f"{head.epoch} epochs, {head.step:,} steps"
     if best is not None:
         balanced, auc = best["val_balanced_accuracy"], best["val_auc"]
@@ -173,6 +178,6 @@ def _rows(head: CheckpointHead, best: dict[str, Any] | None) -> Iterator[tuple[s
         numbers += [f"AUC {auc:.4f}"] if auc is not None else []
         yield "validation", f"epoch {head.best_epoch}: {', '.join(numbers)}"
     wall_s, cpu_s = head.cost.get("train_wall_s", 0.0), head.cost.get("train_cpu_s", 0.0)
-    yield "time", f"{seconds(wall_s)} ({seconds(cpu_s)} of CPU)"
-    if wall_s > 0:
-        yield "data", f"{head.cost.get('data_wait_s', 0.0) / wall_s:.1%} of the time was waited for it"
+    waited = head.cost.get("data_wait_s", 0.0) / wall_s if wall_s > 0 else 0.0
+    yield "time", f"{seconds(wall_s)}, {waited:.1%} of it waiting for data"
+    yield "cost", f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU for labels, {seconds(cpu_s)} to train"

@@ -6,10 +6,10 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from schemas.at_once import in_order
 from schemas.errors import InputError
@@ -38,6 +38,23 @@ class _Draw(IntEnum):
     ORDER = 0
     CANDIDATES = 1
     AUGMENT = 2
+
+
+class Origin(TypedDict):
+    """What a run is known by, in values that JSON can hold.
+
+    `samples_sha256` is over the ids and labels of the samples that count, in stored order: the same for a
+    run, its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run, or is None for
+    a sealed store that came alone.
+    """
+
+    spec_hashes: list[str]
+    schema: str
+    schema_version: int
+    n_samples: int
+    n_scenes: int
+    samples_sha256: str
+    cost: dict[str, float] | None
 
 
 class SampleStream:
@@ -129,13 +146,8 @@ class SampleStream:
         """Digests of all objects in its scenes, targets and clutter."""
         return set(self._scenes.object_digests)
 
-    def origin(self) -> list[dict[str, Any]]:
-        """What a checkpoint says of its data, a run at a time, in values that JSON can hold.
-
-        `samples_sha256` is over the ids and labels of the samples that count, in stored order: the same
-        for a run, its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run, or
-        is None for a sealed store that came alone.
-        """
+    def origin(self) -> list[Origin]:
+        """What a checkpoint says of its data, a run at a time."""
         return [
             {
                 "spec_hashes": list(summary.part.spec_hashes),

@@ -23,11 +23,22 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
 from schemas.errors import InputError
+from train.dataset import Origin
 from train.models import Model, build_model
 from train.training.inert import MAX_BYTES, refuse_foreign
+from train.training.validation import Measured
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
 _MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
+
+
+class EpochRecord(Measured):
+    """What an epoch came to."""
+
+    epoch: int  # counted from 1
+    step: int
+    loss: float  # of training
+    accuracy: float
 
 
 @dataclass(frozen=True)
@@ -40,14 +51,14 @@ class CheckpointHead:
     model_config: dict[str, Any]
     stage: str  # stage1, stage2 or sim-only
     options: dict[str, Any]  # of training, resolved
-    data: tuple[dict[str, Any], ...]  # a run each: `SampleStream.origin()`
-    val_data: tuple[dict[str, Any], ...]
+    data: tuple[Origin, ...]
+    val_data: tuple[Origin, ...]
     house_ids: tuple[str, ...]  # trained on, by the checkpoint that this one began from too
     object_digests: tuple[str, ...]  # the same of objects
     val_house_ids: tuple[str, ...]  # decided which epoch is the best
     cost: dict[str, float]  # label_cpu_s, train_cpu_s, train_wall_s; what it began from is not in it
     versions: dict[str, str]
-    history: tuple[dict[str, Any], ...]  # an epoch each
+    history: tuple[EpochRecord, ...]
     step: int = 0  # optimiser's steps behind the last weights
     epoch: int = 0  # whole epochs behind them
     best_epoch: int | None = None  # whose weights `load_model` gives, counted from 1; None before the first

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from schemas.errors import InputError
 from train.inputs import Array, Batch
 from train.models import Model
 from train.tensors import to_torch
+from train.training.checkpoints import EpochRecord
 from train.training.optimising import rate_at, set_rate
 from train.training.options import Options
 from train.training.ranks import Ranks
@@ -48,7 +49,7 @@ class Position:
     batch: int = 0  # done of the epoch under way
     step: int = 0
     sums: list[float] = field(default_factory=lambda: [0.0] * 4)  # the epoch's weight, loss, hits, samples
-    history: list[dict[str, Any]] = field(default_factory=list)
+    history: list[EpochRecord] = field(default_factory=list)
     best_epoch: int | None = None  # with the lowest validation loss, counted from 1
     best_weights: dict[str, Tensor] = field(default_factory=dict)
     finished: bool = False
@@ -144,7 +145,7 @@ def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
     weight, loss, hits, samples = at.sums
-    record = {
+    record: EpochRecord = {
         "epoch": at.epoch + 1,
         "step": at.step,
         "loss": loss / weight,
@@ -165,7 +166,7 @@ def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
     )
     wall_s, cpu_s = training.ranks.total(spent).tolist()
     _pay(at, wall_s, cpu_s, 0.0)
-    watcher.epoch(record | {"best": best})
+    watcher.epoch({**record, "best": best})
 
 
 def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from schemas.errors import InputError
 from train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
@@ -17,9 +17,16 @@ from train.tensors import to_torch
 from train.training.ranks import Ranks
 
 
-def validate(
-    model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks
-) -> dict[str, Any]:
+class Measured(TypedDict):
+    """What a model came to on samples; what is not defined with one class alone is None."""
+
+    val_loss: float
+    val_accuracy: float
+    val_balanced_accuracy: float | None
+    val_auc: float | None
+
+
+def validate(model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks) -> Measured:
     """Loss (the stage's own), accuracy, balanced accuracy and AUC over all ranks' batches.
 
     Numbers that are not defined, with one class alone, are None. InputError where the loss is not a number.
@@ -48,10 +55,10 @@ def validate(
         mend = "Train again with a smaller --lr, or look at the samples with `datagen verify`"
         raise InputError("validation", "loss", f"{mean_loss} over {len(loss)} samples", mend)
     counts = confusion((p >= 0.5).astype(np.float64), label == 1, np.zeros(len(p), np.int64), 1)[0]
-    measured = {
+    balanced, auc = float(balanced_accuracy(counts)), area_under_roc(label == 1, p)
+    return {
         "val_loss": mean_loss,
         "val_accuracy": float(accuracy(counts)),
-        "val_balanced_accuracy": float(balanced_accuracy(counts)),
-        "val_auc": area_under_roc(label == 1, p),
+        "val_balanced_accuracy": balanced if np.isfinite(balanced) else None,
+        "val_auc": auc if np.isfinite(auc) else None,
     }
-    return {name: value if np.isfinite(value) else None for name, value in measured.items()}

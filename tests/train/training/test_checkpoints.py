@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 
 from schemas.errors import InputError
 from tests.train.training.small import TINY, equal
+from train.dataset import Origin
 from train.models import build_model
 from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
+    EpochRecord,
     load_model,
     only_writer,
     read_checkpoint,
@@ -30,13 +32,22 @@ from train.training.checkpoints import (
 )
 from train.training.inert import MAX_BYTES
 
+ORIGIN: Origin = {
+    "spec_hashes": ["b"], "schema": "sim", "schema_version": 2, "n_samples": 3, "n_scenes": 1,
+    "samples_sha256": "a", "cost": {"cpu_s": 0.1},
+}  # fmt: skip
+EPOCH: EpochRecord = {
+    "epoch": 1, "step": 2, "loss": 0.4, "accuracy": 0.5,
+    "val_loss": 0.1 + 0.2, "val_accuracy": 1.0, "val_balanced_accuracy": None, "val_auc": None,
+}  # fmt: skip
+
 
 def head_of(**changes: Any) -> CheckpointHead:
     fields: dict[str, Any] = {
         "model": "shared", "model_config": build_model("shared", TINY).config, "stage": "stage1",
-        "options": {"lr": 1e-3}, "data": ({"samples_sha256": "a"},), "val_data": (), "house_ids": ("h1",),
+        "options": {"lr": 1e-3}, "data": (ORIGIN,), "val_data": (), "house_ids": ("h1",),
         "object_digests": (), "val_house_ids": ("h3",), "cost": {"train_cpu_s": 0.1}, "versions": {},
-        "history": ({"epoch": 1, "val_loss": 0.1 + 0.2, "val_auc": None},),
+        "history": (EPOCH,),
     }  # fmt: skip
     return CheckpointHead(**{**fields, **changes})
 
@@ -230,6 +241,8 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path):
         (Checkpoint(head_of(model="none"), whole.weights), "no such model"),
         (Checkpoint(head_of(model_config={"width": 10**9}), whole.weights), "width"),
         (Checkpoint(head_of(epoch="x"), whole.weights), "epoch"),
+        (Checkpoint(head_of(data=({"schema": "sim"},)), whole.weights), "spec_hashes"),
+        (Checkpoint(head_of(history=({"epoch": 1},)), whole.weights), "val_loss"),
     ]
     for checkpoint, words in cases:
         write_checkpoint(tmp_path / "c.ckpt", checkpoint)
