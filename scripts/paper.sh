@@ -16,12 +16,12 @@ OUT=$(realpath -m "${2:-$ROOT/build/paper$([ "$SIZE" = full ] || echo -small)}")
 case $SIZE in
 small)
     HEURISTIC=${HEURISTIC:-24000}       # labels of the rule, in training houses
-    SIM_IN_RANGE=${SIM_IN_RANGE:-3000}  # trials at clear candidates within reach, in training houses
-    SIM_CLEAR=${SIM_CLEAR:-3000}        # trials at clear candidates, in training houses
-    VAL_IN_RANGE=${VAL_IN_RANGE:-1500}  # the same in validation houses: for the rule, and to stop by
-    VAL_CLEAR=${VAL_CLEAR:-1500}
-    TEST_IN_RANGE=${TEST_IN_RANGE:-900} # in test houses, with objects that nothing was trained on
-    TEST_SCENES=${TEST_SCENES:-24}      # whole grids there
+    SIM_IN_RANGE=${SIM_IN_RANGE:-1500}  # trials at clear candidates within reach, in training houses
+    SIM_CLEAR=${SIM_CLEAR:-1500}        # trials at clear candidates, in training houses
+    VAL_IN_RANGE=${VAL_IN_RANGE:-900}   # the same in validation houses: for the rule, and to stop by
+    VAL_CLEAR=${VAL_CLEAR:-600}
+    TEST_IN_RANGE=${TEST_IN_RANGE:-1500}  # in test houses, with objects that nothing was trained on
+    TEST_SCENES=${TEST_SCENES:-24}        # whole grids there
     EPOCHS_1=${EPOCHS_1:-6}             # at most, of stage 1 ...
     EPOCHS_2=${EPOCHS_2:-12}            # ... and of the two trainings on trials
     ;;
