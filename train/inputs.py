@@ -16,6 +16,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from schemas.errors import InputError
+
 A = TypeVar("A")  # np.ndarray or torch.Tensor
 Array = npt.NDArray[Any]
 
@@ -88,3 +90,15 @@ def mount_distance_m(
     planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64), axis=1)
     rise_m = clouds.target_height_m[robots.cloud_row] - robots.base_height_m.astype(np.float64)
     return np.hypot(planar_m, rise_m[candidates.robot_row])
+
+
+def column(batch: Batch[Array], name: str) -> Array:
+    """A further column of the store. InputError where the batch was read without it."""
+    if name not in batch.extra:
+        raise InputError("batch", name, "it was read without this column", f"Read it with extra=({name!r},)")
+    return batch.extra[name]
+
+
+def is_clear(batch: Batch[Array]) -> npt.NDArray[np.bool_]:
+    """Where (N,) the base fits. InputError where the batch was read without it."""
+    return column(batch, "base_is_clear").astype(np.bool_)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from train.inputs import Array, Batch
+from train.inputs import Array, Batch, is_clear
 
 if TYPE_CHECKING:
     from train.models import Model
@@ -34,14 +34,22 @@ class Scorer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelScorer:
-    """A model in evaluation mode, whatever mode it is in: its probability of label 1."""
+    """A model in evaluation mode, whatever mode it is in: its probability of label 1.
+
+    With `only_clear` it is told where the base fits, as the baselines are, and says 0 where it does not:
+    models are trained on places that are clear, and what they make of others means nothing.
+    """
 
     model: Model
     name: str
     threshold: float = 0.5
+    only_clear: bool = False
 
     def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
-        """Probabilities (N,); the model itself goes through its candidates in parts that memory allows."""
+        """Probabilities (N,); the model itself goes through its candidates in parts that memory allows.
+
+        InputError where it has to know what is clear and the batch was read without `base_is_clear`.
+        """
         import torch
 
         from train.tensors import to_torch
@@ -52,9 +60,10 @@ class ModelScorer:
             with torch.inference_mode():
                 given = to_torch(batch, self.model.device)
                 logits = self.model.score(given.clouds, given.candidates, given.robots).double()
-                return torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
+                chance = torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
         finally:
             self.model.train(trained)
+        return np.where(is_clear(batch), chance, 0.0) if self.only_clear else chance
 
 
 def use_threads(n: int) -> None:

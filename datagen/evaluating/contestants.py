@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from schemas.errors import InputError
+from train.evaluation.comparisons import Origin
 from train.evaluation.evaluation import Method
 from train.scorers import ModelScorer, Scorer
 
@@ -41,7 +42,8 @@ class Contestant:
     @property
     def method(self) -> Method:
         """As metrics know it."""
-        return Method(self.name, self.scorer.threshold, self.regime)
+        model = self.head.model if self.head else ""
+        return Method(self.name, self.scorer.threshold, Origin(self.regime, model))
 
     @property
     def houses(self) -> frozenset[str]:
@@ -95,7 +97,7 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
             raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
         by_digest[head.digest] = place
     return [
-        Contestant(name, ModelScorer(model, name), place, head)
+        Contestant(name, ModelScorer(model, name, only_clear=True), place, head)
         for (place, model, head), name in zip(loaded, names, strict=True)
     ]
 

@@ -12,6 +12,7 @@ from datagen.reports.specified import specification_record
 from schemas.errors import InputError
 from schemas.merged import open_runs
 from schemas.specification import Specification
+from train.baselines import FIELDS
 from train.dataset import SampleStream
 from train.evaluation.columns import EXTRA
 from workers.bases.candidate_sets import CANDIDATE_SETS
@@ -85,7 +86,8 @@ def open_places(places: Sequence[str]) -> list[Place]:
             if other != spec.hash():
                 problem = "its scenes are those of another run here, labelled otherwise"
                 raise InputError(place, "scenes", problem, "Evaluate the two apart")
-        stream = SampleStream([place], scenes_per_batch=SCENES_PER_BATCH, extra=EXTRA, shuffle=False)
+        extra = tuple(dict.fromkeys((*EXTRA, *FIELDS)))
+        stream = SampleStream([place], scenes_per_batch=SCENES_PER_BATCH, extra=extra, shuffle=False)
         opened.append(Place(place, specs, stream))
     return opened
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from schemas.specification import HeuristicParams
-from train.baselines.baseline import F64, is_clear, mount_m, observed_rho, planar_distance_m, reach_m
-from train.inputs import Array, Batch
+from train.baselines.baseline import F64, mount_m, observed_rho, planar_distance_m, reach_m
+from train.inputs import Array, Batch, is_clear
 from workers.labels.heuristic import heuristic
 
 _PAPER = HeuristicParams()

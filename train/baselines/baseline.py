@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError
-from train.inputs import Array, Batch, mount_distance_m
+from train.inputs import Array, Batch, is_clear, mount_distance_m
 from train.observed_visibility import observed_visibility
 from train.scorers import Scorer
 
@@ -18,7 +18,7 @@ F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 # Columns that a batch must bring along for baselines.
-FIELDS = ("base_is_clear", "object_name")
+FIELDS = ("base_is_clear", "base_clearance_m", "object_name")
 # Above any distance and probability: a candidate that is ruled out is worse by it than any other.
 RULED_OUT = 100.0
 
@@ -58,21 +58,9 @@ def reach_m(batch: Batch[Array]) -> F64:
     return batch.robots.arm_reach_m[batch.candidates.robot_row].astype(np.float64)
 
 
-def is_clear(batch: Batch[Array]) -> Bools:
-    """Where (N,) the base fits. InputError where the batch was read without it."""
-    return column(batch, "base_is_clear").astype(np.bool_)
-
-
 def is_feasible(batch: Batch[Array]) -> Bools:
     """Where (N,) the base fits and the target is within the arm's reach."""
     return is_clear(batch) & (mount_m(batch) <= reach_m(batch))
-
-
-def column(batch: Batch[Array], name: str) -> Array:
-    """A further column of the store. InputError where the batch was read without it."""
-    if name not in batch.extra:
-        raise InputError("baselines", name, "the batches lack it", f"Read them with extra={FIELDS}")
-    return batch.extra[name]
 
 
 _KNOWN_RHO: WeakKeyDictionary[Batch[Array], F64] = WeakKeyDictionary()

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from train.baselines.baseline import F64, best_cut, column, is_feasible, labels, observed_rho
+from train.baselines.baseline import F64, best_cut, is_feasible, labels, observed_rho
 from train.baselines.detector import Detector
 from train.baselines.views import render_views
-from train.inputs import Array, Batch
+from train.inputs import Array, Batch, column
 from train.observed_visibility import eyes
 
 _VIEWS_AT_ONCE = 8

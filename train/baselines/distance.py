@@ -12,13 +12,12 @@ from train.baselines.baseline import (
     F64,
     RULED_OUT,
     Bools,
-    is_clear,
     labels,
     mount_m,
     planar_distance_m,
     reach_m,
 )
-from train.inputs import Array, Batch
+from train.inputs import Array, Batch, is_clear
 
 Kind = Literal["planar", "planar-over-reach", "mount-over-reach"]
 KINDS: tuple[Kind, ...] = ("planar", "planar-over-reach", "mount-over-reach")

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from train.baselines.baseline import F64, RULED_OUT, is_clear, planar_distance_m
-from train.inputs import Array, Batch
+from train.baselines.baseline import F64, RULED_OUT, planar_distance_m
+from train.inputs import Array, Batch, is_clear
 
 
 @dataclass(frozen=True)

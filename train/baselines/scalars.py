@@ -11,18 +11,17 @@ import numpy as np
 from schemas.errors import InputError
 from train.baselines.baseline import (
     F64,
-    is_clear,
     labels,
     mount_m,
     observed_rho,
     planar_distance_m,
     reach_m,
 )
-from train.inputs import Array, Batch
+from train.inputs import Array, Batch, column, is_clear
 
 FEATURES = (
     *("distance_m", "mount_distance_m", "reach_m", "distance_over_reach", "mount_over_reach"),
-    *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho"),
+    *("rise_m", "camera_rise_m", "target_height_m", "target_radius_m", "observed_rho", "base_clearance_m"),
 )
 _WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
 
@@ -76,7 +75,7 @@ class Scalars:
 
 
 def features(batch: Batch[Array]) -> F64:
-    """The numbers (N, 10) of every candidate, in the order of `FEATURES`."""
+    """The numbers (N, 11) of every candidate, in the order of `FEATURES`."""
     robot = batch.candidates.robot_row
     cloud = batch.robots.cloud_row[robot]
     height_m = batch.clouds.target_height_m[cloud].astype(np.float64)
@@ -90,7 +89,7 @@ def features(batch: Batch[Array]) -> F64:
                 height_m,
                 batch.clouds.target_radius_m[cloud],
                 observed_rho(batch),
-                is_clear(batch).astype(float),
+                column(batch, "base_clearance_m"),
             ),
         ]
     )

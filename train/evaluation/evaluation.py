@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,29 +16,29 @@ from train.evaluation import metrics
 from train.evaluation.bootstrap import (
     Estimate,
     Weights,
-    are_disjoint,
     resample_weights,
     resampled_area_under_roc,
     summed,
-    verdict,
 )
 from train.evaluation.breakdown import breakdown, groups_of
 from train.evaluation.columns import Columns
+from train.evaluation.comparisons import NO_TRAINING, Origin, comparisons, differences, finite, said_of
 from train.evaluation.grids import picks, select
 from train.evaluation.metrics import F64, Bools
 
 _CURVE_POINTS = 200
 # In the order in which they are told; differences are told of each.
-METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
+METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick", "mean_average_precision")
+GRID_METRICS = ("good", "mean_average_precision")
 
 
 @dataclass(frozen=True)
 class Method:
-    """What is evaluated: its name among the scores, and the regime that trained it ("" of a baseline)."""
+    """What is evaluated: its name among the scores, and what trained it, which no baseline has."""
 
     name: str
     threshold: float
-    stage: str = ""
+    origin: Origin = NO_TRAINING
 
     @property
     def only_picks(self) -> bool:
@@ -95,6 +94,7 @@ def evaluate_set(
             for m in methods
         },
         "differences": differences(estimates, METRICS),
+        "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, METRICS),
         "curves": {m.name: _curves(columns.label, columns.scores[m.name]) for m in methods},
         "breakdown": [
             {**row, "methods": {k: _plain(v) for k, v in row["methods"].items()}}
@@ -119,7 +119,9 @@ def _estimates(columns: Columns, method: Method, said: F64, weights: Weights) ->
     found["area_under_roc"] = Estimate(
         metrics.area_under_roc(true, score), resampled_area_under_roc(weights, true, score, columns.scene)
     )
-    found["best_pick"] = _picked(columns, method, weights)["good"]
+    picked = _picked(columns, method, weights)
+    found["best_pick"] = picked["good"]
+    found["mean_average_precision"] = picked["mean_average_precision"]
     for name, rows in (("in_reach", columns.is_reachable), ("out_of_reach", ~columns.is_reachable)):
         whole, drawn = counted(rows)
         found[f"accuracy_{name}"] = Estimate(float(metrics.accuracy(whole)), metrics.accuracy(drawn))
@@ -140,54 +142,36 @@ def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights
         "positives_per_scene": float(positives[some].mean()) if some.any() else None,
         "any_clear": float((positives[some] / offered[some]).mean()) if some.any() else None,
         "methods": {name: {k: said_of(e) for k, e in found.items()} for name, found in estimates.items()},
-        "differences": differences(estimates, ("good",)),
+        "differences": differences(estimates, GRID_METRICS),
+        "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, GRID_METRICS),
     }
 
 
 def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Estimate]:
-    """Share of good picks, and mean distance of the others to the nearest good candidate of their robot."""
+    """What each robot with a good clear candidate is given, on average over such robots.
+
+    The share of good picks, the mean distance of the others to the nearest good candidate, and the average
+    precision of the order in which its clear candidates stand.
+    """
     score = columns.scores[method.name]
     chosen = select(score, columns.label, columns.base_xy_m, columns.robot, columns.is_clear)
     scene_of = np.zeros(int(columns.robot.max(initial=-1)) + 1, np.int64)
     scene_of[columns.robot] = columns.scene
     wrong = 1 - chosen.good
-    parts = np.stack([chosen.good, np.ones_like(wrong), wrong * chosen.missed_m, wrong], axis=1)
-    per_scene = np.zeros((columns.n_scenes, 4))
+    one = np.ones_like(wrong)
+    parts = np.stack([chosen.good, one, wrong * chosen.missed_m, wrong, chosen.precision, one], axis=1)
+    per_scene = np.zeros((columns.n_scenes, parts.shape[1]))
     np.add.at(per_scene, scene_of[chosen.group], parts)
     whole, drawn = per_scene.sum(axis=0), summed(weights, per_scene)
     return {
-        "good": Estimate(float(_share(whole, 0)), _share(drawn, 0)),
-        "missed_m": Estimate(float(_share(whole, 2)), _share(drawn, 2)),
+        name: Estimate(float(_share(whole, first)), _share(drawn, first))
+        for name, first in (("good", 0), ("missed_m", 2), ("mean_average_precision", 4))
     }
 
 
 def _share(sums: F64, first: int) -> F64:
     part, whole = sums[..., first], sums[..., first + 1]
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
-
-
-def differences(
-    estimates: Mapping[str, Mapping[str, Estimate]], names: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Every two methods by each metric: the difference, what can be said of it, and of the two intervals."""
-    return [
-        {
-            "metric": metric,
-            "first": first,
-            "second": second,
-            **said_of(difference := estimates[first][metric].minus(estimates[second][metric])),
-            "verdict": verdict(difference),
-            "disjoint": are_disjoint(estimates[first][metric], estimates[second][metric]),
-        }
-        for metric in names
-        for first, second in combinations(estimates, 2)
-    ]
-
-
-def said_of(estimate: Estimate) -> dict[str, float | None]:
-    """Value and interval as JSON has them."""
-    low, high = estimate.interval()
-    return {"value": _finite(estimate.value), "low": _finite(low), "high": _finite(high)}
 
 
 def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:
@@ -222,8 +206,4 @@ def _class_counts(columns: Columns, rows: Bools) -> dict[str, int]:
 
 
 def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: _finite(value) for name, value in values.items()}
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return {name: finite(value) for name, value in values.items()}

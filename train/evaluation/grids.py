@@ -1,4 +1,4 @@
-"""Choosing one of many: the best-scored candidate of each robot, and how far off a wrong one is."""
+"""Choosing one of many: the best-scored candidate of each robot, how far off a wrong one is, the order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from train.evaluation.metrics import F64, Bools, Ints
+from train.evaluation.metrics import F64, Bools, Ints, average_precision
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:
@@ -49,12 +49,14 @@ def nearest_positive_m(base_xy_m: npt.NDArray[np.floating], true: Bools, group: 
 class Selection:
     """What a method picked in each of G groups: its share of good picks, and how far the others missed.
 
-    `missed_m` is the mean distance of the wrong picks, 0 where none was wrong.
+    `missed_m` is the mean distance of the wrong picks, 0 where none was wrong. `precision` is the average
+    precision of the allowed candidates in the order of their scores.
     """
 
     group: npt.NDArray[np.intp]  # (G,) those with an allowed candidate and a positive
     good: F64  # (G,)
     missed_m: F64  # (G,)
+    precision: F64  # (G,)
 
 
 def select(
@@ -71,4 +73,15 @@ def select(
     # All picks of a group have the same share, so that counts give exact ones.
     n, n_wrong = (np.bincount(group[rows], minlength=n_groups)[counted] for rows in (picked, wrong))
     sums_m = np.bincount(group, miss_m, n_groups)[counted]
-    return Selection(counted, (n - n_wrong) / n, sums_m / np.maximum(n_wrong, 1))
+    precision = np.array(
+        [average_precision(true[rows], score[rows]) for rows in _rows_of(group, allowed, counted)]
+    )
+    return Selection(counted, (n - n_wrong) / n, sums_m / np.maximum(n_wrong, 1), precision)
+
+
+def _rows_of(group: Ints, allowed: Bools, groups: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
+    """The allowed candidates of each of these groups."""
+    rows = np.flatnonzero(allowed)
+    rows = rows[np.argsort(group[rows], kind="stable")]
+    starts, ends = (np.searchsorted(group[rows], groups, side) for side in ("left", "right"))
+    return [rows[start:end] for start, end in zip(starts, ends, strict=True)]

@@ -9,6 +9,8 @@ import numpy as np
 
 from train.inputs import Batch, Candidates, Clouds, Robots
 
+PER_CANDIDATE = ("base_is_clear", "base_clearance_m")
+
 
 def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: int = 96) -> Batch[Any]:
     """Scenes with two robots each; labels follow the distance over the reach."""
@@ -44,6 +46,9 @@ def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: in
         sample_id=rng.integers(0, 256, (n, 16)).astype(np.uint8),
         extra={
             "base_is_clear": clear,
+            "base_clearance_m": np.where(clear, rng.uniform(0, 1, n), rng.uniform(-0.3, 0, n)).astype(
+                np.float32
+            ),
             "object_name": np.array([["003_cracker_box"] * 7] * n_scenes, object),
         },
     )
@@ -57,7 +62,7 @@ def take(batch: Batch[Any], rows: np.ndarray) -> Batch[Any]:
         candidates=Candidates(c.robot_row[rows], c.base_xy_m[rows]),
         label=batch.label[rows],
         sample_id=batch.sample_id[rows],
-        extra={**batch.extra, "base_is_clear": batch.extra["base_is_clear"][rows]},
+        extra={**batch.extra, **{name: batch.extra[name][rows] for name in PER_CANDIDATE}},
     )
 
 

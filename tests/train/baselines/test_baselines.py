@@ -16,12 +16,13 @@ from schemas.specification import HeuristicParams
 from tests.train.baselines.scenes import make_batch, moved, take
 from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
 from train.baselines.analytic import Analytic
-from train.baselines.baseline import best_cut, is_clear, is_feasible, observed_rho, planar_distance_m
+from train.baselines.baseline import best_cut, is_feasible, observed_rho, planar_distance_m
 from train.baselines.detection import ThresholdDetector, spoken_name
 from train.baselines.distance import DistanceBand
 from train.baselines.proximity import Proximity
-from train.baselines.scalars import Scalars
+from train.baselines.scalars import FEATURES, Scalars, features
 from train.dataset import SampleStream
+from train.inputs import is_clear
 from workers.labels.heuristic import heuristic
 
 
@@ -116,6 +117,19 @@ def test_scalars_learn_and_are_the_same_for_the_same_seed() -> None:
     again = Scalars(seed=5, steps=300).fit(batches)
     assert np.array_equal(again.score(test), fitted.score(test))
     assert not np.array_equal(Scalars(seed=6, steps=300).fit(batches).score(test), fitted.score(test))
+
+
+def test_scalars_know_all_that_they_name_and_how_much_room_a_base_has() -> None:
+    batch = make_batch(3)
+    numbers = features(batch)
+    assert numbers.shape == (len(batch), len(FEATURES))
+    room_m = numbers[:, FEATURES.index("base_clearance_m")]
+    assert np.array_equal(room_m >= 0, is_clear(batch))
+    # Labels that follow nothing but the room are learned from it.
+    batches = [make_batch(seed) for seed in range(6)]
+    roomy = [replace(b, label=(b.extra["base_clearance_m"] > 0.4).astype(np.int64)) for b in batches]
+    fitted = Scalars(steps=300).fit(roomy[1:])
+    assert balanced(fitted.score(batches[0]) >= fitted.threshold, roomy[0].label == 1) > 0.9
 
 
 def test_stand_in_says_that_it_is_one_and_cuts_among_what_is_feasible() -> None:

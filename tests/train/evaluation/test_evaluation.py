@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,17 +12,18 @@ import pytest
 from schemas.errors import InputError
 from tests.train.evaluation.made_columns import make_columns
 from train.evaluation.columns import Columns
+from train.evaluation.comparisons import Origin
 from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
 
 METHODS = [
     Method("truth", 0.5),
     Method("constant", 0.5),
-    Method("noisy", 0.5, "stage1"),
+    Method("noisy", 0.5, Origin("stage1", "paper")),
     Method("nearest", float("nan")),
 ]
 
 
-def scored(seed: int = 0, **changes: int) -> Columns:
+def scored(seed: int = 0, **changes: Any) -> Columns:
     rng = np.random.default_rng(seed)
     columns = make_columns(rng, **changes)
     n = len(columns)
@@ -93,7 +95,7 @@ def test_differences_are_of_the_same_resamples_both_ways_round() -> None:
     forth = evaluate_set(columns, METHODS, "clear", weights)["differences"]
     back = evaluate_set(columns, METHODS[::-1], "clear", weights)["differences"]
     by_pair = {(d["metric"], d["first"], d["second"]): d for d in back}
-    assert len(forth) == len(back) == 4 * 6
+    assert len(forth) == len(back) == 5 * 6
     turned = {"above": "below", "below": "above", "open": "open"}
     for d in forth:
         other = by_pair[d["metric"], d["second"], d["first"]]
@@ -136,6 +138,11 @@ def test_grids_count_scenes_with_a_good_candidate_and_say_how_many_have_none() -
             goods = columns.base_xy_m[rows[label[rows]]]
             missed.append(float(np.linalg.norm(goods - columns.base_xy_m[pick], axis=1).min()))
     found = told["methods"]["noisy"]
+    assert told["methods"]["truth"]["mean_average_precision"]["value"] == 1
+    # Where no score tells candidates apart each threshold is the share of good ones.
+    constant = told["methods"]["constant"]["mean_average_precision"]
+    assert constant["value"] == pytest.approx(np.mean(shares))
+    assert constant["value"] < found["mean_average_precision"]["low"] < 1
     assert found["good"]["value"] == pytest.approx(1 - len(missed) / len(some))
     assert found["missed_m"]["value"] == pytest.approx(np.mean(missed))
 

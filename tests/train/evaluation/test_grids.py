@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from train.evaluation.grids import picks, select
+from train.evaluation.metrics import average_precision
 
 
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
@@ -32,6 +33,7 @@ def test_a_selection_is_what_looking_at_every_candidate_gives(seed: int, side: i
         assert found.group[row] == g
         assert found.good[row] == pytest.approx(1 - len(wrong) / len(tied))
         assert found.missed_m[row] == pytest.approx(np.mean(wrong) if wrong else 0, abs=1e-6)
+        assert found.precision[row] == pytest.approx(average_precision(true[members], score[members]))
         row += 1
     assert row == len(found.group)
 
@@ -50,6 +52,8 @@ def test_a_scorer_that_knows_the_truth_never_misses() -> None:
     group = np.repeat(np.arange(20), 30)
     true, xy = rng.random(600) < 0.2, rng.uniform(-1, 1, (600, 2))
     found = select(true.astype(np.float64), true, xy, group, np.ones(600, np.bool_))
-    assert (found.good == 1).all() and (found.missed_m == 0).all()
+    assert (found.good == 1).all() and (found.missed_m == 0).all() and (found.precision == 1).all()
     worst = select(-true.astype(np.float64), true, xy, group, np.ones(600, np.bool_))
     assert (worst.good == 0).all() and (worst.missed_m > 0).all()
+    # All good ones come last, with one score.
+    assert worst.precision == pytest.approx(np.bincount(group, true) / 30)
