@@ -46,7 +46,8 @@ paper: venv
 # failed stays there to be looked at. A test worker has one core: more threads would only wait for each other.
 test: lint
 	@scratch=$$(mktemp -d -p /dev/shm 2>/dev/null || mktemp -d); \
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --basetemp=$$scratch/tests \
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder --basetemp=$$scratch/tests \
 	&& rm -rf $$scratch
 
 # Each ends with an error where a promise was broken.

@@ -25,11 +25,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run.open(folder)
 
 
-def task_of(made: Run, **changes: str) -> ShardTask:
-    sources = {"run": made.storage.url, "houses": "builtin", "objects": "builtin", **changes}
-    return ShardTask(
-        spec=made.manifest.spec, layout=made.layout, shard=0, attempt="probe", deadline_s=0.0, **sources
-    )
+def task_of(made: Run, run: str = "", houses: str = "builtin", objects: str = "builtin") -> ShardTask:
+    place, spec = run or made.storage.url, made.manifest.spec
+    return ShardTask(place, spec, made.layout, 0, "probe", houses, objects, deadline_s=0.0)
 
 
 def one_machine(seen: ShardTask | None = None, **answered: Any) -> Ask:
