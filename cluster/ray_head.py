@@ -20,10 +20,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from cluster.ray_settings import head_arguments, head_environment, new_token
 from schemas.errors import InputError
+from schemas.run_records import StoredRecord
 
 _START_WITHIN_S = 120.0
 _STOP_WITHIN_S = 4.0  # politely; some of Ray's processes do not heed that
@@ -32,10 +33,8 @@ _URL = re.compile(r"http://127\.0\.0\.1:[0-9]{1,5}")
 _MAX_BYTES = 1 << 16
 
 
-class Head(BaseModel):
+class Head(StoredRecord):
     """head.json in the state folder: the head that this user's detached jobs go to."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     jobs_api: str = Field(pattern=r"^http://127\.0\.0\.1:[0-9]{1,5}$")
     token: str = Field(pattern=r"^[0-9a-f]{64}$")

@@ -14,21 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from schemas.errors import InputError
+from schemas.run_records import Digest, StoredRecord
 
 LOCK_NAME = "assets.lock.json"
 _MAX_LOCK_BYTES = 256 * 2**20
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Size = Annotated[int, Field(ge=0, le=2**50)]
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class LockedFile(_Frozen):
+class LockedFile(StoredRecord):
     """One file of the folder."""
 
     path: str  # relative, with forward slashes
@@ -38,7 +34,7 @@ class LockedFile(_Frozen):
     source: str = ""
 
 
-class LockedDownload(_Frozen):
+class LockedDownload(StoredRecord):
     """One fetched file or archive. `trust` says who vouched for the digest."""
 
     name: str
@@ -48,7 +44,7 @@ class LockedDownload(_Frozen):
     trust: Literal["published", "first-use"]
 
 
-class Lock(_Frozen):
+class Lock(StoredRecord):
     """The content of a lock file."""
 
     version: Literal[1] = 1

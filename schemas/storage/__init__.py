@@ -202,7 +202,7 @@ def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> 
     text = str(place)
     if "\0" in text or not text.strip():
         raise InputError(repr(text), "", "not the name of a folder", "Name a folder or an s3:// address")
-    if re.match(r"s3:(?!//)", text):  # a slip of the pen, which would become a folder here
+    if text.startswith("s3:") and not text.startswith("s3://"):  # a slip that would become a folder here
         raise InputError(text[:200], "", "does not name a bucket", "Give s3://bucket/prefix")
     scheme, colon, rest = text.partition("://")
     if colon and scheme == "s3":
