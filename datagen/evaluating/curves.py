@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from datagen.evaluating.svg import BASELINE_COLOURS, LINES, MODEL_COLOURS, new_figure
-from datagen.evaluating.wording import METRIC_WORDS, paper_accuracy
+from datagen.evaluating.wording import METRIC_WORDS, Report, paper_accuracy
 
-Report = Mapping[str, Any]
 _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 
 

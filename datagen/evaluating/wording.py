@@ -5,33 +5,37 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+Report = Mapping[str, Any]
+
 METRIC_WORDS = {
     "accuracy": "accuracy",
     "balanced_accuracy": "balanced accuracy",
     "area_under_roc": "AUC",
     "best_pick": "best pick good",
     "good": "good picks",
+    "mean_average_precision": "mAP",
 }
 SET_WORDS = {
     "in-range": "clear and within reach",
     "clear": "clear",
-    "grid": "all cells, also where the base collides",
+    "grid": "all cells, also where the base collides, which all are told",
 }
 
 
-def percent(value: float | None) -> str:
-    """0.8413 as 84.1."""
-    return "-" if value is None else f"{100 * value:.1f}"
+def percent(value: float | None, signed: bool = False) -> str:
+    """0.8413 as 84.1, or +84.1."""
+    return "-" if value is None else f"{100 * value:{'+' if signed else ''}.1f}"
 
 
-def with_interval(estimate: Mapping[str, float | None]) -> str:
+def with_interval(estimate: Report, signed: bool = False) -> str:
     """Percent with its interval: 84.1 [82.0, 86.2]."""
     if estimate["value"] is None:
         return "-"
-    return f"{percent(estimate['value'])} [{percent(estimate['low'])}, {percent(estimate['high'])}]"
+    value, low, high = (percent(estimate[k], signed) for k in ("value", "low", "high"))
+    return f"{value} [{low}, {high}]"
 
 
-def metres_with_interval(estimate: Mapping[str, float | None]) -> str:
+def metres_with_interval(estimate: Report) -> str:
     """Metres with their interval: 0.24 [0.20, 0.31]."""
     if estimate["value"] is None:
         return "-"
@@ -39,22 +43,22 @@ def metres_with_interval(estimate: Mapping[str, float | None]) -> str:
     return f"{estimate['value']:.2f} [{low}, {high}]"
 
 
-def method_label(record: Mapping[str, Any]) -> str:
+def method_label(record: Report) -> str:
     """A method's name, with a mark where it has no threshold."""
     return record["name"] + (" *" if record["threshold"] is None else "")
 
 
-def paper_accuracy(record: Mapping[str, Any], paper: Mapping[str, Any]) -> float | None:
+def paper_accuracy(record: Report, paper: Report) -> float | None:
     """What the paper states for the same method or regime, if it does."""
     return paper["accuracy"].get(record["regime"] or record["name"])
 
 
-def models_first(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def models_first(records: Sequence[Report]) -> list[Report]:
     """Methods with those that were trained before the baselines."""
     return sorted(records, key=lambda record: record["regime"] is None)
 
 
-def compared(differences: Sequence[Mapping[str, Any]], metric: str, name: str) -> dict[str, list[str]]:
+def compared(differences: Sequence[Report], metric: str, name: str) -> dict[str, list[str]]:
     """Whom a method is `above`, `below` and `open` to by a metric; + where the intervals are disjoint too."""
     found: dict[str, list[str]] = {"above": [], "open": [], "below": []}
     other_way = {"above": "below", "below": "above", "open": "open"}
@@ -67,14 +71,14 @@ def compared(differences: Sequence[Mapping[str, Any]], metric: str, name: str) -
     return found
 
 
-def candidates_line(told: Mapping[str, Any]) -> str:
+def candidates_line(told: Report) -> str:
     """How large a set is: 1,200 candidates of 80 scenes (clear), 31.0% good."""
     share = percent(told["positives"] / told["count"])
     words = SET_WORDS[told["candidates"]]
     return f"{told['count']:,} candidates of {told['scenes']:,} scenes ({words}), {share}% good"
 
 
-def grids_line(grids: Mapping[str, Any]) -> str:
+def grids_line(grids: Report) -> str:
     """How many whole grids there are, and what choosing blindly would give."""
     counted = grids["scenes"] - grids["scenes_without_positive"]
     return (

@@ -88,6 +88,15 @@ def test_tables_are_of_what_the_run_holds(
     in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
     expected = {"in-range": in_range, "clear": clear, "grid": np.ones(len(label), np.bool_)}
     assert counts == {k: (int(rows.sum()), int(label[rows].sum())) for k, rows in expected.items()}
+    # Every method is told where the base fits, and calls no other place good.
+    rows = [
+        r for r in part["sets"]["grid"]["breakdown"] if (r["by"], r["group"]) == ("outcome", "base_collision")
+    ]
+    assert [row["count"] for row in rows] == [int((~clear).sum())] and (~clear).any()
+    assert all(told["accuracy"] == 1 for row in rows for told in row["methods"].values())
+    regimes = [("two-stage", "sim-only"), ("sim-only", "stage1")]
+    for told in (*part["sets"].values(), part["grids"]):
+        assert list(dict.fromkeys((d["first"], d["second"]) for d in told["comparisons"])) == regimes
     with_good = {int(s) for s in stored["sample_scene_index"][label]}
     assert part["grids"]["scenes"] == SCENES
     assert part["grids"]["scenes_without_positive"] == SCENES - len(with_good)
@@ -124,7 +133,15 @@ def test_the_same_words_give_the_same_numbers_and_people_read_them(
     said = capsys.readouterr().out
     accuracy = first["parts"][0]["sets"]["clear"]["methods"]["two-stage"]["accuracy"]
     assert f"{100 * accuracy['value']:.1f} [{100 * accuracy['low']:.1f}, " in said
-    for line in ("Table I:", "Table II:", "Table III:", "accuracy by outcome", "Brier", "arXiv:2509.11594"):
+    for line in (
+        "Table I:",
+        "Table II:",
+        "Table III:",
+        "mAP",
+        "accuracy by outcome",
+        "Brier",
+        "arXiv:2509.11594",
+    ):
         assert line in said, line
 
 
@@ -172,6 +189,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     right = (feasible == (stored["label"] == 1)).mean()
     assert told["threshold"]["accuracy"]["value"] == pytest.approx(right)
     assert report["methods"][0]["threshold"] is None and report["methods"][2]["note"]
+    assert report["parts"][0]["sets"]["grid"]["comparisons"] == []  # without models there is nothing to ask
     assert cli.run([*words, "--fit", str(grids)]) == 2
     assert "is trained on too" in capsys.readouterr().err
     rule = tmp_path / "rule.toml"
