@@ -97,7 +97,7 @@ def pairs(runs: Sequence[Run], candidates: str) -> list[dict[str, Any]]:
         said, true = common_candidates(labels[0], labels[1])
         rows = true.is_in(candidates)
         compared = compare(said.at(rows), true.at(rows))
-        costs_s = [_wall_s_per_label(account_for([run])) for run in (first, second)]
+        costs_s = [account_for([run]).wall_s_per_label for run in (first, second)]
         accuracy = compared["accuracy"]
         found.append(
             {
@@ -135,10 +135,6 @@ def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:
     return {"outcomes": outcome_report(labelled.at(labelled.is_in(candidates)))}
 
 
-def _wall_s_per_label(books: Books) -> float | None:
-    return books.total_wall_s / books.labels if books.labels else None
-
-
 def audit_report(books: Books, source: str) -> dict[str, Any]:
     """The audit as plain values; times in seconds, sizes in bytes."""
     labels = books.labels
@@ -152,7 +148,7 @@ def audit_report(books: Books, source: str) -> dict[str, Any]:
         "cpu_s": max(0.0, books.useful.cpu_s - sum(books.useful.stage_cpu_s.values())),
     }
     waste = {outcome: _account(account) for outcome, account in sorted(books.waste.items())}
-    per_label_s = _wall_s_per_label(books)
+    per_label_s = books.wall_s_per_label
     return {
         "label_source": source,
         "labels": labels,
@@ -161,6 +157,7 @@ def audit_report(books: Books, source: str) -> dict[str, Any]:
         "scenes": books.scenes,
         "redraws": dict(sorted(books.redraws.items())),
         "useful": _account(books.useful),
+        "relabelled_from": {f"{clock}_s": books.useful.source_s[clock] for clock in ("wall", "cpu")},
         "stages": stages,
         "waste": waste,
         "waste_share": 1 - books.useful.wall_s / books.total_wall_s if books.total_wall_s else None,

@@ -24,7 +24,7 @@ from schemas.run_records import (
     StoredRecord,
 )
 
-_STAGES = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s")
+_GROUPS = ("stage_wall_s", "stage_cpu_s", "stage_gpu_s", "source_s")
 _COST_FIELDS = set(Cost.model_fields)
 _COSTS = ("cpu_s", "peak_rss_bytes", "written_bytes")  # a number in each row that has wall_s
 _OUTCOMES: frozenset[str] = frozenset(get_args(Outcome))
@@ -176,6 +176,7 @@ class HeadTable:
             stage_wall_s=self._part("stage_wall_s", row),
             stage_cpu_s=self._part("stage_cpu_s", row),
             stage_gpu_s=self._part("stage_gpu_s", row),
+            source_s=self._part("source_s", row),
             peak_rss_bytes=self._integer("peak_rss_bytes", row),
             written_bytes=self._integer("written_bytes", row),
         )
@@ -252,10 +253,8 @@ def _numbers(head: CommitHead | EndHead) -> dict[str, float]:
     if cost is not None:
         numbers |= {"wall_s": cost.wall_s, "cpu_s": cost.cpu_s}
         numbers |= {"peak_rss_bytes": cost.peak_rss_bytes, "written_bytes": cost.written_bytes}
-        for stages, seconds in zip(
-            _STAGES, (cost.stage_wall_s, cost.stage_cpu_s, cost.stage_gpu_s), strict=True
-        ):
-            numbers |= {f"{stages}.{stage}": value for stage, value in seconds.items()}
+        for group in _GROUPS:
+            numbers |= {f"{group}.{key}": value for key, value in getattr(cost, group).items()}
     return numbers
 
 

@@ -5,9 +5,9 @@ They are read back from disk and so are validated like any input.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from schemas.specification import Specification
 
@@ -89,7 +89,11 @@ class FileEntry(StoredRecord):
 
 
 class Cost(StoredRecord):
-    """What one attempt cost. `gpu_s` stays empty where no GPU was used."""
+    """What one attempt cost. `stage_gpu_s` stays empty where no GPU was used.
+
+    `source_s` is in none of the other numbers: what was paid before for the labels of another run, by wall
+    and CPU seconds, where this attempt only judged them by another rule.
+    """
 
     wall_s: float = Field(ge=0)
     cpu_s: float = Field(ge=0)
@@ -98,6 +102,20 @@ class Cost(StoredRecord):
     stage_gpu_s: dict[str, float] = Field(default_factory=dict)
     peak_rss_bytes: int = 0
     written_bytes: int = 0
+    source_s: dict[Literal["wall", "cpu"], Annotated[float, Field(ge=0, allow_inf_nan=False)]] = Field(
+        default_factory=dict
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_empty_source(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Left out where there is none: records have the bytes that they had before there was the field."""
+        return {name: value for name, value in plain(self).items() if name != "source_s" or value}
+
+    @property
+    def all_s(self) -> dict[Literal["wall", "cpu"], float]:
+        """Seconds by clock that the attempt took, and those before it."""
+        before = self.source_s
+        return {"wall": self.wall_s + before.get("wall", 0.0), "cpu": self.cpu_s + before.get("cpu", 0.0)}
 
 
 class Host(StoredRecord):

@@ -21,7 +21,7 @@ class Part:
     """One run's shards and arrays, or those of a sealed store that came without its run.
 
     `spec_hashes` has several where such a store was merged. `cost` adds up the commits' wall and CPU
-    seconds; None where no commit came along.
+    seconds, with those of the labels that a run was relabelled from; None where no commit came along.
     """
 
     place: str
@@ -89,8 +89,8 @@ def _open_run(run: Run, names: Sequence[str]) -> Part | None:
         for commit in commits
     ]
     cost = {
-        "wall_s": sum(commit.cost.wall_s for commit in commits),
-        "cpu_s": sum(commit.cost.cpu_s for commit in commits),
+        "wall_s": sum(commit.cost.all_s["wall"] for commit in commits),
+        "cpu_s": sum(commit.cost.all_s["cpu"] for commit in commits),
     }
     manifest = run.manifest
     version = manifest.schema_version

@@ -65,7 +65,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         files = _made_files(run, made)
     with ends_job(), clock.stage("write"):
         entries, written_bytes = _write(run, source, before, task.attempt, files)
-    cost = meter.cost(clock, written_bytes)
+    cost = meter.cost(clock, written_bytes).model_copy(update={"source_s": before.cost.all_s})
     positives = int(made["label"].sum())
     commit = Commit(
         shard=task.shard,

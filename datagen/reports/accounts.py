@@ -23,6 +23,7 @@ class Account:
     stage_wall_s: Counter[str] = field(default_factory=Counter)
     stage_cpu_s: Counter[str] = field(default_factory=Counter)
     stage_gpu_s: Counter[str] = field(default_factory=Counter)
+    source_s: Counter[str] = field(default_factory=Counter)  # by wall and cpu: what was taken over had cost
     written_bytes: int = 0
     peak_rss_bytes: int = 0
 
@@ -37,6 +38,7 @@ class Account:
         self.stage_wall_s.update(cost.stage_wall_s)
         self.stage_cpu_s.update(cost.stage_cpu_s)
         self.stage_gpu_s.update(cost.stage_gpu_s)
+        self.source_s.update(cost.source_s)
         self.written_bytes += cost.written_bytes
         self.peak_rss_bytes = max(self.peak_rss_bytes, cost.peak_rss_bytes)
 
@@ -60,7 +62,13 @@ class Books:
     machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
 
     @property
+    def wall_s_per_label(self) -> float | None:
+        """Seconds of workers for a label, waste and the labels it was made from included."""
+        return (self.total_wall_s + self.useful.source_s["wall"]) / self.labels if self.labels else None
+
+    @property
     def total_wall_s(self) -> float:
+        """Seconds of workers that these runs themselves took."""
         return self.useful.wall_s + sum(a.wall_s for a in self.waste.values())
 
 

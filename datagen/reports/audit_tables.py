@@ -9,7 +9,7 @@ from datagen.console.printing import print_rows, seconds, size
 
 def print_source(report: dict[str, Any], candidates: str) -> None:
     """The account of one label source."""
-    labels, useful = report["labels"], report["useful"]
+    labels, useful, before = report["labels"], report["useful"], report["relabelled_from"]
     if not labels:
         print_rows(f"audit of {report['label_source']} labels", [("labels", "none committed yet")])
         return
@@ -20,7 +20,8 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
             ("labels", f"{labels:,} in {report['scenes']:,} scenes"),
             ("positive", f"{report['positives']:,} ({100 * report['positive_share']:.1f}%)"),
             ("redraws", redraws),
-            ("worker time", f"{seconds(useful['wall_s'])} wall, {seconds(useful['cpu_s'])} CPU"),
+            ("worker time", _worker_time(useful)),
+            *([("labels it came from", _worker_time(before))] if before["wall_s"] else []),
             (
                 "per label",
                 f"{1000 * report['wall_s_per_label']:.3f} ms, {report['bytes_per_label']:.0f} bytes",
@@ -52,6 +53,10 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
     _print_projection(report["projection"], report["waste_share"])
     if "outcomes" in report:
         _print_outcomes(report["outcomes"], candidates)
+
+
+def _worker_time(spent: dict[str, Any]) -> str:
+    return f"{seconds(spent['wall_s'])} wall, {seconds(spent['cpu_s'])} CPU"
 
 
 def _print_projection(projection: dict[str, Any], waste_share: float) -> None:

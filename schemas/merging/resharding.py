@@ -72,6 +72,7 @@ class Cut:
             stage_wall_s=by_stage(cost.stage_wall_s),
             stage_cpu_s=by_stage(cost.stage_cpu_s),
             stage_gpu_s=by_stage(cost.stage_gpu_s),
+            source_s={clock: seconds(value) for clock, value in cost.source_s.items()},
             peak_rss_bytes=cost.peak_rss_bytes,
             written_bytes=_share(cost.written_bytes, self.scenes, offset, self.into),
         )

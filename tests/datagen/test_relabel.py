@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.keys import shard_folder
+from schemas.keys import commit_key, shard_folder
 from schemas.merged import open_runs
 from schemas.record_files import encode_record
 from schemas.run import Run
@@ -18,6 +18,7 @@ from tests.datagen.forged import forge
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
+from train.opening import open_parts
 
 SCENES = 6
 N = SCENES * PER_SCENE
@@ -88,6 +89,30 @@ def test_every_attempt_is_accounted_for(relabelled: Path, capsys: pytest.Capture
         assert end.cost is not None and end.cost.wall_s >= sum(end.cost.stage_wall_s.values()) > 0
     report = json_of(capsys, ["status", str(relabelled)])
     assert report["complete"] and report["sealed"] and report["labels"] == N
+
+
+def test_the_cost_of_the_labels_it_came_from_is_carried_on(
+    source: Path, relabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = tmp_path / "again"
+    assert cli.run(["relabel", str(relabelled), "--out", str(again), "--tau", "0.3"]) == 0
+    first, second, third = (list(Run.open(place).commits()) for place in (source, relabelled, again))
+    for drawn, once, twice in zip(first, second, third, strict=True):
+        assert drawn.cost.source_s == {}
+        assert once.cost.source_s == {"wall": drawn.cost.wall_s, "cpu": drawn.cost.cpu_s}
+        assert twice.cost.source_s["cpu"] == pytest.approx(drawn.cost.cpu_s + once.cost.cpu_s)
+    assert b"source_s" not in (source / commit_key(0)).read_bytes()  # as before there was such a field
+    capsys.readouterr()
+    (told,) = json_of(capsys, ["audit", str(again)])["sources"]
+    before = {f"{clock}_s": sum(c.cost.source_s[clock] for c in third) for clock in ("wall", "cpu")}
+    assert told["relabelled_from"] == pytest.approx(before)
+    own_s = sum(c.cost.wall_s for c in third)
+    assert told["useful"]["wall_s"] == pytest.approx(own_s)
+    assert told["wall_s_per_label"] == pytest.approx((own_s + before["wall_s"]) / N)
+    assert cli.run(["audit", str(again)]) == 0
+    assert "labels it came from" in capsys.readouterr().out
+    (part,) = open_parts([again], ())
+    assert part.cost == pytest.approx({k: v + told["useful"][k] for k, v in before.items()})
 
 
 def test_a_file_says_the_rule_and_an_option_wins_over_it(

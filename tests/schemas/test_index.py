@@ -39,7 +39,7 @@ def cost(rng: random.Random) -> Cost:
     return Cost(
         wall_s=rng.uniform(30, 99), cpu_s=rng.uniform(0, 99), stage_wall_s=stages,
         stage_gpu_s={"observe": 0.1} if rng.random() < 0.3 else {}, peak_rss_bytes=rng.randrange(2**40),
-        written_bytes=rng.randrange(2**40),
+        written_bytes=rng.randrange(2**40), source_s={"wall": 3.5, "cpu": 2.5} if rng.random() < 0.3 else {},
     )  # fmt: skip
 
 

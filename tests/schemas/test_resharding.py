@@ -19,6 +19,7 @@ costs = st.builds(
     cpu_s=seconds,
     stage_wall_s=st.dictionaries(st.sampled_from(["draw", "settle"]), seconds),
     stage_gpu_s=st.dictionaries(st.just("label"), seconds),
+    source_s=st.dictionaries(st.sampled_from(["wall", "cpu"]), seconds),
     peak_rss_bytes=st.integers(0, 2**40),
     written_bytes=st.integers(0, 2**40),
 )
@@ -33,6 +34,8 @@ def test_pieces_add_up_to_the_whole(cost: Cost, pieces: int, into: int, shard: i
     assert fsum(s.cpu_s for s in shares) == pytest.approx(cost.cpu_s, abs=1e-8)
     for stage, spent in cost.stage_wall_s.items():
         assert fsum(s.stage_wall_s[stage] for s in shares) == pytest.approx(spent, abs=1e-8)
+    for clock, spent in cost.source_s.items():
+        assert fsum(s.source_s[clock] for s in shares) == pytest.approx(spent, abs=1e-8)
     assert sum(s.written_bytes for s in shares) == cost.written_bytes
     assert {s.peak_rss_bytes for s in shares} == {cost.peak_rss_bytes}
 
