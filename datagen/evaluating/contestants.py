@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from schemas.errors import InputError
+from train.baselines.scalars import Scalars
 from train.evaluation.comparisons import Origin
 from train.evaluation.evaluation import Method
 from train.scorers import ModelScorer, Scorer
@@ -43,7 +44,8 @@ class Contestant:
     def method(self) -> Method:
         """As metrics know it."""
         model = self.head.model if self.head else ""
-        return Method(self.name, self.scorer.threshold, Origin(self.regime, model))
+        is_probability = self.head is not None or isinstance(self.scorer, Scalars)
+        return Method(self.name, self.scorer.threshold, Origin(self.regime, model), is_probability)
 
     @property
     def houses(self) -> frozenset[str]:

@@ -71,16 +71,27 @@ def _beaten(positives: F64, negatives: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A value with what the resamples (B,) say it might as well have been."""
+    """A value with what the resamples (B,) say it might as well have been.
+
+    `trials` is how many scenes a share is of, where it is one of scenes that each say yes or no.
+    """
 
     value: float
     resamples: F64
+    trials: int = 0
 
     def interval(self) -> tuple[float, float]:
-        """The percentile interval of `LEVEL`; nan where no resample says anything."""
+        """The percentile interval of `LEVEL`; nan where no resample says anything.
+
+        Where all scenes of a share say yes, or all no, so does every resample, which is no certainty: then it
+        is the exact interval of a share (Clopper and Pearson 1934).
+        """
         said = self.resamples[np.isfinite(self.resamples)]
         if not len(said) or not np.isfinite(self.value):
             return float("nan"), float("nan")
+        if self.trials and self.value in (0, 1):
+            bound = ((1 - LEVEL) / 2) ** (1 / self.trials)
+            return (bound, 1.0) if self.value else (0.0, 1 - bound)
         low, high = np.quantile(said, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return float(low), float(high)
 

@@ -34,11 +34,15 @@ GRID_METRICS = ("good", "mean_average_precision")
 
 @dataclass(frozen=True)
 class Method:
-    """What is evaluated: its name among the scores, and what trained it, which no baseline has."""
+    """What is evaluated: its name among the scores, and what trained it, which no baseline has.
+
+    Whether scores are probabilities of a good label has to be said: others lie in [0, 1] too.
+    """
 
     name: str
     threshold: float
     origin: Origin = NO_TRAINING
+    says_probabilities: bool = False
 
     @property
     def only_picks(self) -> bool:
@@ -50,11 +54,6 @@ class Method:
         if self.only_picks:
             return picks(score, columns.robot, columns.is_clear)
         return (score >= self.threshold).astype(np.float64)
-
-    def says_probabilities(self, score: F64) -> bool:
-        """Whether its scores can be read as probabilities of a good label, and not as yes and no."""
-        in_range = bool(((score >= 0) & (score <= 1)).all())
-        return self.threshold == 0.5 and in_range and len(np.unique(score)) > 2
 
 
 def evaluate_set(
@@ -163,8 +162,9 @@ def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Est
     per_scene = np.zeros((columns.n_scenes, parts.shape[1]))
     np.add.at(per_scene, scene_of[chosen.group], parts)
     whole, drawn = per_scene.sum(axis=0), summed(weights, per_scene)
+    trials = {"good": int((per_scene[:, 1] > 0).sum())}
     return {
-        name: Estimate(float(_share(whole, first)), _share(drawn, first))
+        name: Estimate(float(_share(whole, first)), _share(drawn, first), trials.get(name, 0))
         for name, first in (("good", 0), ("missed_m", 2), ("mean_average_precision", 4))
     }
 
@@ -181,7 +181,7 @@ def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:
 
 def _calibration(columns: Columns, method: Method) -> dict[str, Any]:
     score, true = columns.scores[method.name], columns.label
-    if method.only_picks or not method.says_probabilities(score):
+    if not method.says_probabilities:
         return {"brier": None, "expected_calibration_error": None, "reliability": None}
     bins = metrics.reliability(true, score)
     rows = zip(bins.count.tolist(), bins.said.tolist(), bins.true.tolist(), strict=True)

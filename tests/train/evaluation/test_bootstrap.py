@@ -76,6 +76,15 @@ def test_paired_differences_are_sharper_than_intervals_that_do_not_touch() -> No
     assert are_disjoint(a, Estimate(b.value - 0.5, b.resamples - 0.5))
 
 
+def test_shares_of_all_and_none_are_no_certainty() -> None:
+    all_alike = np.ones(50)
+    low, high = Estimate(1.0, all_alike, trials=19).interval()
+    assert (low, high) == (pytest.approx(0.8235, abs=1e-4), 1)
+    assert Estimate(0.0, 1 - all_alike, trials=19).interval() == (0, pytest.approx(1 - low))
+    both = Estimate(1.0, all_alike, 19)
+    assert both.minus(both).interval() == (0, 0) and verdict(both.minus(both)) == "open"
+
+
 def test_what_no_resample_can_say_has_no_interval() -> None:
     weights = resample_weights(5, 50, np.random.default_rng(0))
     scene, true = np.arange(5), np.array([True, False, False, False, False])

@@ -18,7 +18,7 @@ from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, we
 METHODS = [
     Method("truth", 0.5),
     Method("constant", 0.5),
-    Method("noisy", 0.5, Origin("stage1", "paper")),
+    Method("noisy", 0.5, Origin("stage1", "paper"), says_probabilities=True),
     Method("nearest", float("nan")),
 ]
 
@@ -113,7 +113,7 @@ def test_probabilities_are_judged_as_such_and_other_scores_are_not() -> None:
     methods = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0))["methods"]
     assert methods["noisy"]["brier"] > 0 and methods["noisy"]["expected_calibration_error"] > 0
     assert sum(b["count"] for b in methods["noisy"]["reliability"]) == columns.is_clear.sum()
-    # Yes and no, one constant, and no threshold at all: none of them says how sure it is.
+    # A number in [0, 1] is no probability where nobody says so.
     assert [methods[name]["brier"] for name in ("truth", "constant", "nearest")] == [None, None, None]
 
 
@@ -124,7 +124,9 @@ def test_grids_count_scenes_with_a_good_candidate_and_say_how_many_have_none() -
     some = np.unique(columns.scene[label])
     told = evaluate_grids(columns, METHODS, weights_for(columns, 200, 0))
     assert told["scenes"] == 60 and told["scenes_without_positive"] == 60 - len(some)
-    assert told["methods"]["truth"]["good"] == {"value": 1, "low": 1, "high": 1}
+    # That all are good is no certainty: a chance of `low` gives as many in a row once in forty times.
+    sure = told["methods"]["truth"]["good"]
+    assert (sure["value"], sure["high"]) == (1, 1) and sure["low"] ** len(some) == pytest.approx(0.025)
     assert told["methods"]["truth"]["missed_m"]["value"] is None
     # A constant picks any clear candidate.
     shares = [label[rows].mean() for s in some if (rows := (columns.scene == s) & columns.is_clear).any()]
