@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,21 @@ def assets() -> Path:
     if not (folder / "ycb" / "objects.json").is_file():
         pytest.skip(f"no real assets at {folder}: set DATAGEN_ASSETS to a folder with ycb/ and procthor/")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """One thread for small models, where torch is loaded at all: test processes share the cores, and
+    threads of one would wait for those of another.
+    """
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

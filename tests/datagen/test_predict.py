@@ -7,12 +7,10 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from datagen import cli
@@ -22,15 +20,6 @@ from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
 
 HEIGHT_M = 0.8197  # of the scene's camera
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Test processes share the cores: threads of one would wait for those of another."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -124,6 +124,12 @@ def spacing(points_m: np.ndarray) -> float:
     return float(gaps[np.triu_indices(len(points_m), 1)].min())
 
 
+def rays_of(view: View) -> np.ndarray:
+    """The points (N, 3), seen from the camera that observed them, world axes."""
+    camera_m = view.scene.record["T_world_camera"][:3, 3] - view.scene.record["target_center_m"]
+    return view.points_m[: view.n_points].astype(np.float64) - camera_m
+
+
 @given(SEEDS, SEEDS, st.integers(0, 12), st.floats(0, 1.5), st.floats(0, 1))
 @many
 def test_holes_are_cones_from_the_camera_and_spare_the_target(
@@ -136,8 +142,7 @@ def test_holes_are_cones_from_the_camera_and_spare_the_target(
     assert (np.diff(kept) > 0).all()
     assert after.target_mask.sum() >= kept_share * before.target_mask.sum()
     lost = np.setdiff1d(np.arange(before.n_points), kept)
-    camera_m = before.scene.record["T_world_camera"][:3, 3] - before.scene.record["target_center_m"]
-    sight = before.points_m[: before.n_points] - camera_m
+    sight = rays_of(before)
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     # Each lost point lies in a cone about a point that was lost too.
     if len(lost):
@@ -158,8 +163,7 @@ def test_noise_moves_points_along_their_rays(scene: int, seed: int, std: float):
     after = SensorNoise(std).apply(before, np.random.default_rng(seed))
     assert_whole(after, before)
     assert after.n_points == before.n_points
-    camera_m = before.scene.record["T_world_camera"][:3, 3] - before.scene.record["target_center_m"]
-    rays = [v.points_m[: v.n_points].astype(np.float64) - camera_m for v in (before, after)]
+    rays = [rays_of(view) for view in (before, after)]
     aside = np.linalg.norm(np.cross(*rays), axis=1) / np.linalg.norm(rays[0], axis=1)
     assert aside.max() < 1e-5
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
-import torch
 
 from tests.train.prediction.seen_scenes import Seen, draw_seen, untrained_scorer
 from train.scorers import ModelScorer
@@ -20,12 +17,3 @@ def seen() -> Seen:
 @pytest.fixture(scope="session")
 def scorer() -> ModelScorer:
     return untrained_scorer()
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Test processes share the cores: threads of one would wait for those of another."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
