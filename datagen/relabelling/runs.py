@@ -22,7 +22,7 @@ from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from schemas.errors import InputError
 from schemas.keys import MERGED, part_folder
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.root_records import publish
+from schemas.root_records import publish, refuse_foreign
 from schemas.run import Run
 from schemas.run_records import Merged
 from schemas.sealing import seal
@@ -90,6 +90,8 @@ def relabel_all(
             longest[spec.hash()] = (source, spec)
     pairs = [longest[spec_hash] for spec_hash in sorted(longest)]
     done = Relabelled()
+    if len(pairs) > 1:
+        _refuse_other_place(place, sorted(longest))
     for source, spec in pairs:
         below = place if len(pairs) == 1 else place.below(part_folder(spec.hash()))
         done.runs.append(_open_target(below, source, spec))
@@ -121,6 +123,19 @@ def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
         mend = "Choose another --out: files can be shared only shard by shard"
         raise InputError(f"{place.url}/manifest.json", "layout.scenes_per_shard", problem, mend)
     return run
+
+
+def _refuse_other_place(place: Storage, hashes: Sequence[str]) -> None:
+    """Refuse, before a part is begun there, a place that holds anything but these very runs."""
+    if place.exists("manifest.json"):
+        problem = f"holds one run, and {len(hashes)} would be written"
+        raise InputError(place.url, "manifest.json", problem, "Choose another --out")
+    if place.exists(MERGED):
+        _write_merged(place, hashes)
+    else:
+        refuse_foreign(
+            place, "parts/", MERGED
+        )  # what was cut short may have parts, and a draft of the record
 
 
 def _write_merged(place: Storage, hashes: Sequence[str]) -> None:

@@ -194,6 +194,17 @@ def test_merged_runs_are_relabelled_part_by_part(
         np.testing.assert_array_equal(values, np.concatenate([arrays[name] for arrays in each]), err_msg=name)
     assert json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])["labels"] == 0
     assert cli.run(["verify", str(out)]) == 0
+    # Where something else is, no part is begun.
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "todo.txt").write_text("mine")
+    for there, words in (
+        (merged, "other runs were merged here"),
+        (tmp_path / "alone", "holds one run"),
+        (tmp_path / "notes", "todo.txt"),
+    ):
+        held = files_of(there)
+        refused(["relabel", str(merged), "--out", str(there), *RULE], capsys, words)
+        assert files_of(there) == held
 
 
 def test_scenes_that_were_merged_twice_are_labelled_once(source: Path, tmp_path: Path) -> None:
