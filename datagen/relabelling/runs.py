@@ -133,9 +133,8 @@ def _refuse_other_place(place: Storage, hashes: Sequence[str]) -> None:
     if place.exists(MERGED):
         _write_merged(place, hashes)
     else:
-        refuse_foreign(
-            place, "parts/", MERGED
-        )  # what was cut short may have parts, and a draft of the record
+        # A call that was cut short may have left parts, and a draft of the record.
+        refuse_foreign(place, "parts/", MERGED)
 
 
 def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
