@@ -84,6 +84,7 @@ def document(prediction: Prediction) -> dict[str, Any]:
             "how": floor.how,
             "residual_m": floor.residual_m,
             "offset_m": floor.offset_m,
+            "doubt": floor.doubt,
             "camera_height_m": floor.camera_height_m,
         },
         "cloud": {"points": p.cloud.n, "crop_seen": p.crop_seen, "missing_depth": p.missing_depth},

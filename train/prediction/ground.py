@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from schemas.errors import InputError
 from train.prediction.files import Bools
 from train.prediction.frames import SensorFrame
 from workers.geometry.mesh import F32, F64
 
-_TRIES = 800
-_SAMPLE = 6000  # points on which planes are tried; the fit takes all
-_REFITS = 4
-# Errors of neighbouring points are alike: more points than this make a floor no more certain.
+_SAMPLE = 20_000  # points that are looked at
+_MODES, _VOTERS = 200, 2500  # normals that are tried as the way up, and those that vote
+# Points this steep or flatter (cosine; 15 degrees) lie level: stereo noise turns normals by as much.
+_LIES_LEVEL = 0.966
+_REFITS = 5
+# Errors of neighbouring points are alike: more points than this make a surface no more certain.
 _INDEPENDENT = 400
 _GIVEN_ERROR_M = 0.01  # of the camera's height as people measure it
 # The floor's normal points up in the picture (cosine; 75 degrees), and cameras are hardly rolled (sine).
 _LEAST_UP, _MOST_ROLL = 0.26, 0.25
-# A plane of fewer points, or with more than this share of all points below it, is no floor.
-_LEAST_POINTS, _LEAST_SHARE, _MOST_BELOW = 300, 0.015, 0.02
-# A plane that cuts through things passes many points, whose surfaces run another way (cosine; 15 degrees).
-_LIES_FLAT = 0.966
+_BIN_M, _MOST_LEVELS = 0.02, 6
+# Of all points, the share on a level surface that counts as one, and that may lie below a floor.
+_LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
+_LEAST_POINTS = 300  # of all, for a residual
+_SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
+_NEIGHBOURS, _TREE_POINTS = 20, 20_000  # of clouds without a picture, for normals
 _MEND = "Give --gravity x,y,z (camera frame: where things fall) or --camera-pose pose.json"
 
 
@@ -32,13 +38,15 @@ class Ground:
     """The camera over the floor.
 
     `how` says in words where it comes from. `residual_m` is the standard deviation of the floor's
-    points about z = 0 (None where no floor was seen), `offset_m` their mean height.
+    points about z = 0 (None where no floor was seen), `offset_m` their mean height. `doubt` says why
+    what was taken for the floor may be something else.
     """
 
     T_world_camera: F64  # (4, 4)
     how: str
     residual_m: float | None
     offset_m: float | None
+    doubt: str | None = None
 
     @property
     def camera_height_m(self) -> float:
@@ -75,9 +83,9 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
             mend = "Turn its sign: it says where things fall, an accelerometer at rest shows the opposite"
             raise InputError("--gravity", "", "points up in the picture", mend)
         return _with_residual(frame, level_pose(-down, camera_height_m), "gravity and the camera's height")
-    normal, height_m = _floor_plane(frame, camera_height_m)
+    up, height_m, doubt = _floor_plane(frame, camera_height_m)
     how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({camera_height_m:.3f} m given)"
-    return _with_residual(frame, level_pose(normal, height_m), how)
+    return replace(_with_residual(frame, level_pose(up, height_m), how), doubt=doubt)
 
 
 def level_pose(up: F64, height_m: float) -> F64:
@@ -112,98 +120,119 @@ def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
     return Ground(T, how, float(near.std()), float(near.mean()))
 
 
-def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float]:
-    """(up normal (3,) in the camera's frame, height of the camera) of the floor seen in the frame.
+def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float, str | None]:
+    """(up (3,) in the camera's frame, height of the camera, doubt) of the floor seen in the frame.
 
-    RANSAC (Fischler and Bolles 1981) over planes that face up, then least squares on what lies near.
+    Up is what the normals of level surfaces agree on. Floor is the level surface that lies as far below
+    the camera as it was said to be: neither a table's top nor the board of a low shelf.
     """
     rng = np.random.default_rng([0, len(frame.points_m)])
-    points = frame.points_m.astype(np.float64)
-    rows = rng.choice(len(points), min(_SAMPLE, len(points)), replace=False)
-    some = _Some(points[rows], 0.008 + 2 * depth_error_m(points[rows, 2]), _normals(frame, rows))
-    normals, heights = _tried_planes(some.points, rng)
-    agrees = np.abs(heights - camera_height_m) < _tolerance_m(camera_height_m)
-    found = _best(some, normals[agrees], heights[agrees])
-    if found is None:
-        other = _best(some, normals, heights)
-        if other is not None and other[1] > 0.3:
-            problem = f"the lowest plane is {other[1]:.2f} m below the camera, {camera_height_m:.2f} m given"
-            mend = f"Correct --camera-height, or, if that plane is no floor: {_MEND}"
-            raise InputError(frame.place, "floor", problem, mend)
-        raise InputError(frame.place, "floor", "not seen in the depth picture", _MEND)
-    return _fitted(points, *found, camera_height_m)
+    rows = rng.choice(len(frame.points_m), min(_SAMPLE, len(frame.points_m)), replace=False)
+    points, normals = frame.points_m[rows].astype(np.float64), _normals(frame, rows)
+    up = _way_up(normals, rng)
+    levels = [] if up is None else _levels(points, normals, up)
+    if up is None or not levels:
+        raise InputError(frame.place, "floor", "no level surface is seen in the depth picture", _MEND)
+    for _ in range(_REFITS):
+        up = _common_up(points, levels, up)
+        levels = _levels(points, normals, up) or levels
+    below_m = [-float(np.median(points[level] @ up)) for level in levels]
+    k = int(np.argmin(np.abs(np.array(below_m) - camera_height_m)))
+    share = len(levels[k]) / len(points)
+    if abs(below_m[k] - camera_height_m) > _tolerance_m(camera_height_m):
+        lowest = max(below_m)
+        problem = (
+            f"not seen in the depth picture: the lowest level surface is {lowest:.2f} m below the camera, "
+            f"{camera_height_m:.2f} m given"
+        )
+        x, y, z = np.round(-up, 3)
+        mend = f"{_MEND}; by the level surfaces --gravity is {x:g},{y:g},{z:g}"
+        raise InputError(frame.place, "floor", problem, mend)
+    error_m = depth_error_m(points[levels[k], 2])
+    # The points' height is a mean of so many measurements, the height that was given is one more.
+    weights = 1 / np.array([(error_m.mean() ** 2) / 25 + 0.004**2, _GIVEN_ERROR_M**2])
+    height_m = float(np.average([below_m[k], camera_height_m], weights=weights))
+    below = float((points @ up + height_m < -0.03 - 4 * depth_error_m(points[:, 2])).mean())
+    if below > _MOST_BELOW:
+        problem = f"{below:.0%} of all points lie below the plane {height_m:.2f} m under the camera"
+        raise InputError(frame.place, "floor", problem, f"Correct --camera-height, or: {_MEND}")
+    doubts = [f"it is only {share:.1%} of what was seen"] if share < _SURE_SHARE else []
+    if abs(below_m[k] - camera_height_m) > _SURE_OFF_M:
+        doubts.append(f"it lies {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")
+    return up, height_m, ", and ".join(doubts) or None
 
 
-@dataclass(frozen=True, eq=False)
-class _Some:
-    """Points on which planes are tried, how near a plane passes them that they lie on, and normals."""
-
-    points: F64  # (N, 3)
-    band_m: F64  # (N,)
-    normals: F64 | None  # (N, 3); None for clouds without a picture
-
-
-def _normals(frame: SensorFrame, rows: npt.NDArray[np.int64]) -> F64 | None:
-    """Unit normals (N, 3) at some of a frame's points, in its camera's frame."""
-    if frame.image is None:
-        return None
-    facets = frame.image.facets(np.eye(4))[frame.image.depth_m > 0][rows]
+def _normals(frame: SensorFrame, rows: npt.NDArray[np.int64]) -> F64:
+    """Unit normals (N, 3), turned to the camera, at some of a frame's points, in its camera's frame."""
+    if frame.image is not None:
+        flat = np.flatnonzero(frame.image.depth_m.ravel() > 0)[rows]
+        facets = frame.image.facets(np.eye(4)).reshape(-1, 3)[flat]
+    else:
+        points = frame.points_m.astype(np.float64)
+        some = points[:: max(1, len(points) // _TREE_POINTS)]
+        _, near = KDTree(some).query(points[rows], min(_NEIGHBOURS, len(some)))
+        around = some[near] - some[near].mean(axis=1, keepdims=True)
+        facets = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
+        facets *= -np.sign(np.einsum("ij,ij->i", facets, points[rows]))[:, None]
     return facets / np.maximum(np.linalg.norm(facets, axis=1, keepdims=True), 1e-12)
 
 
-def _fitted(points: F64, normal: F64, height_m: float, camera_height_m: float) -> tuple[F64, float]:
-    """The plane by weighted least squares over the points near it, refound some times.
-
-    A patch of floor far away says little about the height straight below the camera, so the height that
-    was given counts as a measurement too.
-    """
-    error_m = depth_error_m(points[:, 2])
+def _way_up(normals: F64, rng: np.random.Generator) -> F64 | None:
+    """The direction (3,) of most normals (N, 3) that point up in the picture; None where none does."""
+    upward = normals[(normals[:, 1] < -_LEAST_UP) & (np.abs(normals[:, 0]) < _MOST_ROLL)]
+    if len(upward) < _LEAST_SHARE * len(normals):
+        return None
+    tried = upward[rng.choice(len(upward), min(_MODES, len(upward)), replace=False)]
+    # Walls stand upright on it: they count too, less, as noise turns many a normal.
+    cosines = normals[:_VOTERS] @ tried.T  # rows are in random order
+    votes = np.maximum(cosines - _LIES_LEVEL, 0).sum(axis=0) / (1 - _LIES_LEVEL)
+    votes += 0.25 * (np.abs(cosines) < 0.05).sum(axis=0)
+    up = tried[int(votes.argmax())]
     for _ in range(_REFITS):
-        near = np.abs(points @ normal + height_m) < 0.008 + 2 * error_m
-        level = level_pose(normal, height_m)
-        xyz = points[near] @ level[:3, :3].T + level[:3, 3]
-        # z = a + b x + c y over the level floor found so far; the camera stands at x = y = 0.
-        weight = 1 / error_m[near] * np.sqrt(min(1.0, _INDEPENDENT / len(xyz)))
-        rows = np.column_stack([np.ones(len(xyz)), xyz[:, :2]]) * weight[:, None]
-        prior = np.array([[1.0, 0.0, 0.0]]) / _GIVEN_ERROR_M
-        wanted = np.append(xyz[:, 2] * weight, (height_m - camera_height_m) / _GIVEN_ERROR_M)
-        (a, b, c), *_ = np.linalg.lstsq(np.concatenate([rows, prior]), wanted, rcond=None)
-        tilted = np.array([-b, -c, 1.0]) / np.sqrt(b * b + c * c + 1)
-        height_m = float((height_m - a) * tilted[2])
-        normal = level[:3, :3].T @ tilted
-    return normal, height_m
+        up = normals[normals @ up > _LIES_LEVEL].mean(axis=0)
+        up /= np.linalg.norm(up)
+    return up
+
+
+def _levels(points: F64, normals: F64, up: F64) -> list[npt.NDArray[np.int64]]:
+    """Rows of the points (N, 3) on each of the largest level surfaces: where level points gather."""
+    level = np.flatnonzero(normals @ up > _LIES_LEVEL)
+    z, error_m = points[level] @ up, depth_error_m(points[level, 2])
+    found, free = list[npt.NDArray[np.int64]](), np.ones(len(level), np.bool_)
+    if not len(level):
+        return found
+    edges = np.arange(z.min() - _BIN_M, z.max() + 2 * _BIN_M, _BIN_M)
+    while len(found) < _MOST_LEVELS:
+        counted = np.convolve(np.histogram(z[free], edges)[0], np.ones(3), mode="same")
+        k = int(counted.argmax())
+        if counted[k] < _LEAST_SHARE * len(points):
+            break
+        middle = np.median(z[free & (np.abs(z - (edges[k] + edges[k + 1]) / 2) < 1.5 * _BIN_M)])
+        on = free & (np.abs(z - middle) < 0.008 + 2 * error_m)
+        if on.sum() >= _LEAST_SHARE * len(points):
+            found.append(level[on])
+        free &= np.abs(z - middle) >= 1.5 * _BIN_M
+        free &= ~on
+    return found
+
+
+def _common_up(points: F64, levels: Sequence[npt.NDArray[np.int64]], up: F64) -> F64:
+    """The normal (3,) that level surfaces share, by least squares over all, each at its own height."""
+    turn = level_pose(up, 0.0)[:3, :3]
+    rows, wanted = list[F64](), list[F64]()
+    for level in levels:
+        some = points[level]
+        xyz = some @ turn.T
+        weight = 1 / depth_error_m(some[:, 2])
+        centre = np.average(xyz, axis=0, weights=weight**2)
+        weight *= np.sqrt(min(1.0, _INDEPENDENT / len(xyz)))
+        rows.append((xyz[:, :2] - centre[:2]) * weight[:, None])
+        wanted.append((xyz[:, 2] - centre[2]) * weight)
+    (b, c), *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)
+    tilted = turn.T @ np.array([-b, -c, 1.0])
+    return tilted / np.linalg.norm(tilted)
 
 
 def _tolerance_m(camera_height_m: float) -> float:
     """By how much a measured height of the camera may differ from the one that was given."""
-    return 0.05 + 0.03 * camera_height_m
-
-
-def _tried_planes(points: F64, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Planes through three points each: normals (K, 3) that point up, and the camera's heights (K,)."""
-    # Points on low sight lines are drawn more often: there a floor is.
-    order = np.argsort(points[:, 1] / np.maximum(points[:, 2], 1e-6))[::-1]
-    ranks = (len(points) * rng.random((_TRIES, 3)) ** 2).astype(np.int64)
-    a, b, c = (points[order[ranks[:, k]]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    sound = lengths > 1e-6
-    normals = normals[sound] / lengths[sound, None]
-    normals[normals[:, 1] > 0] *= -1  # y points down in the picture
-    heights = -np.einsum("ij,ij->i", normals, a[sound])
-    good = (normals[:, 1] < -_LEAST_UP) & (np.abs(normals[:, 0]) < _MOST_ROLL) & (heights > 0.1)
-    return normals[good], heights[good]
-
-
-def _best(some: _Some, normals: F64, heights: F64) -> tuple[F64, float] | None:
-    """The plane with most points on it, of those with next to nothing below; None where none serves."""
-    if not len(normals):
-        return None
-    gaps = some.points @ normals.T + heights  # (N, K), height of each point over each plane
-    on = np.abs(gaps) < some.band_m[:, None]
-    if some.normals is not None:
-        on &= some.normals @ normals.T > _LIES_FLAT
-    below = (gaps < -0.03 - 2 * some.band_m[:, None]).mean(axis=0)
-    share = np.where(below <= _MOST_BELOW, on.mean(axis=0), 0.0)
-    k = int(share.argmax())
-    return (normals[k], float(heights[k])) if share[k] >= _LEAST_SHARE else None
+    return 0.03 + 0.02 * camera_height_m

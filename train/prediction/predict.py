@@ -122,10 +122,13 @@ class Prediction:
             )
         if self.places.state[self.best] == STATES.index(UNSEEN):
             return "good if the floor there is free, which was not seen"
-        if score < _SURE or thin or self.crop_seen < 0.1:
+        doubt = any(ground.doubt is not None for ground in self.grounds)
+        if score < _SURE or thin or doubt or self.crop_seen < 0.1:
             return "likely, not sure: " + (
                 "a middling score"
                 if score < _SURE
+                else "the floor is in doubt"
+                if doubt
                 else "few points of the target"
                 if thin
                 else "little was seen"
@@ -298,6 +301,10 @@ def _best(score: F64, places: Places, allowed: Sequence[str]) -> int | None:
 def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tuple[str, ...]:
     notes: list[str] = []
     for ground in grounds:
+        if ground.doubt is not None:
+            notes.append(
+                f"what was taken for the floor is in doubt: {ground.doubt}; give --gravity or a pose"
+            )
         if ground.offset_m is not None and abs(ground.offset_m) > 0.03:
             notes.append(
                 f"the floor that is seen lies at {ground.offset_m:+.3f} m, not at 0: check its camera"
