@@ -13,7 +13,7 @@ from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
 
-_MOST_RESAMPLES = 100_000
+_MOST_RESAMPLES = 10_000
 
 
 def evaluate(
@@ -81,7 +81,7 @@ def evaluate(
     models = open_models(checkpoints)
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
-    rule = read_heuristic(heuristic) if heuristic is not None else None
+    rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
     lineup = line_up(baselines, fit or [], detector, rule, seed, opened, allow_seen_houses)
     contestants = [*lineup.baselines, *models]
     if not contestants:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +29,20 @@ class Lineup:
     houses: frozenset[str]
 
 
-def read_heuristic(path: Path) -> HeuristicParams:
-    """The rule's parameters in a file that `datagen calibrate` wrote. InputError where it has none."""
+def read_heuristic(path: Path, places: Sequence[Place], allow_seen_houses: bool) -> HeuristicParams:
+    """The rule's parameters in a file that `datagen calibrate` wrote.
+
+    InputError where it has none, and where it says that they were fitted to one of `places`.
+    """
     mend = "Give the file that `datagen calibrate` wrote"
     section = read_toml(path, "--heuristic", mend).get("heuristic")
     if not isinstance(section, dict):
         raise InputError(path, "heuristic", "there is no such section", mend)
+    fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
+    for place in places:
+        if not allow_seen_houses and any(spec.hash() in fitted_to for spec in place.specs):
+            problem = f"its rule was fitted to the labels of {place.place}"
+            raise InputError(path, "heuristic", problem, "Calibrate to runs of another split")
     return HeuristicParams.model_validate(section)
 
 

@@ -198,6 +198,9 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     report = json_of(capsys, [*words, "--fit", str(grids), "--allow-seen-houses", *chosen])
     assert [part["houses"] for part in report["parts"]] == ["seen"]
     distance, analytic = report["methods"]
+    rule.write_text(f"# run {report['runs'][0]['parts'][0]['spec_hash']}: sim\n[heuristic]\nmu = 0.5\n")
+    assert cli.run([*words, "--baselines", "analytic", "--heuristic", str(rule)]) == 2
+    assert "its rule was fitted to the labels of" in capsys.readouterr().err
     assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
 
 
