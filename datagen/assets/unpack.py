@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import stat
 import tarfile
@@ -61,12 +62,11 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
         except InputError:
             raise
         except (tarfile.TarError, gzip.BadGzipFile, *DAMAGED_ZIP) as error:
-            raise InputError(
-                archive,
-                "",
-                f"the archive is damaged ({error})",
-                "Remove it from the cache and fetch it again",
-            ) from error
+            raise _damaged(archive, error) from error
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # an offset before the archive begins; all else is the disk's
+                raise
+            raise _damaged(archive, error) from error
         files = sorted(names.values())
         for relative in files:
             target = folder / relative
@@ -74,6 +74,11 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
             target.parent.mkdir(parents=True, exist_ok=True)
             (staging / relative).replace(target)
     return files
+
+
+def _damaged(archive: Path, error: Exception) -> InputError:
+    mend = "Remove it from the cache and fetch it again"
+    return InputError(archive, "", f"the archive is damaged ({error})", mend)
 
 
 def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
@@ -107,8 +112,8 @@ def _zip_members(archive: Path) -> Iterator[_Member]:
             kind = stat.S_IFMT(info.external_attr >> 16)
             if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
                 raise InputError(archive, info.filename, "a link, device or special file", _ADVICE)
+            _safe_name(archive, info.filename)
             if info.is_dir():
-                _safe_name(archive, info.filename)
                 continue
             with open_member(packed, info) as stream:
                 yield _Member(info.filename, info.file_size, stream)

@@ -92,6 +92,17 @@ def test_hostile_archives_are_refused_and_leave_nothing(case: str, tmp_path: Pat
     assert sorted(p.name for p in tmp_path.iterdir()) == ["archive.bin", "in"]
 
 
+def test_no_changed_byte_of_a_zip_gives_more_than_a_line(tmp_path: Path) -> None:
+    good, archive = _zip("a", b"hello" * 9), tmp_path / "archive.bin"
+    for at in range(len(good)):
+        for bit in (0x01, 0x80):
+            archive.write_bytes(good[:at] + bytes([good[at] ^ bit]) + good[at + 1 :])
+            try:
+                unpack(archive, tmp_path / "folder", LIMITS)
+            except InputError as error:
+                assert error.place == str(archive)
+
+
 @pytest.mark.parametrize("packed", [True, False])
 def test_good_tars_unpack(packed: bool, tmp_path: Path) -> None:
     (tmp_path / "t").write_bytes(
