@@ -146,7 +146,8 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
             f"{camera_height_m:.2f} m given"
         )
         x, y, z = np.round(-up, 3)
-        mend = f"{_MEND}; by the level surfaces --gravity is {x:g},{y:g},{z:g}"
+        told = f"level surfaces tell {x:g},{y:g},{z:g}"
+        mend = f"Correct --camera-height, or, if that is no floor: {_MEND}; {told}"
         raise InputError(frame.place, "floor", problem, mend)
     error_m = depth_error_m(points[levels[k], 2])
     # The points' height is a mean of so many measurements, the height that was given is one more.
