@@ -70,6 +70,7 @@ def test_both_stages_from_the_command_line(
     assert head.stage == "stage2"
     assert head.init == {"digest": began.digest, "stage": "stage1", "cost": began.cost}
     assert set(began.house_ids) <= set(head.house_ids)
+    assert set(began.val_house_ids) <= {*head.house_ids, *head.val_house_ids}
     assert model.config == began.model_config
     assert not set(head.house_ids) & set(head.val_house_ids)
     assert head.options["augment"].keys() == {"rotation", "dropout"}

@@ -55,7 +55,7 @@ class CheckpointHead:
     val_data: tuple[Origin, ...]
     house_ids: tuple[str, ...]  # trained on, by the checkpoint that this one began from too
     object_digests: tuple[str, ...]  # the same of objects
-    val_house_ids: tuple[str, ...]  # decided which epoch is the best
+    val_house_ids: tuple[str, ...]  # decided which epoch is the best, also of the one that it began from
     cost: dict[str, float]  # label_cpu_s, train_cpu_s, train_wall_s; what it began from is not in it
     versions: dict[str, str]
     history: tuple[EpochRecord, ...]

@@ -214,6 +214,9 @@ def _head(
     job: Job, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
 ) -> CheckpointHead:
     data = tuple(train.origin())
+    house_ids = _all(train.house_ids(), began.house_ids if began else ())
+    # Also those by which --init was chosen: what came of it knows them too.
+    val_house_ids = val.house_ids().union(began.val_house_ids if began else ())
     return CheckpointHead(
         model=model.name,
         model_config=model.config,
@@ -221,9 +224,9 @@ def _head(
         options=job.options.document(),
         data=data,
         val_data=tuple(val.origin()),
-        house_ids=_all(train.house_ids(), began.house_ids if began else ()),
+        house_ids=house_ids,
         object_digests=_all(train.object_digests(), began.object_digests if began else ()),
-        val_house_ids=tuple(sorted(val.house_ids())),
+        val_house_ids=tuple(sorted(val_house_ids.difference(house_ids))),
         cost={"label_cpu_s": sum(float((origin.get("cost") or {}).get("cpu_s", 0.0)) for origin in data)},
         versions={"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         history=(),
