@@ -40,14 +40,17 @@ def train(
         list[str] | None,
         Parameter(negative=(), help="Sizes of the model: a TOML file, or field=value, as often as needed."),
     ] = None,
-    epochs: Annotated[Whole, Parameter(help="[12 in stage1, else 30]")] = None,
+    epochs: Annotated[Whole, Parameter(help="[12 in stage1, else 20]")] = None,
     batch_scenes: Annotated[
         int, WHOLE_NUMBER, Parameter(help="Whole scenes in a step, of all processes together.")
     ] = 16,
+    house_share: Annotated[
+        float, Parameter(help="Learn from this share of the houses alone, for learning curves.")
+    ] = 1.0,
     candidates_per_robot: Annotated[
         Whole, Parameter(help="Take a random so many of each robot's candidates in each epoch [all].")
     ] = None,
-    lr: Annotated[float | None, Parameter(help="Highest learning rate [0.002; 0.0005 in stage2].")] = None,
+    lr: Annotated[float | None, Parameter(help="Highest learning rate [0.002; 0.001 in stage2].")] = None,
     weight_decay: Annotated[float | None, Parameter(help="[0 in stage1, else 0.01]")] = None,
     seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Decides weights, order and dropout.")] = 0,
     patience: Annotated[
@@ -90,6 +93,7 @@ def train(
         model_config={**(began.model_config if began else {}), **model_sizes(model_config or ())},
         epochs=chosen.epochs if epochs is None else epochs,
         batch_scenes=batch_scenes,
+        house_share=house_share,
         candidates_per_robot=candidates_per_robot,
         lr=chosen.lr if lr is None else lr,
         weight_decay=chosen.weight_decay if weight_decay is None else weight_decay,

@@ -23,7 +23,7 @@ small)
     TEST_IN_RANGE=${TEST_IN_RANGE:-1500}  # in test houses, with objects that nothing was trained on
     TEST_SCENES=${TEST_SCENES:-24}        # whole grids there
     EPOCHS_1=${EPOCHS_1:-6}             # at most, of stage 1 ...
-    EPOCHS_2=${EPOCHS_2:-12}            # ... and of the two trainings on trials
+    EPOCHS_2=${EPOCHS_2:-20}            # ... and of the trainings on trials
     ;;
 full)
     HEURISTIC=${HEURISTIC:-180000}
@@ -33,8 +33,8 @@ full)
     VAL_CLEAR=${VAL_CLEAR:-3000}
     TEST_IN_RANGE=${TEST_IN_RANGE:-6000}
     TEST_SCENES=${TEST_SCENES:-100}
-    EPOCHS_1=${EPOCHS_1:-12}
-    EPOCHS_2=${EPOCHS_2:-30}
+    EPOCHS_1=${EPOCHS_1:-8}
+    EPOCHS_2=${EPOCHS_2:-20}
     ;;
 *)
     echo "error: $SIZE: no such size. Say small or full" >&2
@@ -99,20 +99,25 @@ fi
 step "relabel"
 datagen relabel "$OUT/runs/heuristic" --config "$OUT/rule.toml" --out "$OUT/runs/calibrated"
 
-# 4. Three regimes: the rule's labels alone, trials alone, and trials after the rule's labels.
+# 4. Three regimes: the rule's labels alone, trials alone, and trials after the rule's labels; the latter two
+#    again with a quarter of the houses, since what stage 1 is for is to need fewer trials.
 TRAIN_SIM=("$OUT/runs/train-in-range" "$OUT/runs/train-clear")
 VAL_SIM=(--val "$OUT/runs/val-in-range" --val "$OUT/runs/val-clear")
 step "stage 1"
 datagen train stage1 "$OUT/runs/calibrated" --out "$OUT/models/stage1.ckpt" --epochs "$EPOCHS_1"
-step "stage 2"
-datagen train stage2 "${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --out "$OUT/models/stage2.ckpt" \
-    --init "$OUT/models/stage1.ckpt" --epochs "$EPOCHS_2"
-step "sim only"
-datagen train sim-only "${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --out "$OUT/models/sim-only.ckpt" \
-    --epochs "$EPOCHS_2"
+# on_trials NAME SHARE: both trainings that learn from trials, from those in a share of the houses.
+on_trials() {
+    local sim=("${TRAIN_SIM[@]}" "${VAL_SIM[@]}" --house-share "$2" --epochs "$EPOCHS_2")
+    step "sim only $1"
+    datagen train sim-only "${sim[@]}" --out "$OUT/models/sim-only$1.ckpt"
+    step "stage 2 $1"
+    datagen train stage2 "${sim[@]}" --out "$OUT/models/stage2$1.ckpt" --init "$OUT/models/stage1.ckpt"
+}
+on_trials "" 1
+on_trials -quarter 0.25
 
 # 5. Tables I to III, in houses and on objects of which no model and no baseline has seen any.
-MODELS=("$OUT"/models/{stage1,sim-only,stage2}.ckpt)
+MODELS=("$OUT"/models/{stage1,sim-only,stage2,sim-only-quarter,stage2-quarter}.ckpt)
 FITTED=(--fit "$OUT/runs/val-in-range" --fit "$OUT/runs/val-clear" --heuristic "$OUT/rule.toml")
 if ! made_after "$OUT/tables.json" "${MODELS[@]}" "$OUT/rule.toml"; then
     step "evaluate"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
@@ -43,10 +44,12 @@ def tell(folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess[
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with empty assets, and with the program that notes its calls."""
+    """A folder with objects of no content and no houses, and with the program that notes its calls."""
     for folder in ("bin", "assets/ycb", "assets/procthor"):
         (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "assets/ycb/objects.json").write_text("[]")
+    (tmp_path / "assets/ycb/mesh").write_text("")
+    objects = [{"key": f"object-{i}", "files": {"mesh": "mesh"}} for i in range(5)]
+    (tmp_path / "assets/ycb/objects.json").write_text(json.dumps(objects))
     for name, text in (("datagen", NOTING), ("python", f'#!/bin/sh\nexec {sys.executable} "$@"\n')):
         (tmp_path / "bin" / name).write_text(text)
         (tmp_path / "bin" / name).chmod(0o755)
@@ -65,7 +68,7 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     for words in called:
         build_app(words[0]).parse_args(words, exit_on_error=False, print_error=False)
     verbs = [words[0] for words in called]
-    assert verbs == ["submit"] * 7 + ["calibrate", "relabel"] + ["train"] * 3 + ["evaluate"]
+    assert verbs == ["submit"] * 7 + ["calibrate", "relabel"] + ["train"] * 5 + ["evaluate"]
     splits = {words[words.index("--out") + 1]: words[words.index("--split") + 1] for words in called[:7]}
     assert sorted(splits.values()) == ["test"] * 2 + ["train"] * 3 + ["val"] * 2
     trained = {word for words in called if words[0] == "train" for word in words}
@@ -76,7 +79,7 @@ def test_its_commands_are_ours_and_the_slow_ones_are_not_repeated(place: Path, s
     (place / "notes").unlink()
     assert tell(place, size, "out", DATAGEN_ASSETS="assets").returncode == 0
     again = [words[0] for words in notes(place)]  # those that go on by themselves
-    assert again == ["submit"] * 7 + ["relabel"] + ["train"] * 3
+    assert again == ["submit"] * 7 + ["relabel"] + ["train"] * 5
 
 
 def test_it_stops_where_a_step_fails(place: Path) -> None:

@@ -11,9 +11,10 @@ from typing import Any
 from schemas.errors import InputError
 from train.dataset import SampleStream
 
-# Another salt than that of a run's own split (workers/houses/split.py): the tenth that is held out here
+# Other salts than that of a run's own split (workers/houses/split.py): the tenth that is held out here
 # is a tenth of a run of that split's training houses too.
 _SALT = b"held-out-houses-1:"
+_SHARE_SALT = b"share-of-houses-1:"
 
 
 @dataclass(frozen=True)
@@ -23,20 +24,38 @@ class HouseSide:
     held_out: bool
 
     def __call__(self, house_id: str) -> bool:
-        digest = hashlib.sha256(_SALT + house_id.encode()).digest()
-        return (int.from_bytes(digest[:8], "big") % 10 == 0) == self.held_out
+        return (_number(_SALT, house_id) % 10 == 0) == self.held_out
 
 
-def split_by_house(places: Sequence[str | Path], **options: Any) -> tuple[SampleStream, SampleStream]:
+@dataclass(frozen=True)
+class HouseShare:
+    """A share of the houses (of one side), by id alone: a larger share has all houses of a smaller one."""
+
+    share: float
+    side: HouseSide | None = None
+
+    def __call__(self, house_id: str) -> bool:
+        chosen = _number(_SHARE_SALT, house_id) < self.share * 2**64
+        return chosen and (self.side is None or self.side(house_id))
+
+
+def _number(salt: bytes, house_id: str) -> int:
+    """Evenly spread over 0 .. 2**64 - 1."""
+    return int.from_bytes(hashlib.sha256(salt + house_id.encode()).digest()[:8], "big")
+
+
+def split_by_house(
+    places: Sequence[str | Path], share: float = 1.0, **options: Any
+) -> tuple[SampleStream, SampleStream]:
     """One set of runs as (training, validation): nine tenths of the houses, and one tenth, held out.
 
-    `options` are those of SampleStream for training; validation is neither shuffled nor augmented and
-    has all its candidates. InputError where a side has no house.
+    Of the nine tenths `share` is trained on. `options` are those of SampleStream for training; validation
+    is neither shuffled nor augmented and has all its candidates. InputError where a side has no house.
     """
     plain: dict[str, Any] = {"shuffle": False, "augment": None, "candidates_per_robot": None}
     try:
         validation = SampleStream(places, **(options | plain), houses=HouseSide(held_out=True))
-        train = SampleStream(places, **options, houses=HouseSide(held_out=False))
+        train = SampleStream(places, **options, houses=HouseShare(share, HouseSide(held_out=False)))
     except InputError as error:
         if error.field != "house_id":
             raise

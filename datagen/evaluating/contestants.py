@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from schemas.errors import InputError
 from train.baselines.scalars import Scalars
-from train.evaluation.comparisons import Origin
+from train.evaluation.comparisons import NO_TRAINING, TrainedBy
 from train.evaluation.evaluation import Method
 from train.scorers import ModelScorer, Scorer
 
@@ -41,11 +41,17 @@ class Contestant:
         return REGIMES.get(self.head.stage, self.head.stage) if self.head else ""
 
     @property
+    def origin(self) -> TrainedBy:
+        """What trained it, for comparisons of like with like."""
+        if self.head is None:
+            return NO_TRAINING
+        return TrainedBy(self.regime, self.head.model, house_share(self.head))
+
+    @property
     def method(self) -> Method:
         """As metrics know it."""
-        model = self.head.model if self.head else ""
         is_probability = self.head is not None or isinstance(self.scorer, Scalars)
-        return Method(self.name, self.scorer.threshold, Origin(self.regime, model), is_probability)
+        return Method(self.name, self.scorer.threshold, self.origin, is_probability)
 
     @property
     def houses(self) -> frozenset[str]:
@@ -92,7 +98,7 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
     from train.training.checkpoints import load_model
 
     loaded = [(place, *load_model(place)) for place in places]
-    names = _names([(REGIMES.get(head.stage, head.stage), head.model) for _, _, head in loaded])
+    names = _names([(_regime_name(head), head.model) for _, _, head in loaded])
     by_digest: dict[str, str] = {}
     for place, _, head in loaded:
         if head.digest in by_digest:
@@ -102,6 +108,17 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
         Contestant(name, ModelScorer(model, name, only_clear=True), place, head)
         for (place, model, head), name in zip(loaded, names, strict=True)
     ]
+
+
+def house_share(head: CheckpointHead) -> float:
+    """Of the houses that it could have learned from, the share that it did learn from."""
+    share = head.options.get("house_share", 1.0)
+    return float(share) if isinstance(share, (int, float)) else 1.0
+
+
+def _regime_name(head: CheckpointHead) -> str:
+    regime, share = REGIMES.get(head.stage, head.stage), house_share(head)
+    return regime if share == 1 else f"{regime} {share:.0%}"
 
 
 def _names(known: Sequence[tuple[str, str]]) -> list[str]:

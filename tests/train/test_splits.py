@@ -11,7 +11,7 @@ from schemas.errors import InputError
 from tests.train.stream_runs import make_stream_run
 from train.augment import Augmentation, Rotation
 from train.dataset import SampleStream
-from train.splits import HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
+from train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
 from workers.houses.split import split_of
 
 
@@ -35,6 +35,19 @@ def test_sides_are_a_tenth_and_the_rest_whatever_split_a_run_has():
     for split in ("train", "val", "test"):
         share = np.mean([held(i) for i in ids if split_of(i) == split])
         assert 0.07 < share < 0.13
+
+
+def test_a_larger_share_has_the_houses_of_a_smaller_one_whatever_the_side():
+    ids = [f"house-{i}" for i in range(4000)]
+    kept = HouseSide(held_out=False)
+    smaller: set[str] = set()
+    for share in (0.1, 0.25, 0.5, 1.0):
+        chosen = {i for i in ids if HouseShare(share)(i)}
+        assert smaller <= chosen
+        assert abs(len(chosen) / len(ids) - share) < 0.03
+        assert {i for i in ids if HouseShare(share, kept)(i)} == {i for i in chosen if kept(i)}
+        smaller = chosen
+    assert smaller == set(ids)
 
 
 def test_one_run_is_divided_by_house(tmp_path: Path):

@@ -6,7 +6,7 @@ A difference is sharper than the intervals of its two methods: what a scene adds
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -21,14 +21,15 @@ Estimates = Mapping[str, Mapping[str, Estimate]]
 
 
 @dataclass(frozen=True)
-class Origin:
-    """What trained a method: regime and model, both "" of a baseline."""
+class TrainedBy:
+    """What trained a method: regime and model, both "" of a baseline, and the share of the houses it had."""
 
     regime: str = ""
     model: str = ""
+    house_share: float = 1.0
 
 
-NO_TRAINING = Origin()
+NO_TRAINING = TrainedBy()
 
 
 def differences(estimates: Estimates, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -41,12 +42,12 @@ def differences(estimates: Estimates, names: Sequence[str]) -> list[dict[str, An
 
 
 def comparisons(
-    estimates: Estimates, origins: Mapping[str, Origin], names: Sequence[str]
+    estimates: Estimates, origins: Mapping[str, TrainedBy], names: Sequence[str]
 ) -> list[dict[str, Any]]:
     """The differences that are asked for first, by each metric.
 
-    `regimes`: each regime less the one before it, of the same model. `best`: the best model less the best
-    baseline, both chosen by these very scenes, which no interval allows for.
+    `regimes`: each regime less the one before it, of the same model and share of the houses. `best`: the
+    best model less the best baseline, both chosen by these very scenes, which no interval allows for.
     """
     return [
         {"kind": kind, **_difference(estimates, metric, first, second)}
@@ -70,18 +71,16 @@ def _difference(estimates: Estimates, metric: str, first: str, second: str) -> d
     }
 
 
-def _consecutive(origins: Mapping[str, Origin]) -> Iterator[tuple[str, str]]:
-    """(later, earlier) of each model's regimes that are there, the last first."""
-    for model in dict.fromkeys(o.model for o in origins.values() if o.regime):
-        present = [r for r in REGIMES if Origin(r, model) in origins.values()]
+def _consecutive(origins: Mapping[str, TrainedBy]) -> Iterator[tuple[str, str]]:
+    """(later, earlier) of the regimes that are there of each model and share, the last first."""
+    for like in dict.fromkeys(replace(o, regime="") for o in origins.values() if o.regime):
+        alike = {r: [n for n, o in origins.items() if o == replace(like, regime=r)] for r in REGIMES}
+        present = [names for names in alike.values() if names]
         for earlier, later in reversed(list(pairwise(present))):
-            by_regime = {
-                r: [n for n, o in origins.items() if o == Origin(r, model)] for r in (earlier, later)
-            }
-            yield from ((a, b) for a in by_regime[later] for b in by_regime[earlier])
+            yield from ((a, b) for a in later for b in earlier)
 
 
-def _best(estimates: Estimates, origins: Mapping[str, Origin], metric: str) -> Iterator[tuple[str, str]]:
+def _best(estimates: Estimates, origins: Mapping[str, TrainedBy], metric: str) -> Iterator[tuple[str, str]]:
     """(best model, best baseline) where there are both; the first named of equals."""
     known = {n: e[metric].value for n, e in estimates.items() if np.isfinite(e[metric].value)}
     models, baselines = ([n for n in known if bool(origins[n].regime) is side] for side in (True, False))

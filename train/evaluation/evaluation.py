@@ -22,7 +22,7 @@ from train.evaluation.bootstrap import (
 )
 from train.evaluation.breakdown import breakdown, groups_of
 from train.evaluation.columns import Columns
-from train.evaluation.comparisons import NO_TRAINING, Origin, comparisons, differences, finite, said_of
+from train.evaluation.comparisons import NO_TRAINING, TrainedBy, comparisons, differences, finite, said_of
 from train.evaluation.grids import picks, select
 from train.evaluation.metrics import F64, Bools
 
@@ -41,7 +41,7 @@ class Method:
 
     name: str
     threshold: float
-    origin: Origin = NO_TRAINING
+    origin: TrainedBy = NO_TRAINING
     says_probabilities: bool = False
 
     @property

@@ -26,8 +26,8 @@ class Stage:
 # The paper gives the losses and the order; rates, decay and epochs are ours.
 STAGES: dict[str, Stage] = {
     "stage1": Stage("stage1", ("heuristic",), True, False, 2e-3, 0.0, 12),
-    "stage2": Stage("stage2", ("plan", "sim"), False, True, 5e-4, 1e-2, 30),
-    "sim-only": Stage("sim-only", ("plan", "sim"), False, False, 2e-3, 1e-2, 30),
+    "stage2": Stage("stage2", ("plan", "sim"), False, True, 1e-3, 1e-2, 20),
+    "sim-only": Stage("sim-only", ("plan", "sim"), False, False, 2e-3, 1e-2, 20),
 }
 
 
@@ -43,6 +43,7 @@ class Options:
     model_config: Mapping[str, Any]
     epochs: int
     batch_scenes: int = 16
+    house_share: float = 1.0  # of the houses that could be trained on; a larger share has those of a smaller
     candidates_per_robot: int | None = None  # a random so many of each robot in each epoch; None for all
     lr: float = 2e-3  # the highest of the schedule
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
@@ -59,6 +60,10 @@ class Options:
         for name, (value, low) in whole.items():
             if value < low:
                 raise InputError("datagen train", f"--{name}", f"{value}", f"Give {low} or more")
+        if not 0 < self.house_share <= 1:
+            raise InputError(
+                "datagen train", "--house-share", f"{self.house_share}", "Give a share above 0, at most 1"
+            )
         for name, value, low in (("lr", self.lr, 0), ("weight-decay", self.weight_decay, -1)):
             if not math.isfinite(value) or value <= low or value < 0:
                 raise InputError("datagen train", f"--{name}", f"{value}", "Give a positive number")

@@ -17,7 +17,7 @@ from schemas.errors import InputError
 from train.augment import Augmentation
 from train.dataset import SampleStream
 from train.models import Model, build_model
-from train.splits import HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
+from train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
 from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
@@ -153,19 +153,20 @@ def _streams(job: Job, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
     drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
     if job.val_runs:
         train, val = (
-            SampleStream(job.runs, **sizes, **drawn),
+            SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share)),
             SampleStream(job.val_runs, **sizes, shuffle=False),
         )
     else:
-        train, val = split_by_house(job.runs, **sizes, **drawn)
+        train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
     refuse_shared_houses(train, val)
     if ranks.world == 1:
         return train, val
     sides = (None, None) if job.val_runs else (HouseSide(held_out=False), HouseSide(held_out=True))
+    ours = HouseShare(options.house_share, sides[0])
     shared: dict[str, Any] = {"rank": ranks.rank, "world": ranks.world, **sizes}
-    train = SampleStream(job.runs, houses=sides[0], **shared, **drawn)
+    train = SampleStream(job.runs, houses=ours, **shared, **drawn)
     # Of fewer scenes than processes each process judges all; `validate` counts a sample once.
     if val.n_scenes >= ranks.world:
         val = SampleStream(job.val_runs or job.runs, houses=sides[1], **shared, shuffle=False)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.comparisons import Estimates, Origin, comparisons
+from train.evaluation.comparisons import Estimates, TrainedBy, comparisons
 from train.evaluation.evaluation import Method, evaluate_set, weights_for
 
 METRICS = ("accuracy", "balanced_accuracy", "mean_average_precision")
@@ -28,7 +28,11 @@ def test_a_difference_is_turned_round_with_its_methods_and_nothing_between_equal
     scores = {name: label * share + (1 - share) * rng.random(len(label)) for name, share in
               (("late", skill), ("early", 0.3), ("plain", 0.5))}  # fmt: skip
     columns = replace(columns, label=label, scores={**scores, "same": scores["early"]})
-    origins = {"late": Origin("two-stage", "m"), "early": Origin("stage1", "m"), "same": Origin("x", "m")}
+    origins = {
+        "late": TrainedBy("two-stage", "m"),
+        "early": TrainedBy("stage1", "m"),
+        "same": TrainedBy("x", "m"),
+    }
 
     def told(first: str, second: str) -> dict[str, dict[str, float]]:
         named = {first: origins["late"], second: origins["early"]}
@@ -60,10 +64,15 @@ def test_regimes_are_held_against_the_one_before_and_the_best_against_the_best()
         "two a": 0.44,
         "two b": 0.48,
         "lone": 0.1,
+        "so quarter": 0.15,
+        "two quarter": 0.2,
     }
     origins = {
-        "plain": Origin(), "good plain": Origin(), "s1": Origin("stage1", "m"), "so": Origin("sim-only", "m"),
-        "two a": Origin("two-stage", "m"), "two b": Origin("two-stage", "m"), "lone": Origin("stage1", "k"),
+        "plain": TrainedBy(), "good plain": TrainedBy(),
+        "s1": TrainedBy("stage1", "m"), "so": TrainedBy("sim-only", "m"),
+        "two a": TrainedBy("two-stage", "m"), "two b": TrainedBy("two-stage", "m"),
+        "lone": TrainedBy("stage1", "k"),
+        "so quarter": TrainedBy("sim-only", "m", 0.25), "two quarter": TrainedBy("two-stage", "m", 0.25),
     }  # fmt: skip
     scores = {n: columns.label * s + (1 - s) * rng.random(len(columns)) for n, s in shares.items()}
     columns = replace(columns, scores=scores)
@@ -72,6 +81,7 @@ def test_regimes_are_held_against_the_one_before_and_the_best_against_the_best()
     pairs = [(d["kind"], d["first"], d["second"]) for d in found["comparisons"] if d["metric"] == "accuracy"]
     assert pairs == [
         ("regimes", "two a", "so"), ("regimes", "two b", "so"), ("regimes", "so", "s1"),
+        ("regimes", "two quarter", "so quarter"),
         ("best", "two b", "good plain"),
     ]  # fmt: skip
     every = {(d["metric"], d["first"], d["second"]): d for d in found["differences"]}

@@ -12,13 +12,13 @@ import pytest
 from schemas.errors import InputError
 from tests.train.evaluation.made_columns import make_columns
 from train.evaluation.columns import Columns
-from train.evaluation.comparisons import Origin
+from train.evaluation.comparisons import TrainedBy
 from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
 
 METHODS = [
     Method("truth", 0.5),
     Method("constant", 0.5),
-    Method("noisy", 0.5, Origin("stage1", "paper"), says_probabilities=True),
+    Method("noisy", 0.5, TrainedBy("stage1", "paper"), says_probabilities=True),
     Method("nearest", float("nan")),
 ]
 
