@@ -24,6 +24,8 @@ SEEN_SHARE = 0.8
 _LEAST_POINTS = 3
 _CELL_M = 0.04
 _GAP_CELLS = 4  # gaps up to twice as wide are closed
+# Table tops and shelves reach down below the top that is seen of them, by about so much.
+_BOARD_M = 0.08
 _AROUND_M = 3.0  # farther from the grid's middle nothing matters
 
 
@@ -48,8 +50,9 @@ class Places:
 def look_at_places(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> Places:
     """The grid around the target, each place blocked, clear or unseen.
 
-    Blocked where observed points lie within the base's radius between floor and mount, or within the
-    mast's between mount and camera; otherwise unseen where too little of its floor was seen.
+    Blocked where observed points lie within the base's radius between the floor and a board's thickness
+    above the mount, or within the mast's from there to the camera; otherwise unseen where too little of its
+    floor was seen.
     """
     offsets = grid_offsets(params)
     base_xy = center_m[:2] + offsets
@@ -59,7 +62,7 @@ def look_at_places(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Ca
     is_floor = np.any([floor_points(seen.points_m, eye) for eye in eyes], axis=0)
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
-    low = _counts(seen.points_m[above & (z < mount)], base_xy, params.base_radius_m)
+    low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, params.base_radius_m)
     high = _counts(seen.points_m[above & (z >= mount) & (z < top)], base_xy, params.mast_radius_m)
     tops = seen.points_m[above & (z >= mount) & (z < top)]
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
