@@ -109,16 +109,18 @@ def _refuse_other_labels(place: str, source: str, kinds: dict[str, str]) -> None
         raise InputError(place, "label_source", problem, "Evaluate the two apart")
 
 
-def sets_of(places: Sequence[Place], asked: Sequence[str]) -> list[str]:
-    """The sets of candidates to tell of: those asked for, else all that every run offers."""
-    offered = [name for name in CANDIDATE_SETS if all(name in place.offers for place in places)]
+def sets_of(places: Sequence[Place], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """The sets of candidates to tell of, those asked for or all, each with the places that offer it.
+
+    A run of candidates within reach says nothing of others, and beside it one of whole grids says of all.
+    """
+    by_name = {n: tuple(k for k, place in enumerate(places) if n in place.offers) for n in CANDIDATE_SETS}
+    offered = {name: rows for name, rows in by_name.items() if rows}
     for name in asked:
-        for place in places:
-            if name not in place.offers:
-                problem = f"the run was made of {place.offers[-1]} candidates, not of {name}"
-                mend = f"Choose of: {', '.join(offered)}"
-                raise InputError(place.place, "--candidates", problem, mend)
-    return [name for name in CANDIDATE_SETS if name in asked] if asked else offered
+        if name not in offered:
+            problem = f"no run was made of {name} candidates, but of {list(offered)[-1]}"
+            raise InputError(places[0].place, "--candidates", problem, f"Choose of: {', '.join(offered)}")
+    return {name: rows for name, rows in offered.items() if not asked or name in asked}
 
 
 def refuse_seen_houses(places: Sequence[Place], contestants: Iterable[Contestant]) -> None:

@@ -23,7 +23,7 @@ def evaluation_report(
     gathered: Gathered,
     contestants: Sequence[Contestant],
     places: Sequence[Place],
-    sets: Sequence[str],
+    sets: Mapping[str, Sequence[int]],
     *,
     seen_houses: frozenset[str],
     fit: Sequence[str],
@@ -31,7 +31,10 @@ def evaluation_report(
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """All tables and curves. Scenes in houses that somebody was trained on are a part of their own."""
+    """All tables and curves. Scenes in houses that somebody was trained on are a part of their own.
+
+    `sets` names candidates, each with the places whose scenes are told of.
+    """
     columns = gathered.columns
     methods = [c.method for c in contestants]
     objects = frozenset[str]().union(*(c.objects for c in contestants))
@@ -69,19 +72,20 @@ def evaluation_report(
 def _part(
     columns: Columns,
     methods: Sequence[Method],
-    sets: Sequence[str],
+    sets: Mapping[str, Sequence[int]],
     objects: frozenset[str],
     resamples: int,
     seed: int,
     is_one_of_two: bool,
 ) -> dict[str, Any]:
     """The tables of some scenes. One side of two may be too small for a set, which is then left out."""
-    weights = weights_for(columns, resamples, seed)
     told: dict[str, Any] = {}
     left_out: dict[str, str] = {}
-    for name in sets:
+    for name, runs in sets.items():
+        drawn_whole = columns.of_scenes(np.isin(columns.run, runs))
+        weights = weights_for(drawn_whole, resamples, seed)
         try:
-            told[name] = evaluate_set(columns, methods, name, weights, objects)
+            told[name] = {**evaluate_set(drawn_whole, methods, name, weights, objects), "runs": list(runs)}
         except InputError as error:
             if not is_one_of_two:
                 raise

@@ -105,6 +105,29 @@ def test_tables_are_of_what_the_run_holds(
     _check_page(page.read_text(), n_sets=3)
 
 
+def test_a_set_is_told_over_the_runs_that_hold_it(
+    grids: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    near, file = tmp_path / "near", checkpoint(tmp_path / "c.pt")
+    drawn = ["--candidates", "in-range", "--candidates-per-scene", "4", "--n", "8", "--seed", "2"]
+    where = ["--out", str(near), "--config", str(grids.parent / "grid.toml"), "--workers", "0"]
+    assert cli.run(["submit", "sim", *drawn, *where]) == 0
+    (part,) = json_of(capsys, ["evaluate", file, str(near), str(grids), *QUICK])["parts"]
+    stored = arrays_of(grids)
+    clear = stored["base_is_clear"]
+    in_range = clear & (stored["mount_distance_m"] <= stored["arm_reach_m"])
+    told = {name: (said["runs"], said["count"], said["scenes"]) for name, said in part["sets"].items()}
+    scenes = {name: len(set(stored["sample_scene_index"][rows])) for name, rows in
+              (("in-range", in_range), ("clear", clear))}  # fmt: skip
+    assert told == {
+        "in-range": ([0, 1], int(in_range.sum()) + 8, scenes["in-range"] + 2),
+        "clear": ([1], int(clear.sum()), scenes["clear"]),
+        "grid": ([1], len(clear), SCENES),
+    }
+    assert cli.run(["evaluate", file, str(near), *QUICK, "--candidates", "clear"]) == 2
+    assert "no run was made of clear candidates, but of in-range" in capsys.readouterr().err
+
+
 def _check_page(text: str, n_sets: int) -> None:
     page = Page(text)
     # Each set has intervals and curves, and there is one picture of grids; nothing lies elsewhere.
