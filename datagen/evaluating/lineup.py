@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from datagen.console.steps import steps
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import SCENES_PER_BATCH, Place, refuse_no_trials
-from datagen.specifying.specify import read_toml
+from datagen.specifying.specify import first_of, read_toml
 from schemas.errors import InputError
 from schemas.specification import HeuristicParams
 from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
@@ -43,7 +45,10 @@ def read_heuristic(path: Path, places: Sequence[Place], allow_seen_houses: bool)
         if not allow_seen_houses and any(spec.hash() in fitted_to for spec in place.specs):
             problem = f"its rule was fitted to the labels of {place.place}"
             raise InputError(path, "heuristic", problem, "Calibrate to runs of another split")
-    return HeuristicParams.model_validate(section)
+    try:
+        return HeuristicParams.model_validate(section)
+    except ValidationError as error:
+        raise first_of(error, str(path), "heuristic") from None
 
 
 def line_up(

@@ -110,14 +110,19 @@ def validated(fields: dict[str, Any], place: str) -> Specification:
     try:
         return Specification.model_validate(fields)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        mend = (
-            "Take the key out, or correct it: docs/specification.md lists all"
-            if (first["type"] == "extra_forbidden")
-            else "Correct the value"
-        )
-        raise InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend) from None
+        raise first_of(error, place) from None
+
+
+def first_of(error: ValidationError, place: str, *section: str) -> InputError:
+    """The first field that is wrong in a file, or in this section of it, as one line."""
+    first = error.errors()[0]
+    field = ".".join((*section, *map(str, first["loc"])))
+    mend = (
+        "Take the key out, or correct it: docs/specification.md lists all"
+        if (first["type"] == "extra_forbidden")
+        else "Correct the value"
+    )
+    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend)
 
 
 def layout_of(spec: Specification, n: int) -> Layout:

@@ -237,6 +237,8 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
 ) -> None:
     file, run = checkpoint(tmp_path / "c.pt"), str(grids)
     (tmp_path / "thesis.tex").write_text("text")
+    odd = tmp_path / "odd.toml"
+    odd.write_text('[heuristic]\nmu = "far"\n')
     heuristic = make_run(tmp_path / "heuristic").storage.url
     cases: list[tuple[list[str], list[str]]] = [
         ([file], ["RUN", "only checkpoints are named"]),
@@ -252,6 +254,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
         ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["heuristic labels"]),
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
+        ([file, run, "--heuristic", str(odd), *QUICK], ["odd.toml: heuristic.mu", "given: far"]),
         ([file, run, "--threads", "0"], ["--threads"]),
         ([file, run, "--html", "page.pdf"], ["--html", "not an .html file"]),
         ([file, run, "--html", str(tmp_path / "no" / "page.html")], ["--html", "folder does not exist"]),
