@@ -12,8 +12,9 @@ DAMAGED_ZIP = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,  # a member that is cut
-    RuntimeError,  # an encrypted member; with NotImplementedError, which is one, unknown methods and versions
-    ValueError,  # an offset before the file begins; with UnicodeDecodeError, a name that is no UTF-8
+    RuntimeError,  # an encrypted member; a version or flag that zipfile does not know raises a kind of it
+    # An offset before the file begins, a member that is not read; with UnicodeDecodeError, a name no UTF-8.
+    ValueError,
 )
 # What numpy.lib.format raises over an array's header, which it reads as Python, and over its bytes.
 DAMAGED_ARRAY = (
@@ -31,10 +32,11 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> IO[bytes]:
-    """A stored or deflated member, for reading. NotImplementedError for other methods, else `DAMAGED_ZIP`.
+    """A stored or deflated member, for reading. Raises one of `DAMAGED_ZIP`, ValueError for other methods:
 
-    Damaged bzip2 raises OSError, as a failing disk does; LZMA takes up to 4 GiB at a header's word.
+    damaged bzip2 raises OSError, as a failing disk does; LZMA takes up to 4 GiB at a header's word.
     """
     if member.compress_type not in _METHODS:
-        raise NotImplementedError(f"compression method {member.compress_type}")
+        method = member.compress_type
+        raise ValueError(f"{member.filename!r} is compressed by method {method}, neither stored nor deflated")
     return archive.open(member)

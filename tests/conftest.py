@@ -24,10 +24,10 @@ def assets() -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def one_thread() -> Iterator[None]:
     """One thread for small models, where torch is loaded at all: test processes share the cores, and
-    threads of one would wait for those of another.
+    threads of one would wait for those of another. For whole modules, since their fixtures train as well.
     """
     torch = sys.modules.get("torch")
     if torch is None:

@@ -130,20 +130,28 @@ def _refuse_other_place(place: Storage, hashes: Sequence[str]) -> None:
     if place.exists("manifest.json"):
         problem = f"holds one run, and {len(hashes)} would be written"
         raise InputError(place.url, "manifest.json", problem, "Choose another --out")
-    if place.exists(MERGED):
-        _write_merged(place, hashes)
-    else:
+    stored = place.get(MERGED, MAX_RECORD_BYTES)
+    if stored is None:
         # A call that was cut short may have left parts, and a draft of the record.
         refuse_foreign(place, "parts/", MERGED)
+    elif stored != _merged_record(hashes):
+        raise _other_runs(place)
+
+
+def _merged_record(hashes: Sequence[str]) -> bytes:
+    return encode_record(Merged(parts=tuple(hashes)))
+
+
+def _other_runs(place: Storage) -> InputError:
+    return InputError(f"{place.url}/{MERGED}", "parts", "other runs were merged here", "Choose another --out")
 
 
 def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
-    record = encode_record(Merged(parts=tuple(hashes)))
+    record = _merged_record(hashes)
     if place.get(MERGED, MAX_RECORD_BYTES) in (None, record):
         publish(place, MERGED, record)
     if place.get(MERGED, MAX_RECORD_BYTES) != record:  # also where somebody else was faster
-        problem = "other runs were merged here"
-        raise InputError(f"{place.url}/{MERGED}", "parts", problem, "Choose another --out")
+        raise _other_runs(place)
 
 
 def _relabel_run(

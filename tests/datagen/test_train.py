@@ -110,6 +110,7 @@ def test_what_cannot_be_trained_is_refused(
         (words("stage1", run, out, "--epochs", "0"), ("--epochs",)),
         (words("stage1", run, out, "--lr", "nan"), ("--lr",)),
         (words("stage1", run, out, "--weight-decay", "-1"), ("--weight-decay",)),
+        *((words("stage1", run, out, "--house-share", s), ("--house-share",)) for s in ("0", "1.5", "nan")),
         (words("stage1", run, out, "--model-config", "width=x"), ("width",)),
         (words("stage1", run, out, "--model-config", "beauty=1"), ("beauty",)),
         (words("stage1", run, out, "--model-config", "none.toml"), ("none.toml",)),
