@@ -24,11 +24,14 @@ from cluster.executor import Executor
 from cluster.open_shards import OpenShards
 from cluster.policy import (
     Durations,
+    LostInARow,
     Policy,
     Trouble,
     deadline_s,
     decide,
     ends_early,
+    is_suspect,
+    nothing_runs,
     too_many_quarantined,
     window,
 )
@@ -50,7 +53,6 @@ class Order:
     shard: int
     attempt: str
     deadline_s: float
-    memory_factor: float
 
 
 class Books(Protocol):
@@ -91,6 +93,7 @@ class _Flight:
     number: int  # of this driver's attempts
     submitted_s: float
     check_s: float  # when to look after it next
+    alone: bool  # no other attempt was in flight at any moment of this one
     begun: bool = False
     verdict: tuple[Outcome, str] | None = None  # set when the driver ended it
 
@@ -137,6 +140,7 @@ class _Driver(Generic[T]):
         self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
         self._durations = Durations()
         self._numbered = 0
+        self._lost = LostInARow()
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
         self._open = OpenShards(shards, random.Random(self._name))
@@ -179,11 +183,20 @@ class _Driver(Generic[T]):
             room -= 1
 
     def _next_shard(self) -> int | None:
-        if self._due and self._due[0][0] <= self._clock():
-            return heapq.heappop(self._due)[1]
+        now_s = self._clock()
+        while self._due and self._due[0][0] <= now_s:
+            _, shard = heapq.heappop(self._due)
+            flying = (flight.order.shard for flight in self._flights.values())
+            if not (self._is_suspect(shard) and any(map(self._is_suspect, flying))):
+                return shard
+            # Those that were lost together would be lost together again, by the fault of one of them.
+            heapq.heappush(self._due, (now_s + _POLL_S, shard))
         if len(self._due) >= self._policy.max_waiting:
             return None
         return self._open.next()
+
+    def _is_suspect(self, shard: int) -> bool:
+        return shard in self._troubled and is_suspect(self._troubled[shard])
 
     def _submit(self, shard: int) -> None:
         trouble = self._troubled.get(shard, Trouble())
@@ -192,11 +205,12 @@ class _Driver(Generic[T]):
             shard=shard,
             attempt=f"{shard:06d}-{self._name}-{self._numbered:06d}",
             deadline_s=deadline_s(self._policy, self._durations, trouble),
-            memory_factor=trouble.memory_factor,
         )
         now_s = self._clock()
         check_s = now_s + order.deadline_s + self._policy.grace_s
-        self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s)
+        if len(self._flights) == 1:  # of more, none is alone
+            next(iter(self._flights.values())).alone = False
+        self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s, not self._flights)
         self._next_check_s = min(self._next_check_s, check_s)
         self._tally.retries += bool(trouble.attempts)
         self._executor.submit(self._make_task(order))
@@ -220,7 +234,9 @@ class _Driver(Generic[T]):
         if report.outcome not in ("committed", "superseded"):
             report = self._what_the_run_says(report)
         shard = report.shard
-        decision = decide(self._policy, self._troubled.get(shard, Trouble()), report)
+        successes = self._tally.committed + self._tally.superseded
+        decision = decide(self._policy, self._troubled.get(shard, Trouble()), report, successes, flight.alone)
+        self._lost = self._lost.after(report, flight.number, self._numbered)
         self._books.close(_ledger_entry(report))
         self._tally.count(report)
         if report.outcome == "committed" and report.cost is not None:
@@ -238,8 +254,9 @@ class _Driver(Generic[T]):
             self._tally.count_quarantined(shard)
             if ends_early(self._policy, self._tally.quarantined, self._tally.shards):
                 self._begin_end("failed", f"{self._tally.quarantined} shards are quarantined")
-        elif decision.action == "abort":
-            self._begin_end("aborted", report.cause)
+        if decision.action == "abort" or (self._end is None and nothing_runs(self._policy, self._lost)):
+            again = "" if decision.action == "abort" else "whatever begins is lost, at last by: "
+            self._begin_end("aborted", again + report.cause)
             self.kill_all("the job cannot go on")
         self._events.ended(report, decision.action)
 

@@ -66,7 +66,6 @@ class Meter:
             cpu_s=time.process_time() - self._cpu,
             stage_wall_s=clock.wall_s,
             stage_cpu_s=clock.cpu_s,
-            stage_gpu_s=clock.gpu_s,
             peak_rss_bytes=_peak_memory_bytes(),
             written_bytes=written_bytes,
         )

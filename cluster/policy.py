@@ -21,8 +21,9 @@ class Policy:
     """The budgets of a job. Seconds unless a name says otherwise."""
 
     max_failures: int = 3  # crash, hang, exception or bad output; then the shard is given up
-    max_lost: int = 10  # lost machines say nothing about the shard, so they have their own budget
-    max_out_of_memory: int = 2  # the first is retried with double memory
+    max_lost: int = 10  # losses that count against the shard (see `decide`), in a budget of their own
+    max_lost_rounds: int = 5  # all that was in flight lost so many times in a row: the executor is at fault
+    max_out_of_memory: int = 2
     backoff_s: float = 0.5  # wait before the second attempt; doubles with every further one
     max_backoff_s: float = 60.0
     window_factor: float = 2.0  # attempts in flight per slot, so that no worker waits for the driver
@@ -46,16 +47,13 @@ class Trouble:
     """What went wrong with one shard so far. Shards without trouble have none of these."""
 
     failures: int = 0
-    lost: int = 0
+    lost: int = 0  # those that count
+    successes: int = 0  # of other shards in this job, when this one was last lost
     out_of_memory: int = 0
     hangs: int = 0
     attempts: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     stacks: tuple[str, ...] = ()
-
-    @property
-    def memory_factor(self) -> float:
-        return 2.0 if self.out_of_memory else 1.0
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,15 @@ class Decision:
     wait_s: float = 0.0
 
 
-def decide(policy: Policy, trouble: Trouble, report: AttemptReport) -> Decision:
+def decide(
+    policy: Policy, trouble: Trouble, report: AttemptReport, successes: int = 0, alone: bool = False
+) -> Decision:
     """What to do with a shard after this report.
 
     A superseded attempt is done: the shard is committed, by whoever was first. A cancelled one is
-    dropped: the job is stopping and the shard stays open for the next.
+    dropped: the job is stopping and the shard stays open for the next. A loss counts against the shard
+    where it was `alone` in flight, or where others succeeded since it was lost before (`successes` are
+    those of the job so far): a machine or a cluster that is gone loses everything, whichever shard it is.
     """
     if report.outcome in ("committed", "superseded"):
         return Decision("done", trouble)
@@ -79,11 +81,13 @@ def decide(policy: Policy, trouble: Trouble, report: AttemptReport) -> Decision:
         return Decision("drop", trouble)
     if report.ends_job:
         return Decision("abort", trouble)
+    lost = report.outcome == "lost"
     now = replace(
         trouble,
         failures=trouble.failures + (report.outcome in ("failed", "crashed", "hung")),
         hangs=trouble.hangs + (report.outcome == "hung"),
-        lost=trouble.lost + (report.outcome == "lost"),
+        lost=trouble.lost + (lost and (alone or successes > trouble.successes)),
+        successes=successes if lost else trouble.successes,
         out_of_memory=trouble.out_of_memory + (report.outcome == "out_of_memory"),
         attempts=(*trouble.attempts, report.attempt),
         causes=(*trouble.causes, f"{report.outcome}: {report.cause}" if report.cause else report.outcome),
@@ -98,6 +102,36 @@ def decide(policy: Policy, trouble: Trouble, report: AttemptReport) -> Decision:
         return Decision("quarantine", now)
     wait_s = min(policy.backoff_s * 2 ** (len(now.attempts) - 1), policy.max_backoff_s)
     return Decision("retry", now, wait_s)
+
+
+@dataclass(frozen=True)
+class LostInARow:
+    """Attempts lost since a worker last answered. A round is all that was in flight together."""
+
+    rounds: int = 0
+    newest: int = 0  # the number of the job's latest attempt when the present round began
+    shards: frozenset[int] = frozenset()
+
+    def after(self, report: AttemptReport, number: int, newest: int) -> LostInARow:
+        """The row after the end of attempt `number`, of `newest` so far."""
+        if report.outcome in ("cancelled", "hung"):  # by the driver's own doing
+            return self
+        if report.outcome != "lost":
+            return LostInARow()
+        shards = self.shards | {report.shard}
+        if number <= self.newest:
+            return replace(self, shards=shards)
+        return LostInARow(self.rounds + 1, newest, shards)
+
+
+def is_suspect(trouble: Trouble) -> bool:
+    """Whether the shard may be what takes its machine along: then no other suspect is in flight with it."""
+    return trouble.lost >= 2
+
+
+def nothing_runs(policy: Policy, row: LostInARow) -> bool:
+    """Whether the executor rather than a shard is at fault: whatever it is given is lost."""
+    return row.rounds >= policy.max_lost_rounds and len(row.shards) > 1
 
 
 def window(policy: Policy, slots: int) -> int:

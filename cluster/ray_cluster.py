@@ -32,7 +32,6 @@ class RaySettings:
 
     address: str = "local"  # or `auto`, `HOST:PORT`, `ray://...` of a running cluster
     workers: int | None = None  # slots of a local cluster; None is one a core
-    memory_bytes: int = 0  # reserved per attempt, doubled after a shard ran out of memory; 0: none
     attempts_per_worker: int = 500  # then a fresh process, against slow leaks
     resident_limit_bytes: int = 3 * 2**30  # above it after an attempt: a fresh process at once
     object_store_bytes: int = OBJECT_STORE_BYTES

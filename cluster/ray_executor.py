@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
+import psutil
+
 from cluster.guard import Meter, Remains, collect_remains, guarded, obituary, resident_bytes
-from cluster.ray_cluster import RaySettings, first_line
+from cluster.ray_cluster import RaySettings, first_line, ray_cluster
 from cluster.ray_nodes import (
     OtherNodes,
     Question,
@@ -24,6 +27,7 @@ from cluster.ray_nodes import (
     remains_of,
 )
 from cluster.task import AttemptReport, Product, Task
+from schemas.errors import InputError
 from schemas.run_records import Outcome
 
 _SLOTS_SEEN_FOR_S = 5.0
@@ -53,11 +57,42 @@ class _Inquest(Generic[T]):
     question: Question
 
 
-class RayExecutor(Generic[T]):
-    """An executor over a Ray cluster that lives as long as `ray_cluster` is open."""
+@contextmanager
+def ray_executor(function: Callable[[T, Meter], Product], settings: RaySettings) -> Generator[RayExecutor[T]]:
+    """An executor over `ray_cluster(settings)`; a local cluster that dies is started anew."""
+    with ExitStack() as stack:
 
-    def __init__(self, function: Callable[[T, Meter], Product], settings: RaySettings, ray: Any) -> None:
-        self._ray, self._settings = ray, settings
+        def restart() -> Any:
+            left = executor.others.own.processes()  # some outlive a GCS server that was killed
+            stack.close()
+            for process in left:
+                with suppress(psutil.NoSuchProcess):
+                    process.kill()
+            return stack.enter_context(ray_cluster(settings))
+
+        ray = stack.enter_context(ray_cluster(settings))
+        executor = RayExecutor(function, settings, ray, restart if settings.address == "local" else None)
+        try:
+            yield executor
+        finally:
+            executor.close()
+
+
+class RayExecutor(Generic[T]):
+    """An executor over a Ray cluster that lives as long as `ray_cluster` is open.
+
+    Where the cluster dies, everything in flight is lost. `restart` gives another one; without it the
+    reports end the job.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[T, Meter], Product],
+        settings: RaySettings,
+        ray: Any,
+        restart: Callable[[], Any] | None = None,
+    ) -> None:
+        self._settings, self._restart = settings, restart
         limit_bytes, attempts = settings.resident_limit_bytes, settings.attempts_per_worker
 
         def work(task: T) -> AttemptReport:
@@ -66,27 +101,32 @@ class RayExecutor(Generic[T]):
                 retire_worker()
             return report
 
-        options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
-        self._work = ray.remote(**options)(work)
+        self._function: Callable[[T], AttemptReport] = work
+        self._options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
         self._inquests: list[_Inquest[T]] = []
         self._killed: dict[str, float] = {}  # attempts to end, and when to do so by their notes elsewhere
-        self._slots, self._slots_until_s = 1, 0.0
         self._begun_elsewhere: set[str] = set()
         self._begun_until_s = 0.0
         self._jobs: set[str] = set()  # names under which notes are kept
-        self.others = OtherNodes(ray, settings.address)
+        self._join(ray)
+
+    def _join(self, ray: Any) -> None:
+        self._ray, self._work = ray, ray.remote(**self._options)(self._function)
+        self._slots, self._slots_until_s = 1, 0.0
+        self.others = OtherNodes(ray, self._settings.address)
 
     @property
     def slots(self) -> int:
-        if time.monotonic() >= self._slots_until_s:  # a cluster grows and shrinks
+        # A cluster grows and shrinks.
+        if time.monotonic() >= self._slots_until_s and not self.others.own.silent():
             self._slots = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
             self._slots_until_s = time.monotonic() + _SLOTS_SEEN_FOR_S
         return self._slots
 
     def submit(self, task: T) -> None:
-        ref = self._work.options(name=f"shard {task.shard}", **self._memory(task.memory_factor)).remote(task)
+        ref = self._work.options(name=f"shard {task.shard}").remote(task)
         self._tasks[ref], self._refs[task.attempt] = task, ref
         self._jobs.add(task.notes)
 
@@ -96,6 +136,8 @@ class RayExecutor(Generic[T]):
             if not self._inquests:
                 time.sleep(timeout_s)
             return self._ended_inquests()
+        if dead := self.others.own.dead():
+            return self._lose_all(dead)
         self._end_stubborn()
         refs = [*self._tasks, *asked]
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
@@ -151,12 +193,30 @@ class RayExecutor(Generic[T]):
         for notes, attempts in self._by_notes(stubborn).items():
             self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # nothing is waited for
 
-    def _memory(self, factor: float) -> dict[str, int]:
-        if not self._settings.memory_bytes:
-            return {}
-        # A demand that no machine can meet would wait for ever.
-        largest = max((n["Resources"].get("memory", 0) for n in self._ray.nodes() if n["Alive"]), default=0)
-        return {"memory": int(min(self._settings.memory_bytes * factor, largest))}
+    def _lose_all(self, cause: str) -> list[AttemptReport]:
+        """Reports of all that was in flight on a cluster that died: what has answered, and what is lost."""
+        refs = list(self._tasks)
+        ended = [self._answer(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
+        reports = [answer for answer in ended if not isinstance(answer, _Death)]
+        deaths = [answer for answer in ended if isinstance(answer, _Death)]
+        deaths += [death for inquest in self._inquests for death in inquest.deaths]
+        deaths += [
+            _Death(task, "cancelled" if task.attempt in self._killed else "lost", cause)
+            for task in self._tasks.values()
+        ]
+        for known in (self._tasks, self._refs, self._killed, self._inquests):
+            known.clear()
+        ends_job = self._restart is None
+        if self._restart is not None:
+            try:
+                self._join(self._restart())
+            except InputError as error:
+                ends_job, cause = True, f"{cause}, and Ray cannot be started anew: {error}"
+        for death in deaths:
+            end_attempts(death.task.notes, [death.task.attempt])  # a worker may outlive its raylet
+            report = obituary(death.task, death.outcome, death.cause)
+            reports.append(replace(report, cause=cause, ends_job=True) if ends_job else report)
+        return reports
 
     def _answer(self, ref: Any) -> AttemptReport | _Death[T]:
         task, e = self._tasks.pop(ref), self._ray.exceptions

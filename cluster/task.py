@@ -24,11 +24,6 @@ class Task(Protocol):
     def deadline_s(self) -> float: ...
 
     @property
-    def memory_factor(self) -> float:
-        """1, or 2 after the shard once ran out of memory."""
-        ...
-
-    @property
     def notes(self) -> str:
         """Name of the folder, in its machine's folder for temporary files, in which the worker leaves
         its process id and its stack; "" for none. Unique to the job; an absolute path stands as it is.
@@ -48,7 +43,6 @@ class ShardTask:
     houses: str  # source reference, as the command line takes it: `builtin`, `procthor:DIR`
     objects: str
     deadline_s: float
-    memory_factor: float = 1.0
     notes: str = ""
     scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" draws new ones
 

@@ -180,7 +180,6 @@ def _account(account: Account) -> dict[str, Any]:
         "without_account": account.unaccounted,
         "wall_s": account.wall_s,
         "cpu_s": account.cpu_s,
-        "gpu_s": sum(account.stage_gpu_s.values()),
         "written_bytes": account.written_bytes,
         "peak_rss_bytes": account.peak_rss_bytes,
     }

@@ -12,7 +12,7 @@ STAGES = ("draw", "settle", "observe", "visibility", "grasps", "plan", "execute"
 
 @dataclass
 class StageClock:
-    """Adds up wall, CPU and GPU seconds by stage. `other` is what no stage claimed.
+    """Adds up wall and CPU seconds by stage.
 
     CPU seconds are those of the whole process, so that a library's threads are counted. A stage
     within another is taken out of the outer one, so that every second is counted once.
@@ -20,7 +20,6 @@ class StageClock:
 
     wall_s: dict[str, float] = field(default_factory=dict)
     cpu_s: dict[str, float] = field(default_factory=dict)
-    gpu_s: dict[str, float] = field(default_factory=dict)
     _inner: list[tuple[float, float]] = field(default_factory=list)  # (wall, CPU) spent within open stages
 
     @contextmanager

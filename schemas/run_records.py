@@ -89,7 +89,7 @@ class FileEntry(StoredRecord):
 
 
 class Cost(StoredRecord):
-    """What one attempt cost. `stage_gpu_s` stays empty where no GPU was used.
+    """What one attempt cost. No stage measures `stage_gpu_s`: stored records have the field.
 
     `source_s` is in none of the other numbers: what was paid before for the labels of another run, by wall
     and CPU seconds, where this attempt only judged them by another rule.
@@ -125,7 +125,7 @@ class Host(StoredRecord):
     cpu: str
     cores: int
     memory_bytes: int
-    gpu: str = ""
+    gpu: str = ""  # read from stored records; no machine fills it
     pid: int = 0
 
 

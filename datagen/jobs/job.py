@@ -19,8 +19,8 @@ from cluster.guard import notes_of_a_job
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy, too_many_quarantined
 from cluster.progress import progress
-from cluster.ray_cluster import RaySettings, ray_cluster
-from cluster.ray_executor import RayExecutor
+from cluster.ray_cluster import RaySettings
+from cluster.ray_executor import RayExecutor, ray_executor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally, no_work
 from cluster.task import ShardTask
@@ -156,13 +156,12 @@ def _drive(
             houses=work.houses,
             objects=work.objects,
             deadline_s=order.deadline_s,
-            memory_factor=order.memory_factor,
             notes=notes,
             scenes_from=work.scenes_from,
         )
 
     if isinstance(executor, RayExecutor):
-        probe = make_task(Order(shards[0], "probe", deadline_s=0.0, memory_factor=1.0))
+        probe = make_task(Order(shards[0], "probe", deadline_s=0.0))
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     with progress(per_shard, len(shards), done, True if placing.json else None) as display:
@@ -193,9 +192,7 @@ def _executor(placing: Placing, shards: int, stack: ExitStack) -> Executor[Shard
     cores = len(os.sched_getaffinity(0))
     workers = min(placing.workers or cores, shards)  # Ray starts them all at once
     ray_settings = RaySettings(address=placing.address, workers=workers)
-    executor = RayExecutor(run_attempt, ray_settings, stack.enter_context(ray_cluster(ray_settings)))
-    stack.callback(executor.close)
-    return executor
+    return stack.enter_context(ray_executor(run_attempt, ray_settings))
 
 
 class _CannotGoOn(InputError):

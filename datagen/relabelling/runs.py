@@ -163,7 +163,7 @@ def _relabel_run(
         return relabel_shard(run, source, task, meter, flips)
 
     def make_task(order: Order) -> RelabelTask:
-        return RelabelTask(order.shard, order.attempt, order.deadline_s, order.memory_factor)
+        return RelabelTask(order.shard, order.attempt, order.deadline_s)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard
     with progress(per_shard, len(missing), done, True if json else None) as display:

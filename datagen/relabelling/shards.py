@@ -35,7 +35,6 @@ class RelabelTask:
     shard: int
     attempt: str
     deadline_s: float
-    memory_factor: float = 1.0
     notes: str = ""
 
 

@@ -22,7 +22,6 @@ class Account:
     cpu_s: float = 0.0
     stage_wall_s: Counter[str] = field(default_factory=Counter)
     stage_cpu_s: Counter[str] = field(default_factory=Counter)
-    stage_gpu_s: Counter[str] = field(default_factory=Counter)
     source_s: Counter[str] = field(default_factory=Counter)  # by wall and cpu: what was taken over had cost
     written_bytes: int = 0
     peak_rss_bytes: int = 0
@@ -37,7 +36,6 @@ class Account:
         self.cpu_s += cost.cpu_s
         self.stage_wall_s.update(cost.stage_wall_s)
         self.stage_cpu_s.update(cost.stage_cpu_s)
-        self.stage_gpu_s.update(cost.stage_gpu_s)
         self.source_s.update(cost.source_s)
         self.written_bytes += cost.written_bytes
         self.peak_rss_bytes = max(self.peak_rss_bytes, cost.peak_rss_bytes)

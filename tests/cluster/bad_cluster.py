@@ -102,6 +102,8 @@ class BadCluster:
         self._free.append(node)
         if outcome == "committed":
             outcome = "committed" if self._commit(order.shard) else "superseded"
+        elif self.done[order.shard] and outcome != "failed":  # by a zombie: the driver finds its commit
+            outcome = "superseded"
         self._count(order.shard, outcome, wall_s)
         self._ready.append(report_of(order, outcome, wall_s))
 
@@ -184,7 +186,7 @@ class _Books(PaperBooks):
             return self.commits[shard]
         if not self._cluster.done[shard]:
             return None
-        return commit_by(Order(shard, "another", 0.0, 1.0))
+        return commit_by(Order(shard, "another", 0.0))
 
     def missing(self) -> ShardRanges:
         return ShardRanges.of(np.flatnonzero(np.frombuffer(self._cluster.done, np.uint8) == 0))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import tracemalloc
+from collections import Counter
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -14,11 +16,12 @@ from cluster.open_shards import OpenShards
 from cluster.policy import Policy
 from cluster.stop import StopRequest
 from cluster.tally import JobSummary, Tally
+from cluster.task import AttemptReport
 from schemas.errors import InputError
 from schemas.run_records import Commit, Cost, Host, LedgerEntry
 from schemas.shard_ranges import ShardRanges
 from tests.cluster.bad_cluster import simulate
-from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
+from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor, report_of
 
 LENIENT = Policy(max_quarantined_share=1.0)
 
@@ -62,13 +65,73 @@ def test_three_failures_of_any_kind_quarantine_the_shard_with_its_story() -> Non
 def test_lost_machines_have_their_own_budget() -> None:
     summary, books, _, _ = run_script({1: ["lost"] * 9 + ["crashed"] * 2})
     assert summary.tally.committed == 6 and not books.given_up
-    summary, books, _, _ = run_script({1: ["lost"] * 10})
+    _, books, _, _ = run_script({1: ["lost"] * 11})
     assert set(books.given_up) == {1}
 
 
-def test_out_of_memory_is_tried_once_more_with_double_memory() -> None:
-    _, _, executor, _ = run_script({4: ["out_of_memory"]})
-    assert [o.memory_factor for o in executor.orders if o.shard == 4] == [1.0, 2.0]
+class OneMachine(SimulatedExecutor):
+    """A machine that loses all that it has been given whenever one attempt is lost."""
+
+    def wait(self, timeout_s: float) -> list[AttemptReport]:
+        ended = super().wait(timeout_s)
+        if any(report.outcome == "lost" for report in ended):
+            ended += [report_of(order, "lost", 0.0) for order in [*self._running.values(), *self._queue]]
+            self._running.clear()
+            self._queue.clear()
+        return ended
+
+
+def on_one_machine(
+    shards: int, fate: Callable[[Order, int], Fate]
+) -> tuple[JobSummary, PaperBooks, OneMachine]:
+    clock, books = FakeClock(), PaperBooks()
+    executor = OneMachine(clock, fate, keep_orders=True)
+    summary = drive(range(shards), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
+    assert len(books.entries) == len(executor.orders) == summary.tally.outcomes.total()
+    return summary, books, executor
+
+
+@pytest.mark.parametrize("shards", [2, 7, 300])
+def test_an_executor_that_loses_everything_ends_the_job_and_is_no_shards_fault(shards: int) -> None:
+    made = 0
+
+    def fate(order: Order, n: int) -> Fate:
+        nonlocal made
+        made += shards > 2
+        return ("committed", 5.0) if 0 < made <= 3 else ("lost", 0.01)
+
+    summary, books, executor = on_one_machine(shards, fate)
+    assert summary.end == "aborted" and summary.exit_code == 2 and not books.given_up
+    assert summary.cause == "whatever begins is lost, at last by: scripted lost"
+    assert summary.remaining == shards - summary.tally.committed and len(executor.orders) < 60
+
+
+def test_an_executor_that_works_again_completes_the_job() -> None:
+    began = 0
+
+    def fate(order: Order, n: int) -> Fate:
+        nonlocal began
+        began += 1
+        return ("lost", 0.1) if began % 40 < 4 else ("committed", 5.0)
+
+    summary, books, _ = on_one_machine(300, fate)
+    assert summary.end == "complete" and summary.tally.committed == 300 and not books.given_up
+
+
+@pytest.mark.parametrize(("shards", "wall_s"), [(1, 1.0), (300, 0.01), (300, 20.0)])
+def test_a_shard_that_takes_its_machine_along_is_given_up_alone(shards: int, wall_s: float) -> None:
+    def fate(order: Order, n: int) -> Fate:
+        return ("lost", wall_s) if order.shard == shards // 3 else ("committed", 5.0)
+
+    summary, books, executor = on_one_machine(shards, fate)
+    assert set(books.given_up) == {shards // 3} and summary.tally.committed == shards - 1
+    assert len(executor.orders) <= shards + 11 * 8
+    assert max(Counter(e.shard for e in books.entries if e.shard != shards // 3).values(), default=0) <= 5
+
+
+def test_out_of_memory_is_tried_once_more() -> None:
+    summary, _, _, _ = run_script({4: ["out_of_memory"]})
+    assert summary.tally.committed == 6
     _, books, executor, _ = run_script({4: ["out_of_memory"] * 5})
     assert set(books.given_up) == {4}
     assert len([o for o in executor.orders if o.shard == 4]) == 2
@@ -250,7 +313,7 @@ WORDS = st.sampled_from(["crashed", "hung", "failed", "out_of_memory", "lost", "
 def test_whatever_fails_every_shard_ends_once_and_every_attempt_is_in_the_ledger(
     script: dict[int, list[str]],
 ) -> None:
-    policy = Policy(initial_deadline_s=10, grace_s=1, max_quarantined_share=1.0)
+    policy = Policy(initial_deadline_s=10, grace_s=1, max_quarantined_share=1.0, max_lost_rounds=100)
     summary, books, executor, heard = run_script(script, 12, policy)
     tally = summary.tally
     assert tally.committed + tally.superseded + tally.quarantined == 12 and summary.remaining == 0

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.policy import (
     Durations,
+    LostInARow,
     Policy,
     Trouble,
     deadline_s,
     decide,
     ends_early,
+    nothing_runs,
     percentile_95,
     too_many_quarantined,
     window,
@@ -27,7 +31,7 @@ def follow(outcomes: list[Outcome]) -> tuple[list[str], Trouble, list[float]]:
     """Actions, the trouble at the end and the waits of a shard whose attempts end like this."""
     trouble, actions, waits = Trouble(), [], []
     for n, outcome in enumerate(outcomes):
-        decision = decide(POLICY, trouble, AttemptReport(f"a{n}", 0, outcome, cause="why"))
+        decision = decide(POLICY, trouble, AttemptReport(f"a{n}", 0, outcome, cause="why"), alone=True)
         actions.append(decision.action)
         waits.append(decision.wait_s)
         trouble = decision.trouble
@@ -53,6 +57,36 @@ def test_budgets(outcomes: list[Outcome], last: str) -> None:
     assert actions[-1] == last
     troubles = [o for o in outcomes if o not in ("committed", "superseded", "cancelled")]
     assert [c.split(":")[0] for c in trouble.causes] == troubles
+
+
+def test_a_loss_counts_where_the_shard_was_alone_or_others_succeeded_since_its_last() -> None:
+    trouble, lost = Trouble(), AttemptReport("a", 0, "lost")
+    for successes, alone, counted in (
+        (0, False, 0),
+        (3, False, 1),
+        (3, False, 1),
+        (3, True, 2),
+        (4, False, 3),
+    ):
+        trouble = decide(POLICY, trouble, lost, successes, alone).trouble
+        assert trouble.lost == counted
+    for _ in range(100):  # a cluster that is gone
+        assert decide(POLICY, trouble, lost, successes=4).action == "retry"
+    assert decide(POLICY, replace(trouble, lost=9), lost, successes=5).action == "quarantine"
+
+
+def test_a_row_of_losses_has_rounds_and_ends_with_any_answer() -> None:
+    def after(row: LostInARow, outcome: Outcome, shard: int, number: int, newest: int) -> LostInARow:
+        return row.after(AttemptReport("a", shard, outcome), number, newest)
+
+    row = after(after(LostInARow(), "lost", 1, 1, 4), "lost", 2, 2, 4)
+    assert (row.rounds, row.shards) == (1, {1, 2})  # both were in flight when the first was lost
+    assert after(row, "lost", 1, 5, 6).rounds == 2
+    assert after(row, "cancelled", 1, 5, 6) == after(row, "hung", 1, 5, 6) == row
+    assert after(row, "crashed", 1, 5, 6) == after(row, "committed", 1, 5, 6) == LostInARow()
+    assert nothing_runs(POLICY, LostInARow(5, 9, frozenset({1, 2})))
+    assert not nothing_runs(POLICY, LostInARow(4, 9, frozenset({1, 2})))
+    assert not nothing_runs(POLICY, LostInARow(9, 9, frozenset({1})))  # the shard's own budget decides
 
 
 def test_waits_double_up_to_a_limit() -> None:

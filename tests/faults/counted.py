@@ -65,7 +65,6 @@ class CountedRows:
     attempt: str
     deadline_s: float
     notes: str
-    memory_factor: float = 1.0
 
 
 def count(counted: str, word: str, attempt: str) -> None:

@@ -15,8 +15,8 @@ from cluster.driver import Order, drive
 from cluster.guard import Meter, notes_of_a_job
 from cluster.policy import Policy
 from cluster.progress import progress
-from cluster.ray_cluster import RaySettings, ray_cluster
-from cluster.ray_executor import RayExecutor
+from cluster.ray_cluster import RaySettings
+from cluster.ray_executor import ray_executor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.task import Product
 from schemas.run import Run
@@ -33,7 +33,6 @@ class RandomRows:
     attempt: str
     deadline_s: float
     notes: str
-    memory_factor: float = 1.0
 
 
 def make_rows(task: RandomRows, meter: Meter) -> Product:
@@ -52,7 +51,7 @@ def main() -> int:
     missing = run.missing()
     with (
         notes_of_a_job() as notes,
-        ray_cluster(settings) as ray,
+        ray_executor(make_rows, settings) as executor,
         stop_on_signals(StopRequest()) as stop,
         progress(run.layout.samples_per_shard, len(missing)) as display,
     ):
@@ -60,10 +59,13 @@ def main() -> int:
         def make_task(order: Order) -> RandomRows:
             return RandomRows(place, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
-        executor = RayExecutor(make_rows, settings, ray)
         summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
-        executor.close()
-    said = {"end": summary.end, "closed": close_lost_attempts(run), "outcomes": summary.tally.outcomes}
+    said = {
+        "end": summary.end,
+        "cause": summary.cause,
+        "closed": close_lost_attempts(run),
+        "outcomes": summary.tally.outcomes,
+    }
     print(json.dumps(said))
     return summary.exit_code
 

@@ -42,7 +42,6 @@ class Rows:
     attempt: str
     deadline_s: float
     notes: str = ""
-    memory_factor: float = 1.0
 
 
 def make_rows(task: Rows, meter: Meter) -> Product:

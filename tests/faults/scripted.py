@@ -29,7 +29,6 @@ class ScriptedTask:
     deadline_s: float
     notes: str
     words: tuple[str, ...] = ()
-    memory_factor: float = 1.0
     tries: str = ""  # folder that counts attempts, one file each; "" is beside the notes
 
 

@@ -68,7 +68,6 @@ def play(
             deadline_s,
             str(notes),
             words.get(order.shard, ()),
-            order.memory_factor,
         )
 
     stop, books = StopRequest(), PaperBooks()

@@ -84,9 +84,7 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
         def make_task(order: Order) -> ScriptedTask:
             script = words.get(order.shard, ())
             # A stopped process has no clock; the driver's own deadline comes for it.
-            return ScriptedTask(
-                order.shard, order.attempt, 1.5, notes, script, order.memory_factor, str(tmp_path / "tries")
-            )
+            return ScriptedTask(order.shard, order.attempt, 1.5, notes, script, str(tmp_path / "tries"))
 
         policy = Policy(
             max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=4, grace_s=0.5, kill_s=60

@@ -91,7 +91,6 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
             houses=sources["houses"],
             objects=sources["objects"],
             deadline_s=HANG_S if is_first and "hang_with_lock" in words else PATIENCE_S,
-            memory_factor=order.memory_factor,
             notes=str(notes),
             scenes_from=sources["scenes_from"],
             words=words,

@@ -1,0 +1,100 @@
+"""SIGKILL to the servers of local Ray clusters in the middle of jobs: raylet and GCS server."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from cluster.books import RunBooks, close_lost_attempts
+from cluster.driver import Order, drive
+from cluster.guard import notes_of_a_job
+from cluster.policy import Policy
+from cluster.ray_cluster import RaySettings
+from cluster.ray_executor import ray_executor
+from cluster.stop import StopRequest
+from cluster.tally import JobSummary, Tally
+from datagen.reports.accounts import account_for
+from schemas.run import Run
+from schemas.sealing import seal
+from tests.cluster.simulated import Heard
+from tests.faults.job import RandomRows, make_rows
+from tests.made_runs import make_run
+from tests.small_runs import arrays_of, assert_equal_runs
+
+SAMPLES_PER_SHARD = 10
+POLICY = Policy(backoff_s=0.05)
+
+
+def kill_server(ray: Any, kind: str) -> bool:
+    """SIGKILL to the `raylet` or the `gcs_server` of this process's local cluster; whether it lived."""
+    (server,) = ray._private.worker._global_node.all_processes[kind]
+    if server.process.poll() is not None:
+        return False
+    psutil.Process(server.process.pid).kill()
+    return True
+
+
+def one_job(run: Run, seconds: float, on_tick: Callable[[Any, Tally], None]) -> JobSummary:
+    """Make the missing shards on a local cluster of two slots; `on_tick` is given Ray and the tally."""
+    with notes_of_a_job() as notes, ray_executor(make_rows, RaySettings(workers=2)) as executor:
+        import ray
+
+        def make_task(order: Order) -> RandomRows:
+            return RandomRows(run.storage.url, seconds, order.shard, order.attempt, order.deadline_s, notes)
+
+        heard = Heard(on_tick=lambda tally: on_tick(ray, tally))
+        summary = drive(run.missing(), make_task, executor, RunBooks(run), POLICY, heard, StopRequest())
+    close_lost_attempts(run)
+    return summary
+
+
+def kill_servers(
+    folder: Path, kind: str, kills: int, shards: int, seconds: float, rng: random.Random
+) -> dict[str, int]:
+    """Kill a server so often while a run is made, resume the run where that ended a job, and check it."""
+    run = make_run(folder / "run", n=shards * SAMPLES_PER_SHARD, shards=())
+    # Each once more than so many shards are committed, the last while both slots are at work.
+    due = sorted(rng.sample(range(shards - 3), kills))
+    killed, jobs = 0, 0
+
+    def on_tick(ray: Any, tally: Tally) -> None:
+        nonlocal killed
+        if killed < kills and len(run.committed()) > due[killed] and tally.in_flight:
+            killed += kill_server(ray, kind)
+
+    while run.missing():
+        jobs += 1
+        assert jobs <= kills + 1, "a job that nothing disturbs does not end"
+        summary = one_job(run, seconds, on_tick)
+        assert summary.end == "complete" or (summary.end == "aborted" and summary.cause), summary
+    waste = check_bytes_and_ledger(run)
+    assert killed == kills
+    return {"kills": killed, "jobs": jobs, "shards": shards, "attempts wasted": waste}
+
+
+def check_bytes_and_ledger(run: Run) -> int:
+    """AssertionError where a finished run is not the undisturbed one, or its ledger not commits and waste.
+
+    Returns how many attempts were wasted.
+    """
+    run, folder = Run.open(run.storage.url), Path(run.storage.url)
+    assert run.missing() == [] and run.quarantined() == set() and run.ledger.unfinished() == []
+    undisturbed = make_run(folder.parent / f"{folder.name}-undisturbed", n=run.n)
+    seal(undisturbed.storage)
+    seal(run.storage)
+    assert_equal_runs(arrays_of(folder), arrays_of(Path(undisturbed.storage.url)))
+    commits = [run.commit_of(shard) for shard in run.planned()]
+    for commit in commits:
+        run.check_digests(commit)
+    ends = list(run.ledger.ends())
+    winners = {end.attempt for end in ends if end.outcome == "committed"}
+    assert winners == {commit.attempt for commit in commits}
+    assert {end.outcome for end in ends} <= {"committed", "lost", "superseded"}
+    books = account_for([run])
+    waste = sum(account.attempts for account in books.waste.values())
+    assert books.useful.attempts == len(commits) and len(commits) + waste == len(ends)
+    return waste
