@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -16,21 +14,17 @@ from schemas.run import Run
 from schemas.run_records import Commit
 from schemas.scene_rows import read_scenes
 from schemas.shard_files import encode_shard
-from schemas.storage import storage_error
+from schemas.storage.errors import FORBIDDEN, FULL, machine_error
 from workers.robots import gripper_of
 from workers.run_shard import run_shard
 from workers.world import World, open_world
-
-# Failures of a disk that no retry cures.
-_FINAL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def run_attempt(task: ShardTask, meter: Meter) -> Product:
     """Make the shard's arrays, write them, and commit them unless another attempt was first.
 
     Raises JobCannotGoOn where the run or its sources cannot be opened or its disk is full; what
-    else goes wrong is raised as it is, and concerns this attempt alone.
+    else goes wrong is raised as it is, and concerns this attempt alone unless a disk is full (`guarded`).
     """
     spec_hash = task.spec.hash()
     run, world, source = open_task(task)
@@ -39,8 +33,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
             return Product(False, 0, 0, meter.cost())
     stored = None if source is None else read_scenes(source, task.scene_indices)
-    with ends_job(codes=_FULL):  # the files of robots; what cannot be read concerns this shard alone
-        made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
+    made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
         entries = run.write_shard(task.shard, task.attempt, files, ours=True)
@@ -77,19 +70,15 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
 
 
 @contextmanager
-def ends_job(every_input_error: bool = False, codes: tuple[int, ...] = _FINAL) -> Generator[None]:
-    """Raise JobCannotGoOn for a full or forbidden disk (`codes`) or, where asked, for any InputError."""
-    problems = {os.strerror(code) for code in codes}
+def ends_job(every_input_error: bool = False) -> Generator[None]:
+    """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
     try:
         yield
-    except InputError as error:
-        if every_input_error or error.problem in problems:
-            raise JobCannotGoOn(str(error)) from error
-        raise
-    except OSError as error:
-        if error.errno in codes:
-            raise JobCannotGoOn(str(storage_error(error.filename or "the run", error))) from error
-        raise
+    except (InputError, OSError) as error:
+        known = machine_error(error, (*FULL, *FORBIDDEN))
+        if known is None and not (every_input_error and isinstance(error, InputError)):
+            raise
+        raise JobCannotGoOn(str(known or error)) from error
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large

@@ -32,7 +32,7 @@ from typing import TypeVar
 from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from schemas.cost import StageClock
 from schemas.run_records import Cost, Host, Outcome
-from schemas.storage.errors import StoreFailure
+from schemas.storage.errors import FULL, StoreFailure, machine_error
 
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.
@@ -78,36 +78,38 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
     also when native code hangs with the interpreter's lock held.
     """
     started, meter = utc_now(), Meter()
-    with _notes(task, started, deadline):
-        try:
+    try:
+        with _notes(task, started, deadline):
             product = function(task, meter)
-        except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
-            cause = " ".join(str(error).split())
-            # A store that gives no answer gives none to the next shard either.
-            ends_job = isinstance(error, JobCannotGoOn | StoreFailure)
-            return AttemptReport(
-                attempt=task.attempt,
-                shard=task.shard,
-                outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
-                cause=cause if ends_job else short_line(f"{type(error).__name__}: {cause}"),
-                stack=traceback.format_exc()[-STACK_LIMIT:],
-                started=started,
-                ended=utc_now(),
-                cost=meter.cost(),
-                host=this_host(),
-                ends_job=ends_job,
-            )
+    except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
+        # A store that gives no answer gives none to the next shard either, and a full disk stays full.
+        ends_job = isinstance(error, JobCannotGoOn | StoreFailure)
+        full = None if ends_job else machine_error(error, FULL)
+        cause = " ".join(str(full or error).split())
+        ends_job = ends_job or full is not None
         return AttemptReport(
             attempt=task.attempt,
             shard=task.shard,
-            outcome="committed" if product.won else "superseded",
+            outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
+            cause=cause if ends_job else short_line(f"{type(error).__name__}: {cause}"),
+            stack=traceback.format_exc()[-STACK_LIMIT:],
             started=started,
             ended=utc_now(),
-            labels=product.labels,
-            positives=product.positives,
-            cost=product.cost,
+            cost=meter.cost(),
             host=this_host(),
+            ends_job=ends_job,
         )
+    return AttemptReport(
+        attempt=task.attempt,
+        shard=task.shard,
+        outcome="committed" if product.won else "superseded",
+        started=started,
+        ended=utc_now(),
+        labels=product.labels,
+        positives=product.positives,
+        cost=product.cost,
+        host=this_host(),
+    )
 
 
 @contextmanager

@@ -6,7 +6,6 @@ Exit codes: 0 good, 1 finished and something is wrong (too many failures, findin
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -48,18 +47,6 @@ VERBS: dict[str, tuple[str, str]] = {
     "predict": ("datagen.predict:predict", "A base pose from a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
-}
-
-# The machine's fault, not the program's: the disk is full or the place cannot be written.
-_PLACE_ERRNOS = {
-    errno.ENOSPC: "free some space, or choose another place",
-    errno.EDQUOT: "the quota is used up: free some space, or choose another place",
-    errno.EROFS: "choose a place that can be written",
-    errno.EACCES: "choose a place that you may use, or change its permissions",
-    errno.EPERM: "choose a place that you may use, or change its permissions",
-    errno.EMFILE: "raise the limit of open files: ulimit -n 65536",
-    errno.EFBIG: "choose a file system that holds larger files",
-    errno.ENAMETOOLONG: "choose a shorter path",
 }
 
 
@@ -118,10 +105,10 @@ def _lines_for(error: Exception) -> list[str] | None:
         return [str(error)]
     if isinstance(error, CycloptsError):
         return [_usage_line(error)]
-    if isinstance(error, OSError) and error.errno in _PLACE_ERRNOS:
-        place = error.filename or error.filename2 or "output"
-        reason = os.strerror(error.errno)
-        return [f"{place}: {reason}. Mend: {_PLACE_ERRNOS[error.errno]}"]
+    if isinstance(error, OSError):
+        from schemas.storage.errors import machine_error
+
+        return [str(known)] if (known := machine_error(error)) else None
     # pydantic takes 0.1 s to import; whoever raised its error has imported it.
     if "pydantic" in sys.modules:
         from pydantic import ValidationError

@@ -5,14 +5,21 @@ from __future__ import annotations
 import errno
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
 
+# What any write may meet, whatever is written: the machine is at fault, and no shard or program.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+MACHINE = (*FULL, *FORBIDDEN, errno.EMFILE, errno.ENAMETOOLONG)
+
 _MENDS = {
-    errno.ENOSPC: "Free disk space or write to another disk, then go on with `datagen resume`",
-    errno.EDQUOT: "Free disk space or raise the quota, then go on with `datagen resume`",
+    errno.ENOSPC: "Free disk space or write to another disk",
+    errno.EDQUOT: "Free disk space or raise the quota",
+    errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or write to another file system",
     errno.EACCES: "Give yourself read and write permission there, or choose another folder",
     errno.EPERM: "Choose a folder on a file system that allows this (hard links, permissions)",
     errno.EROFS: "Choose a folder that can be written",
@@ -62,6 +69,16 @@ def storage_error(place: str | Path, error: OSError) -> InputError:
     """The one-line error for a failed file operation, with the mend that its errno asks for."""
     problem = os.strerror(error.errno) if error.errno is not None else str(error)
     return InputError(place, "", problem, _MENDS.get(error.errno or 0, _OTHER_MEND))
+
+
+def machine_error(error: BaseException | None, codes: Sequence[int] = MACHINE) -> InputError | None:
+    """The one-line error where one of `codes` is behind an exception; None where none is."""
+    known = error if isinstance(error, InputError) else None
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in codes:
+            return known or storage_error(error.filename or error.filename2 or "a file", error)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def too_large(place: str, size: int, limit_bytes: int) -> FileTooLarge:

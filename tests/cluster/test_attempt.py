@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -97,7 +99,8 @@ def test_a_full_disk_ends_the_job_and_commits_nothing(spec: Specification, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("code", "ends_job"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)]
+    ("code", "ends_job"),
+    [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EFBIG, True), (errno.EIO, False)],
 )
 def test_a_disk_that_is_full_while_scenes_are_made_ends_the_job(
     code: int, ends_job: bool, spec: Specification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -108,5 +111,24 @@ def test_a_disk_that_is_full_while_scenes_are_made_ends_the_job(
         raise OSError(code, os.strerror(code), str(tmp_path / "arm.urdf"))
 
     monkeypatch.setattr(attempt, "run_shard", full)
-    with pytest.raises(JobCannotGoOn if ends_job else OSError, match="arm"):
-        run_attempt(task_on(run, "a"), Meter())
+    report = guarded(run_attempt, task_on(run, "a"), deadline=False)
+    assert report.outcome == "failed" and report.ends_job == ends_job and "arm" in report.cause
+
+
+def test_a_limit_of_file_sizes_ends_the_job_as_a_full_disk_does(spec: Specification, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", scenes_per_shard=2, candidates_per_scene=5, shards=(), spec=spec)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    notes = replace(task_on(run, "b"), notes=str(tmp_path / "notes"))
+    try:
+        # Records fit, and chunks do not; then not even the note of an attempt.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        large = guarded(run_attempt, task_on(run, "a"), deadline=False)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+        small = guarded(run_attempt, notes, deadline=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    for report in (large, small):
+        assert report.ends_job and "File too large. Raise the limit of file sizes" in report.cause, (
+            report.stack
+        )
+    assert str(tmp_path / "run") in large.cause and run.committed() == set()

@@ -63,8 +63,8 @@ def with_verbs(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (["refuse-input"], 2, ["run.toml", "scene.n_clutter", "is -1", "0 to 30"]),
         (["interrupt"], 130, ["interrupted"]),
-        (["fill-disk"], 2, ["RUN/shards/0/c", "No space left", "free some space"]),
-        (["deny"], 2, ["RUN", "Permission denied", "permissions"]),
+        (["fill-disk"], 2, ["RUN/shards/0/c", "No space left on device. Free disk space"]),
+        (["deny"], 2, ["RUN", "Permission denied", "permission"]),
         (["answer", "--n", "many"], 2, ["--n", "many", "int"]),
         (["answer", "--m", "1"], 2, ["--m", "--help"]),
         (["answer", "--n"], 2, ["--n", "argument"]),
