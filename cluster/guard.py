@@ -80,25 +80,12 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
     started, meter = utc_now(), Meter()
     try:
         with _notes(task, started, deadline):
-            product = function(task, meter)
-    except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
-        # A store that gives no answer gives none to the next shard either, and a full disk stays full.
-        ends_job = isinstance(error, JobCannotGoOn | StoreFailure)
-        full = None if ends_job else machine_error(error, FULL)
-        cause = " ".join(str(full or error).split())
-        ends_job = ends_job or full is not None
-        return AttemptReport(
-            attempt=task.attempt,
-            shard=task.shard,
-            outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
-            cause=cause if ends_job else short_line(f"{type(error).__name__}: {cause}"),
-            stack=traceback.format_exc()[-STACK_LIMIT:],
-            started=started,
-            ended=utc_now(),
-            cost=meter.cost(),
-            host=this_host(),
-            ends_job=ends_job,
-        )
+            try:
+                product = function(task, meter)
+            except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
+                return _failure(task, started, meter, error)
+    except OSError as error:  # of the note itself
+        return _failure(task, started, meter, error)
     return AttemptReport(
         attempt=task.attempt,
         shard=task.shard,
@@ -109,6 +96,24 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
         positives=product.positives,
         cost=product.cost,
         host=this_host(),
+    )
+
+
+def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
+    # A store that gives no answer gives none to the next shard either, and a full disk stays full.
+    final = error if isinstance(error, JobCannotGoOn | StoreFailure) else machine_error(error, FULL)
+    cause = " ".join(str(final or error).split())
+    return AttemptReport(
+        attempt=task.attempt,
+        shard=task.shard,
+        outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
+        cause=cause if final else short_line(f"{type(error).__name__}: {cause}"),
+        stack=traceback.format_exc()[-STACK_LIMIT:],
+        started=started,
+        ended=utc_now(),
+        cost=meter.cost(),
+        host=this_host(),
+        ends_job=final is not None,
     )
 
 

@@ -24,6 +24,8 @@ from schemas.storage import open_storage
 _LOOK_S = 1.0
 # Its driver looks for requests every few seconds; beyond this one of a detached job has not answered.
 _ANSWER_WITHIN_S = 30.0
+# Longer than a driver is silent that works; one without workers of its own hears between two shards.
+_GIVE_UP_S = 180.0
 
 
 def cancel(
@@ -41,8 +43,9 @@ def cancel(
 ) -> int:
     """Ask every job at work on a run to stop, and wait until it has: what is committed stays.
 
-    A job that somebody else runs on another machine is asked in the same way. Detached jobs whose driver
-    does not answer are ended through Ray. Ctrl-C ends the waiting, and the request stands.
+    A job on another machine is asked in the same way. Detached jobs whose driver does not answer are
+    ended through Ray. A job that is not heard for 3 minutes is waited for no longer. Ctrl-C ends the
+    waiting. Either way the request stands. Exit code: 0 when every job has ended, 1 when one has not.
     """
     if head:
         if run is not None:
@@ -67,6 +70,12 @@ def cancel(
         print_rows(f"cancel {run}", [(job.id, health_line(job)) for job in ended])
         if not living:
             sys.stdout.write(f"go on with: {command_line(['resume', run])}\n")
+    for job in living:
+        _say(
+            f"{run}: job {job.id} was asked to stop and has not ended, heard "
+            f"{seconds(job.silence().total_seconds())} ago. The request stands; to end the job by force: "
+            f"kill -9 {job.record.pid} on {job.record.host}, then {command_line(['resume', run])}"
+        )
     return 1 if living else 0
 
 
@@ -82,6 +91,8 @@ def _await_end(jobs: Jobs, job: Job, say: Callable[[str], None]) -> Job:
             _stop_submission(job)
             stopped = True
         if health == "silent" and not job.record.submission:
+            return job
+        if waited_s >= _GIVE_UP_S <= job.silence().total_seconds():
             return job
         if stopped and waited_s >= 2 * _ANSWER_WITHIN_S:
             return job

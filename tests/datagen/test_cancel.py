@@ -104,6 +104,29 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     assert "is dead: last heard of then" in capsys.readouterr().out
 
 
+def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    work = Work(run)
+    job = work.wait_until_it_makes_shards()
+    work.process.send_signal(signal.SIGSTOP)
+    try:
+        before = (datetime.now(UTC) - timedelta(minutes=5)).isoformat()
+        assert job.state is not None
+        Jobs(work.place).tell(job.state.model_copy(update={"updated": before}))
+        monkeypatch.setattr("datagen.cancel._GIVE_UP_S", 1.0)
+        assert work.job().health() == "live"
+        assert cli.run(["cancel", str(run)]) == 1
+        told = capsys.readouterr()
+        (line,) = [line for line in told.err.splitlines() if "has not ended" in line]
+        assert job.id in line and "heard 5 min" in line and f"kill -9 {work.process.pid} on" in line
+        assert f"datagen resume {run}" in line and "go on with" not in told.out
+    finally:
+        work.process.send_signal(signal.SIGCONT)
+    assert work.process.wait(120) == 130  # the request stands
+
+
 def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
 from cluster.books import RunBooks, close_lost_attempts
@@ -53,27 +53,30 @@ def one_job(run: Run, seconds: float, on_tick: Callable[[Any, Tally], None]) -> 
 
 
 def kill_servers(
-    folder: Path, kind: str, kills: int, shards: int, seconds: float, rng: random.Random
+    folder: Path, kind: str, kills: int, shards: int, seconds: float, rng: np.random.Generator
 ) -> dict[str, int]:
-    """Kill a server so often while a run is made, resume the run where that ended a job, and check it."""
+    """Kill a server so often while a run is made, resume the run where that ended a job, and check it.
+
+    A run that is done before every kill was spent is extended.
+    """
     run = make_run(folder / "run", n=shards * SAMPLES_PER_SHARD, shards=())
-    # Each once more than so many shards are committed, the last while both slots are at work.
-    due = sorted(rng.sample(range(shards - 3), kills))
-    killed, jobs = 0, 0
+    killed = aborted = 0
+    due = rng.integers(shards // 2)  # the next kill comes when more shards are committed
 
     def on_tick(ray: Any, tally: Tally) -> None:
-        nonlocal killed
-        if killed < kills and len(run.committed()) > due[killed] and tally.in_flight:
-            killed += kill_server(ray, kind)
+        nonlocal killed, due
+        if killed < kills and tally.in_flight and len(run.committed()) > due and kill_server(ray, kind):
+            killed, due = killed + 1, len(run.committed()) + rng.integers(shards // 2)
 
-    while run.missing():
-        jobs += 1
-        assert jobs <= kills + 1, "a job that nothing disturbs does not end"
+    while run.missing() or killed < kills:
+        if not run.missing():
+            run.grow(run.n + shards * SAMPLES_PER_SHARD)
         summary = one_job(run, seconds, on_tick)
         assert summary.end == "complete" or (summary.end == "aborted" and summary.cause), summary
+        aborted += summary.end == "aborted"
+        assert aborted <= killed, "a job that nothing disturbed was aborted"
     waste = check_bytes_and_ledger(run)
-    assert killed == kills
-    return {"kills": killed, "jobs": jobs, "shards": shards, "attempts wasted": waste}
+    return {"kills": killed, "jobs aborted": aborted, "shards": len(run.planned()), "attempts wasted": waste}
 
 
 def check_bytes_and_ledger(run: Run) -> int:
