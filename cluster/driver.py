@@ -24,7 +24,6 @@ from cluster.executor import Executor
 from cluster.open_shards import OpenShards
 from cluster.policy import (
     Durations,
-    LostInARow,
     Policy,
     Trouble,
     deadline_s,
@@ -140,7 +139,7 @@ class _Driver(Generic[T]):
         self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
         self._durations = Durations()
         self._numbered = 0
-        self._lost = LostInARow()
+        self._lost_in_a_row = 0
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
         self._open = OpenShards(shards, random.Random(self._name))
@@ -236,7 +235,8 @@ class _Driver(Generic[T]):
         shard = report.shard
         successes = self._tally.committed + self._tally.superseded
         decision = decide(self._policy, self._troubled.get(shard, Trouble()), report, successes, flight.alone)
-        self._lost = self._lost.after(report, flight.number, self._numbered)
+        if report.outcome not in ("cancelled", "hung"):  # of those nobody answered
+            self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
         self._books.close(_ledger_entry(report))
         self._tally.count(report)
         if report.outcome == "committed" and report.cost is not None:
@@ -254,11 +254,15 @@ class _Driver(Generic[T]):
             self._tally.count_quarantined(shard)
             if ends_early(self._policy, self._tally.quarantined, self._tally.shards):
                 self._begin_end("failed", f"{self._tally.quarantined} shards are quarantined")
-        if decision.action == "abort" or (self._end is None and nothing_runs(self._policy, self._lost)):
+        if decision.action == "abort" or (self._end is None and self._nothing_runs()):
             again = "" if decision.action == "abort" else "whatever begins is lost, at last by: "
             self._begin_end("aborted", again + report.cause)
             self.kill_all("the job cannot go on")
         self._events.ended(report, decision.action)
+
+    def _nothing_runs(self) -> bool:
+        at_once = min(window(self._policy, self._executor.slots), self._tally.shards - self._tally.finished)
+        return nothing_runs(self._policy, self._lost_in_a_row, at_once)
 
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
         """A worker may die, or lose its store's answer, after its commit: the commit record decides."""

@@ -11,16 +11,17 @@ from schemas.shard_ranges import ShardRanges
 
 
 class OpenShards:
-    """Gives shards in ascending order until it is told that another driver works at them as well.
+    """Gives shards in ascending order from a random one on, and from the first one behind the last.
 
-    Two drivers that begin at the same shard would make every shard twice. From the first sign of that,
-    each goes on at a random place, which it leaves for another whenever it runs into somebody again.
+    Drivers that begin at the same shard would make every shard twice. One that runs into another goes on
+    at another random place.
     16 bytes a range of neighbours, however many shards there are.
     """
 
     def __init__(self, shards: Sequence[int], rng: random.Random) -> None:
         self._rng = rng
         self._begin(ShardRanges.of(shards), None)
+        self.go_elsewhere()
 
     def __len__(self) -> int:
         return len(self._present) + self._after

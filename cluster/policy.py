@@ -104,34 +104,17 @@ def decide(
     return Decision("retry", now, wait_s)
 
 
-@dataclass(frozen=True)
-class LostInARow:
-    """Attempts lost since a worker last answered. A round is all that was in flight together."""
-
-    rounds: int = 0
-    newest: int = 0  # the number of the job's latest attempt when the present round began
-    shards: frozenset[int] = frozenset()
-
-    def after(self, report: AttemptReport, number: int, newest: int) -> LostInARow:
-        """The row after the end of attempt `number`, of `newest` so far."""
-        if report.outcome in ("cancelled", "hung"):  # by the driver's own doing
-            return self
-        if report.outcome != "lost":
-            return LostInARow()
-        shards = self.shards | {report.shard}
-        if number <= self.newest:
-            return replace(self, shards=shards)
-        return LostInARow(self.rounds + 1, newest, shards)
-
-
 def is_suspect(trouble: Trouble) -> bool:
     """Whether the shard may be what takes its machine along: then no other suspect is in flight with it."""
     return trouble.lost >= 2
 
 
-def nothing_runs(policy: Policy, row: LostInARow) -> bool:
-    """Whether the executor rather than a shard is at fault: whatever it is given is lost."""
-    return row.rounds >= policy.max_lost_rounds and len(row.shards) > 1
+def nothing_runs(policy: Policy, lost_in_a_row: int, at_once: int) -> bool:
+    """Whether the executor rather than a shard is at fault: whatever it is given, `at_once`, is lost.
+
+    Not before the budget of a shard that is the only one left has decided.
+    """
+    return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * at_once)
 
 
 def window(policy: Policy, slots: int) -> int:

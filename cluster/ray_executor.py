@@ -10,11 +10,9 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
-
-import psutil
 
 from cluster.guard import Meter, Remains, collect_remains, guarded, obituary, resident_bytes
 from cluster.ray_cluster import RaySettings, first_line, ray_cluster
@@ -63,11 +61,7 @@ def ray_executor(function: Callable[[T, Meter], Product], settings: RaySettings)
     with ExitStack() as stack:
 
         def restart() -> Any:
-            left = executor.others.own.processes()  # some outlive a GCS server that was killed
             stack.close()
-            for process in left:
-                with suppress(psutil.NoSuchProcess):
-                    process.kill()
             return stack.enter_context(ray_cluster(settings))
 
         ray = stack.enter_context(ray_cluster(settings))
@@ -119,10 +113,11 @@ class RayExecutor(Generic[T]):
 
     @property
     def slots(self) -> int:
-        # A cluster grows and shrinks.
         if time.monotonic() >= self._slots_until_s and not self.others.own.silent():
             self._slots = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-            self._slots_until_s = time.monotonic() + _SLOTS_SEEN_FOR_S
+            # Other clusters grow and shrink.
+            seen_for_s = _SLOTS_SEEN_FOR_S if self._restart is None else float("inf")
+            self._slots_until_s = time.monotonic() + seen_for_s
         return self._slots
 
     def submit(self, task: T) -> None:

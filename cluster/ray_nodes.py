@@ -8,12 +8,9 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 from cluster.guard import Remains, clear_notes, collect_remains, read_note
 
@@ -27,49 +24,39 @@ class OwnNode:
     """The two servers that a driver needs: its machine's raylet, and the cluster's GCS server.
 
     Ray lets a driver without them wait, fail or die, a minute later. So they are asked whether they
-    listen, at most once a second, and before each request that would block.
+    listen: once a second, and right before each request that would block.
     """
 
     def __init__(self, ray: Any, address: str) -> None:
         self._node = ray._private.worker._global_node  # None for a client (ray://), which needs neither
         self._patience_s = 0.0 if address == "local" else _PATIENCE_S
-        self._silent, self._looked_s = "", float("-inf")
-        self._heard_s = time.monotonic()
-
-    def silent(self) -> str:
-        """Which server does not answer now; "" where both do."""
-        now_s = time.monotonic()
-        if self._node is not None and now_s >= self._looked_s + _LOOK_S:
-            self._silent, self._looked_s = self._look(), now_s
-            self._heard_s = self._heard_s if self._silent else now_s
-        return self._silent
+        self._heard_s = self._looked_s = time.monotonic()
 
     def dead(self) -> str:
         """Which server has been silent for too long; "" where none has."""
-        return self.silent() and (self._silent if self._looked_s - self._heard_s >= self._patience_s else "")
+        if self._node is None or time.monotonic() < self._looked_s + _LOOK_S:
+            return ""
+        self._looked_s, silent = time.monotonic(), self.silent()
+        if not silent:
+            self._heard_s = self._looked_s
+        return silent if self._looked_s - self._heard_s >= self._patience_s else ""
 
-    def _look(self) -> str:
+    def silent(self) -> str:
+        """Which server does not answer now; "" where both do."""
+        if self._node is None:
+            return ""
         host, _, port = self._node.gcs_address.rpartition(":")
         try:
             socket.create_connection((host.strip("[]"), int(port)), _CONNECTS_WITHIN_S).close()
         except OSError as error:
             return f"Ray's GCS server at {host}:{port} does not answer ({error})"
-        with socket.socket(socket.AF_UNIX) as raylet:
-            raylet.settimeout(_CONNECTS_WITHIN_S)
-            try:
+        try:
+            with socket.socket(socket.AF_UNIX) as raylet:
+                raylet.settimeout(_CONNECTS_WITHIN_S)
                 raylet.connect(self._node.raylet_socket_name)
-            except OSError as error:
-                return f"Ray's raylet on this machine does not answer ({error})"
+        except OSError as error:
+            return f"Ray's raylet on this machine does not answer ({error})"
         return ""
-
-    def processes(self) -> list[psutil.Process]:
-        """What the servers of a local cluster have started."""
-        found: list[psutil.Process] = []
-        for kind in self._node.all_processes.values():
-            for server in kind:
-                with suppress(psutil.NoSuchProcess):
-                    found += psutil.Process(server.process.pid).children(recursive=True)
-        return found
 
 
 @dataclass

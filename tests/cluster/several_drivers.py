@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import TypeVar
 
 from cluster.driver import Order, drive
@@ -28,7 +27,9 @@ class Turns:
     def wait_for(self, driver: int) -> None:
         with self._changed:
             self._changed.notify_all()
-            self._changed.wait_for(lambda: min(self._left, key=lambda d: (self._clocks[d].now_s, d)) == driver)
+            self._changed.wait_for(
+                lambda: min(self._left, key=lambda d: (self._clocks[d].now_s, d)) == driver
+            )
 
     def end(self, driver: int) -> None:
         with self._changed:
@@ -80,7 +81,7 @@ class Books(PaperBooks):
         return ShardRanges.of([s for s in range(self.shared.shards) if not self.shared.is_done(s, now_s)])
 
 
-def drive_together(drivers: int, shards: int, slots: int = 2, policy: Policy = Policy()) -> list[JobSummary]:
+def drive_together(drivers: int, shards: int, slots: int = 2) -> list[JobSummary]:
     """How the jobs of drivers that begin together at one run ended."""
     clocks = [FakeClock() for _ in range(drivers)]
     shared, turns, ended = Shared(shards), Turns(clocks), dict[int, JobSummary]()
@@ -90,7 +91,9 @@ def drive_together(drivers: int, shards: int, slots: int = 2, policy: Policy = P
         books, clock = Books(shared, clocks[driver]), clocks[driver]
         try:
             turns.wait_for(driver)
-            ended[driver] = drive(range(shards), _same, executor, books, policy, Heard(), StopRequest(), clock)
+            ended[driver] = drive(
+                range(shards), _same, executor, books, Policy(), Heard(), StopRequest(), clock
+            )
         finally:
             turns.end(driver)
 

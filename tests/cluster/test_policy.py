@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from cluster.policy import (
     Durations,
-    LostInARow,
     Policy,
     Trouble,
     deadline_s,
@@ -75,18 +74,15 @@ def test_a_loss_counts_where_the_shard_was_alone_or_others_succeeded_since_its_l
     assert decide(POLICY, replace(trouble, lost=9), lost, successes=5).action == "quarantine"
 
 
-def test_a_row_of_losses_has_rounds_and_ends_with_any_answer() -> None:
-    def after(row: LostInARow, outcome: Outcome, shard: int, number: int, newest: int) -> LostInARow:
-        return row.after(AttemptReport("a", shard, outcome), number, newest)
-
-    row = after(after(LostInARow(), "lost", 1, 1, 4), "lost", 2, 2, 4)
-    assert (row.rounds, row.shards) == (1, {1, 2})  # both were in flight when the first was lost
-    assert after(row, "lost", 1, 5, 6).rounds == 2
-    assert after(row, "cancelled", 1, 5, 6) == after(row, "hung", 1, 5, 6) == row
-    assert after(row, "crashed", 1, 5, 6) == after(row, "committed", 1, 5, 6) == LostInARow()
-    assert nothing_runs(POLICY, LostInARow(5, 9, frozenset({1, 2})))
-    assert not nothing_runs(POLICY, LostInARow(4, 9, frozenset({1, 2})))
-    assert not nothing_runs(POLICY, LostInARow(9, 9, frozenset({1})))  # the shard's own budget decides
+def test_losses_in_a_row_are_the_executors_fault_and_never_before_a_lone_shards_budget_is_spent() -> None:
+    assert [nothing_runs(POLICY, lost, at_once=4) for lost in (20, 21)] == [False, True]
+    assert [nothing_runs(POLICY, lost, at_once=1) for lost in (11, 12)] == [False, True]
+    # The first of its losses may not count.
+    trouble, actions = Trouble(), []
+    for _ in range(11):
+        decision = decide(POLICY, trouble, AttemptReport("a", 0, "lost"), alone=bool(actions))
+        trouble, actions = decision.trouble, [*actions, decision.action]
+    assert actions == ["retry"] * 10 + ["quarantine"]
 
 
 def test_waits_double_up_to_a_limit() -> None:
