@@ -92,7 +92,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
         machines = job.children(recursive=True)
         assert sum(process.name() == "raylet" for process in machines) == 2
         job.send_signal(signal.SIGTERM)
-        code = job.wait(timeout=120)
+        code = job.wait(timeout=300)
     finally:
         for process in [*job.children(recursive=True), job] if job.is_running() else []:
             process.kill()
@@ -103,7 +103,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
     started = (here / "started").read_text()
     assert "alpha: ray start" in started and "beta: ray start" in started
     assert "0.0.0.0" not in started and "--include-dashboard=false" in started
-    _, alive = psutil.wait_procs(machines, timeout=30)
+    _, alive = psutil.wait_procs(machines, timeout=120)
     assert not token.exists() and not alive  # nothing is left behind on the machines
     made = committed(run)
     assert 0 < made < 8 and Run.open(run).ledger.unfinished() == []

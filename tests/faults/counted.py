@@ -116,7 +116,7 @@ def drive_counted(
 
     executor = ProcessExecutor(make_counted, workers)
     if together is not None:
-        together.wait(60)
+        together.wait(300)
     drive(run.missing(), make_task, executor, RunBooks(run), PATIENT, Heard(), StopRequest())
     executor.close()
     close_lost_attempts(run)
@@ -155,7 +155,7 @@ def executions(counted: Path) -> Executions:
     return Executions(names["begins"], names["begun"], {int(pid) for _, _, pid in rows})
 
 
-def await_ends(counted: Path, within_s: float = 60.0) -> None:
+def await_ends(counted: Path, within_s: float = 300.0) -> None:
     """Wait until no worker is left: those of a killed driver finish what they are at."""
     until_s = time.monotonic() + within_s
     while any(_is_worker(pid) for pid in executions(counted).processes):
