@@ -9,17 +9,22 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import sys
+import threading
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cluster.environment import changed_environment
+from cluster.private_folder import private_folder, ray_folder
+from cluster.ray_local import START_MEND, slim_node
 from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token, token_environment
 from schemas.errors import InputError
 
 _PATIENCE_S = 10.0
+_SILENT_START_S = 5.0  # then standard error says what is waited for
 _TOKEN_MEND = (
     "Set RAY_AUTH_TOKEN to the token that the cluster was started with, or RAY_AUTH_TOKEN_PATH to its file"
 )
@@ -41,44 +46,67 @@ class RaySettings:
 def ray_cluster(settings: RaySettings) -> Generator[Any]:
     """Start a local cluster, or connect to a running one, for the time of the block; gives `ray`.
 
-    A local cluster opens no dashboard. Raises InputError when the cluster cannot be reached, or wants
-    another token than is known here.
+    A local cluster has a private folder and no dashboard. Raises InputError when it does not start, the
+    other cannot be reached, or wants another token than is known here.
     """
-    if settings.address == "local":
-        wanted = head_environment(new_token())
-        options: dict[str, Any] = {
-            "num_cpus": settings.workers,
-            "include_dashboard": False,
-            "object_store_memory": settings.object_store_bytes,
-        }
-        address = "local"
-    else:
-        address = _resolved(settings.address)
-        wanted = head_environment("") | token_for(address)
-        options = {}
-    with changed_environment(wanted):  # workers inherit it; the caller's own stays as it was
+    local = settings.address == "local"
+    with ExitStack() as whole, ExitStack() as start:
+        if local:
+            address, folder = "local", whole.enter_context(private_folder())
+            wanted = head_environment(new_token(), folder)
+            options: dict[str, Any] = {
+                "num_cpus": settings.workers,
+                "include_dashboard": False,
+                "object_store_memory": settings.object_store_bytes,
+                "_temp_dir": str(ray_folder(folder)),
+            }
+        else:
+            address = _resolved(settings.address)
+            wanted, options = head_environment("") | token_for(address), {}
+        start.enter_context(changed_environment(wanted))  # workers inherit it; the caller's own stays
         import ray
         from ray.exceptions import AuthenticationError
 
-        _keep_loopback()
+        _keep_ray_local()
         forget_former_token()
+        if local:
+            start.enter_context(slim_node())
+        start.enter_context(_announced(f"waiting for Ray to start: --address {settings.address}\n"))
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-        except (ConnectionError, ValueError, TimeoutError, AuthenticationError) as error:
-            mend = "Start Ray there, or use --address local"
-            raise InputError("--address", settings.address, first_line(error), mend) from error
-        except RuntimeError as error:
-            if "No node info found" not in str(error):
-                raise
-            problem = "no node of that cluster runs on this machine"
-            mend = "Submit from one of its machines, or start a node here: ray start --address"
-            raise InputError("--address", settings.address, problem, mend) from error
-    # Ray prints a paragraph on standard output for each dead worker; the driver reports it already.
-    ray._private.worker._worker_logs_enabled = False  # pyright: ignore
-    try:
+        except InputError:
+            raise
+        except (OSError, RuntimeError, ValueError, AuthenticationError) as error:
+            raise _refusal(settings.address, error) from error
+        start.close()
+        # Ray prints a paragraph on standard output for each dead worker; the driver reports it already.
+        ray._private.worker._worker_logs_enabled = False  # pyright: ignore
+        whole.callback(ray.shutdown)
         yield ray
+
+
+@contextmanager
+def _announced(line: str) -> Generator[None]:
+    """Write a line to standard error when the block takes longer than some seconds."""
+    timer = threading.Timer(_SILENT_START_S, sys.stderr.write, [line])
+    timer.start()
+    try:
+        yield
     finally:
-        ray.shutdown()
+        timer.cancel()
+
+
+def _refusal(address: str, error: BaseException) -> BaseException:
+    """What to raise for an error of Ray while it starts or joins a cluster."""
+    if address == "local":
+        return InputError("ray", "", f"does not start: {first_line(error)}", START_MEND)
+    if not isinstance(error, RuntimeError):
+        return InputError("--address", address, first_line(error), "Start Ray there, or use --address local")
+    if "No node info found" not in str(error):
+        return error
+    problem = "no node of that cluster runs on this machine"
+    mend = "Submit from one of its machines, or start a node here: ray start --address"
+    return InputError("--address", address, problem, mend)
 
 
 def refuse_unusable(address: str) -> None:
@@ -150,7 +178,7 @@ def _resolved(address: str) -> str:
         return address
     from ray._private.services import canonicalize_bootstrap_address_or_die
 
-    _keep_loopback()
+    _keep_ray_local()
     try:
         return str(canonicalize_bootstrap_address_or_die("auto"))
     except ConnectionError as error:
@@ -178,14 +206,15 @@ def _turns_away(address: str, token: str | None) -> bool:
     return False
 
 
-def _keep_loopback() -> None:
-    """Let Ray take 127.0.0.1 as it is, and not for this machine's outer address.
+def _keep_ray_local() -> None:
+    """Let Ray use 127.0.0.1 as it is, not this machine's outer address, and upload no code under `uv run`.
 
-    It reads that from the environment, but only once, when it is imported, which may have been before.
+    It reads both from the environment, but only once, when it is imported, which may have been before.
     """
     from ray._private import ray_constants
 
     ray_constants.ENABLE_RAY_CLUSTER = False
+    ray_constants.RAY_ENABLE_UV_RUN_RUNTIME_ENV = False
 
 
 def forget_former_token() -> None:

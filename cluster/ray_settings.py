@@ -10,6 +10,8 @@ import secrets
 import socket
 from pathlib import Path
 
+from cluster.private_folder import OWNER
+
 OBJECT_STORE_BYTES = 80 * 2**20  # only reports travel, so the least that Ray accepts
 
 # What every worker process needs, on whatever machine it starts.
@@ -20,6 +22,11 @@ _LOCAL = {
     # A cluster of one machine: Ray then listens on the loopback address alone. Read when Ray is imported.
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    # A busy machine needs longer than the 30 to 60 s that Ray gives its own processes.
+    "RAY_gcs_server_port_wait_time_s": "300",
+    "RAY_worker_register_timeout_seconds": "300",
+    # Whether a process lives as long as the raylet is told by a pipe.
+    "RAY_enable_pipe_based_agent_to_parent_health_check": "1",
 }
 
 
@@ -28,17 +35,18 @@ def new_token() -> str:
     return secrets.token_hex(32)
 
 
-def head_environment(token: str) -> dict[str, str]:
+def head_environment(token: str, folder: Path | None = None) -> dict[str, str]:
     """Environment, over the caller's own, of a cluster of this machine alone and of its clients.
 
-    The processes listen on the loopback address and answer only those who have the token. Workers
-    find the five packages by PYTHONPATH, wherever the caller found them.
+    The processes listen on the loopback address, answer only those who have the token, and belong to a
+    private folder. Workers find the five packages by PYTHONPATH, wherever the caller found them.
     """
     paths = [str(Path(__file__).resolve().parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
         **_LOCAL,
         **WORKER_ENVIRONMENT,
         **token_environment(token),
+        **({OWNER: str(folder)} if folder else {}),
         "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)),
     }
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import psutil
 import pytest
 
+from cluster import ray_cluster as ray_cluster_module
+from cluster.private_folder import private_folder
 from cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
 from cluster.ray_settings import head_arguments, head_environment, new_token
 from schemas.errors import InputError
+from tests.other_user import as_another_user, needs_root, traces_of
 
 LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
 SOURCES = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
@@ -88,3 +95,95 @@ def test_a_head_of_this_machine_has_loopback_a_token_and_a_port_of_its_own() -> 
     environment = head_environment("t" * 64)
     assert environment["RAY_AUTH_MODE"] == "token" and environment["RAY_AUTH_TOKEN"] == "t" * 64
     assert new_token() != new_token()
+
+
+ANOTHER_USER = """
+from pathlib import Path
+import grpc, grpc._channel
+address, folder, pids = sys.argv[1], Path(sys.argv[2]), sys.argv[3].split()
+for place in ("session_latest/logs/raylet.out", "session_latest/sockets/planted", "planted"):
+    try: (folder / "ray" / place).symlink_to("/etc/passwd")
+    except PermissionError: print("refused")
+for pid in pids:
+    try: Path("/proc", pid, "environ").read_bytes()
+    except PermissionError: print("refused")
+ask = grpc.insecure_channel(address).unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")
+try: ask(b"", timeout=60)
+except grpc.RpcError as error: print(error.code().name)
+"""
+
+
+@needs_root
+def test_another_user_can_neither_enter_nor_read_nor_speak_to_a_local_cluster() -> None:
+    with ray_cluster(RaySettings(workers=1)) as ray:
+        token = str(ray.get(ray.remote(lambda: os.environ["RAY_AUTH_TOKEN"]).remote()))
+        folder = Path(ray._private.worker._global_node.temp_dir).parent
+        its = [p for p in psutil.Process().children(recursive=True) if token_of(p) == token]
+        assert folder.stat().st_mode & 0o777 == 0o700 and len(its) >= 3
+        address = ray.get_runtime_context().gcs_address
+        tried = as_another_user(ANOTHER_USER, address, folder, " ".join(str(p.pid) for p in its)).split()
+        assert tried == ["refused"] * (3 + len(its)) + ["UNAUTHENTICATED"]
+        assert traces_of(token, [folder]) == []
+    assert not folder.exists() and not [p for p in its if p.is_running()]
+    assert not list(Path("/tmp/ray").glob(f"session_*_{os.getpid()}"))
+
+
+def test_the_next_cluster_removes_what_a_killed_driver_left() -> None:
+    program = """
+import ray, sys
+from cluster.ray_cluster import RaySettings, ray_cluster
+with ray_cluster(RaySettings(workers=1)) as ray:
+    print(ray._private.worker._global_node.temp_dir, flush=True)
+    sys.stdin.read()
+"""
+    driver = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )  # fmt: skip
+    assert driver.stdout is not None
+    folder = Path(driver.stdout.readline().strip()).parent
+    its = psutil.Process(driver.pid).children(recursive=True)
+    assert {"gcs_server", "raylet"} <= {p.name() for p in its}
+    assert not [p for p in its if "Agent" in p.name() or "dashboard" in " ".join(p.cmdline()[:2])]
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    assert folder.exists()
+    with private_folder():  # as the next cluster begins
+        assert not folder.exists() and not [p for p in its if is_alive(p)]
+
+
+def is_alive(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def test_a_cluster_that_does_not_start_is_one_line_and_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from ray._private import services
+
+    monkeypatch.setattr(services, "RAYLET_EXECUTABLE", "/bin/false")
+    monkeypatch.setattr(ray_cluster_module, "_SILENT_START_S", 0.0)
+    said = pytest.raises(InputError, match=r"^ray: does not start: .* --workers 0.* --address")
+    with said, ray_cluster(RaySettings(workers=1)):
+        pass
+    assert capsys.readouterr().err.splitlines() == ["waiting for Ray to start: --address local"]
+    assert "gcs_server" not in {p.name() for p in psutil.Process().children(recursive=True) if is_alive(p)}
+
+
+@pytest.mark.slow
+def test_a_cluster_may_take_longer_to_start_than_ray_itself_waits(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from ray._private import services
+
+    slow = tmp_path / "raylet"
+    slow.write_text(f'#!/bin/sh\nsleep 40\nexec {services.RAYLET_EXECUTABLE} "$@"\n')
+    slow.chmod(0o755)
+    monkeypatch.setattr(services, "RAYLET_EXECUTABLE", str(slow))
+    began_s = time.monotonic()
+    with ray_cluster(RaySettings(workers=1)) as ray:
+        assert ray.get(ray.remote(lambda: 2).remote()) == 2
+    assert time.monotonic() - began_s > 40
