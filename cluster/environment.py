@@ -1,10 +1,42 @@
-"""Environment variables of this process, changed for the time of a block."""
+"""Environment variables: changed for the time of a block, or handed to a detached job in a file.
+
+What a runtime environment of Ray says stands on command lines and in logs. So secrets travel in a file
+that its user alone can read; the job's driver and workers read it when they start.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
+
+# Names the file to a detached job.
+JOB_ENVIRONMENT = "DATAGEN_JOB_ENVIRONMENT"
+_OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
+
+
+def is_of_the_shell(name: str) -> bool:
+    """Whether a detached job has this variable from the shell that submits it, not from Ray's head."""
+    return name.startswith(_OF_THE_SHELL)
+
+
+def adopt_job_environment() -> None:
+    """Set the variables that a detached job was given; Ray calls it in each worker of the job."""
+    if named := os.environ.get(JOB_ENVIRONMENT):
+        os.environ.update(json.loads(Path(named).read_text()))
+
+
+@contextmanager
+def job_environment() -> Generator[None]:
+    """Set the variables of a detached job, and remove their file when the block ends."""
+    adopt_job_environment()
+    try:
+        yield
+    finally:
+        if named := os.environ.get(JOB_ENVIRONMENT):
+            Path(named).unlink(missing_ok=True)
 
 
 @contextmanager

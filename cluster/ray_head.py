@@ -9,25 +9,24 @@ import fcntl
 import http.client
 import os
 import re
-import shutil
-import signal
 import subprocess
 import sys
-import tempfile
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import psutil
 from pydantic import Field, ValidationError
 
+from cluster.environment import is_of_the_shell
+from cluster.private_folder import is_private, new_folder, ray_folder, remove_folder, write_private
 from cluster.ray_settings import head_arguments, head_environment, new_token
 from schemas.errors import InputError
 from schemas.run_records import StoredRecord
 
-_START_WITHIN_S = 120.0
-_STOP_WITHIN_S = 4.0  # politely; some of Ray's processes do not heed that
+_START_WITHIN_S = 300.0
+_KIND = "datagen-head-"
 _ANSWER_WITHIN_S = 10.0
 _URL = re.compile(r"http://127\.0\.0\.1:[0-9]{1,5}")
 _MAX_BYTES = 1 << 16
@@ -86,11 +85,13 @@ def head_token(jobs_api: str) -> str:
 @contextmanager
 def _locked() -> Generator[None]:
     folder = state_folder()
+    mend = "Name a folder of your own as DATAGEN_STATE"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not is_private(folder.stat()):
+            raise InputError(folder, "", "other users can write to it, or it is another user's", mend)
         file = (folder / "head.lock").open("w")
     except OSError as error:
-        mend = "Name a folder of your own as DATAGEN_STATE"
         raise InputError(folder, "", f"cannot be written: {error.strerror}", mend) from error
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)  # two shells must not start two heads
@@ -100,21 +101,43 @@ def _locked() -> Generator[None]:
 def _read() -> Head | None:
     try:
         with (state_folder() / "head.json").open("rb") as file:
+            if not is_private(os.fstat(file.fileno())):
+                return None  # another user's: who follows it would run what that user says
             return Head.model_validate_json(file.read(_MAX_BYTES))
     except (OSError, ValidationError):
         return None  # lost or broken: then the next job starts a head of its own
 
 
 def _start(workers: int) -> Head:
-    # Ray opens its own folder to everybody, so it lies in one that is closed. Sockets need a short path.
-    folder = Path(tempfile.mkdtemp(prefix="datagen-head-", dir="/tmp"))
+    until_s = time.monotonic() + _START_WITHIN_S
+    while True:
+        folder = new_folder(_KIND)
+        try:
+            head = _started(workers, folder, until_s)
+        except BaseException:
+            remove_folder(folder)
+            raise
+        if isinstance(head, Head):
+            write_private(state_folder() / "head.json", head.model_dump_json())
+            return head
+        remove_folder(folder)
+        # Ray gives its own processes 15 to 30 s, which a busy machine does not keep.
+        if time.monotonic() >= until_s:
+            mend = "Submit again when the machine is less busy, or without --detach"
+            raise InputError("ray", "", f"does not start: {head}", mend)
+        sys.stderr.write(f"Ray did not start and is started again: {head}\n")
+
+
+def _started(workers: int, folder: Path, until_s: float) -> Head | str:
+    """The head, started once in this private folder; what it said last where it failed."""
     token, said = new_token(), folder / "start.txt"
-    inherited = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    arguments = [*head_arguments(max(1, workers)), f"--temp-dir={folder / 'ray'}"]
+    # Jobs bring stores and caches of their own: one must never work with the credentials of another.
+    inherited = {n: value for n, value in os.environ.items() if n != "RAY_ADDRESS" and not is_of_the_shell(n)}
+    arguments = [*head_arguments(max(1, workers)), f"--temp-dir={ray_folder(folder)}"]
     with said.open("w") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "ray.scripts.scripts", *arguments],
-            env=inherited | head_environment(token),
+            env=inherited | head_environment(token, folder),
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=out,
@@ -122,23 +145,15 @@ def _start(workers: int) -> Head:
             start_new_session=True,  # the end of the shell is not its end
         )
         try:
-            code = process.wait(_START_WITHIN_S)
+            code = process.wait(max(0.0, until_s - time.monotonic()))
         except subprocess.TimeoutExpired:
             process.kill()
             code = process.wait()
     text = said.read_text(errors="replace")
     found = _URL.search(text)
     if code != 0 or found is None:
-        _end_group(process.pid)
-        problem = next((line for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
-        raise InputError("ray", "", f"does not start: {problem}", f"See {said}")
-    head = Head(jobs_api=found[0], token=token, group=process.pid, folder=str(folder))
-    path = state_folder() / "head.json"
-    draft = path.with_suffix(f".{os.getpid()}.part")
-    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(head.model_dump_json())
-    draft.replace(path)
-    return head
+        return next((line for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
+    return Head(jobs_api=found[0], token=token, group=process.pid, folder=str(folder))
 
 
 def _answers(head: Head) -> bool:
@@ -154,66 +169,7 @@ def _answers(head: Head) -> bool:
 
 
 def _end(head: Head) -> None:
-    folder = Path(head.folder)
-    # The number of a group that is gone may be another's by now.
-    if any(head.folder in " ".join(_command(p)) for p in _members(head.group)):
-        _end_group(head.group)
-    # Workers that were just starting belong to nobody now.
-    _end_all({p for p in _own() if head.folder in " ".join(_command(p))})
     (state_folder() / "head.json").unlink(missing_ok=True)
-    if folder.name.startswith("datagen-head-") and folder.parent == Path("/tmp"):
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _end_group(group: int) -> None:
-    members = _members(group)
-    # Workers and jobs have groups of their own; they are children of this one's processes.
-    _end_all({*members, *(child for p in members for child in _children(p))})
-
-
-def _end_all(processes: set[psutil.Process]) -> None:
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        for process in processes:
-            try:
-                process.send_signal(number)
-            except psutil.NoSuchProcess:
-                continue
-        _, living = psutil.wait_procs(list(processes), timeout=_STOP_WITHIN_S)
-        processes = set(living)
-
-
-def _members(group: int) -> list[psutil.Process]:
-    found: list[psutil.Process] = []
-    for process in _own():
-        try:
-            if os.getpgid(process.pid) == group:
-                found.append(process)
-        except (ProcessLookupError, PermissionError):
-            continue
-    return found
-
-
-def _own() -> list[psutil.Process]:
-    """Processes of this user, without the one that asks."""
-    found: list[psutil.Process] = []
-    for process in psutil.process_iter():
-        try:
-            if process.pid != os.getpid() and process.uids().real == os.getuid():
-                found.append(process)
-        except psutil.Error:
-            continue
-    return found
-
-
-def _children(process: psutil.Process) -> list[psutil.Process]:
-    try:
-        return process.children(recursive=True)
-    except psutil.Error:
-        return []
-
-
-def _command(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:
-        return []
+    folder = Path(head.folder)
+    if folder.name.startswith(_KIND) and folder.parent == Path("/tmp"):
+        remove_folder(folder)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
-from cluster.environment import changed_environment
+from cluster.environment import JOB_ENVIRONMENT, changed_environment
 from cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
 from schemas.errors import InputError
 
@@ -19,6 +19,7 @@ _MEND = (
 _AGENT_WITHIN_S = 60.0
 _ANSWER_WITHIN_S = 5.0
 _WORK = ("PENDING", "RUNNING")
+ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 # Ray takes these over the address that it is given.
 _OVERRIDES = ("RAY_ADDRESS", "RAY_API_SERVER_ADDRESS")
 
@@ -31,14 +32,20 @@ class RayJobs:
         self._client = client
 
     def submit(self, entrypoint: str, submission: str, environment: Mapping[str, str]) -> None:
-        """Let the cluster's head run a shell command under a name of our own."""
+        """Let the cluster's head run a shell command under a name of our own.
+
+        Others may see the variables: no secret may be among them.
+        """
+        runtime: dict[str, Any] = {"env_vars": dict(environment)}
+        if JOB_ENVIRONMENT in environment:
+            runtime["worker_process_setup_hook"] = "cluster.environment.adopt_job_environment"
         until_s = time.monotonic() + _AGENT_WITHIN_S
         while True:
             try:
                 self._client.submit_job(
                     entrypoint=entrypoint,
                     submission_id=submission,
-                    runtime_env={"env_vars": dict(environment)},
+                    runtime_env=runtime,
                 )
                 return
             except RuntimeError as error:
@@ -91,6 +98,9 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
     nothing answers there, or not to us.
     """
     changed: dict[str, str | None] = dict.fromkeys(_OVERRIDES)
+    if "@" in address:
+        mend = "Leave it out; a token goes into RAY_AUTH_TOKEN"
+        raise InputError("--address", "", "a password in an address gets into records and logs", mend)
     if address.startswith(("http://", "https://")):
         url = address
     else:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError, UnknownCommandError
 
+from cluster.environment import job_environment
 from datagen import __version__
 from schemas.errors import InputError
 
@@ -145,7 +146,9 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """The console script."""
-    sys.exit(run(sys.argv[1:]))
+    with job_environment():
+        code = run(sys.argv[1:])
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
+from cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
+from cluster.private_folder import write_private
 from cluster.ray_head import ensure_head, head_token
-from cluster.ray_jobs import RayJobs, open_ray_jobs
+from cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.printing import print_rows
 from datagen.jobs.job import JOBS_API, SUBMISSION
 from datagen.jobs.options import Placing, command_line
@@ -18,7 +22,6 @@ from schemas.jobs import new_job_id
 
 _BEGUN_WITHIN_S = 60.0
 _LOOK_S = 0.3
-_OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
 
 
 def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
@@ -28,21 +31,19 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
     the command has begun, or waits for room on its cluster. InputError where the cluster cannot be
     reached or refuses it.
     """
+    submission = f"datagen-{new_job_id()}"
+    address = [] if placing.workers == 0 else ["--address", "auto"]
     if placing.address == "local":
         head = ensure_head(placing.workers or len(os.sched_getaffinity(0)))
         jobs = open_ray_jobs(head.jobs_api, head.token)
         # The very program that was called: the head runs on its machine, for its user.
-        program = [sys.executable, "-m", "datagen.cli"]
+        entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words, *address])
+        file = _hand_over(jobs, Path(head.folder), submission)
+        environment = {SUBMISSION: submission, JOBS_API: jobs.url, JOB_ENVIRONMENT: str(file)}
     else:
         jobs = open_ray_jobs(placing.address)
-        program = ["datagen"]  # as the cluster's image has it
-    submission = f"datagen-{new_job_id()}"
-    address = [] if placing.workers == 0 else ["--address", "auto"]
-    entrypoint = shlex.join([*program, *words, *address])
-    environment = {SUBMISSION: submission, JOBS_API: jobs.url}
-    if placing.address == "local":
-        # The head may be older than what this shell says of stores and caches.
-        environment |= {name: value for name, value in os.environ.items() if name.startswith(_OF_THE_SHELL)}
+        entrypoint = shlex.join(["datagen", *words, *address])  # as the cluster's image has it
+        environment = {SUBMISSION: submission, JOBS_API: jobs.url}
     jobs.submit(entrypoint, submission, environment)
     state = _await_begin(jobs, submission)
     rows = [
@@ -57,6 +58,20 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
         rows.append(("Ray stays", f"for later jobs; {command_line(['cancel', '--head'])} ends it"))
     print_rows(f"detached: {command_line(words)}", rows)
     return 0
+
+
+def _hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
+    """Write what this shell says of stores and caches for one job; return the file.
+
+    The job removes it at its end. Those of jobs that were killed are removed here.
+    """
+    for left in folder.glob("datagen-*.json"):
+        if jobs.state(left.stem) in ENDED:
+            left.unlink(missing_ok=True)
+    file = folder / f"{submission}.json"
+    given = {name: value for name, value in os.environ.items() if is_of_the_shell(name)}
+    write_private(file, json.dumps({n: v for n, v in given.items() if n not in (SUBMISSION, JOBS_API)}))
+    return file
 
 
 def detached_words() -> list[str]:
