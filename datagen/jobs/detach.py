@@ -38,7 +38,7 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
         jobs = open_ray_jobs(head.jobs_api, head.token)
         # The very program that was called: the head runs on its machine, for its user.
         entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words, *address])
-        file = _hand_over(jobs, Path(head.folder), submission)
+        file = hand_over(jobs, Path(head.folder), submission)
         environment = {SUBMISSION: submission, JOBS_API: jobs.url, JOB_ENVIRONMENT: str(file)}
     else:
         jobs = open_ray_jobs(placing.address)
@@ -60,7 +60,7 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
     return 0
 
 
-def _hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
+def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
     """Write what this shell says of stores and caches for one job; return the file.
 
     The job removes it at its end. Those of jobs that were killed are removed here.

@@ -1,0 +1,165 @@
+"""Credentials of detached jobs: each job has its own, and no other user can see them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import secrets
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cluster.environment import JOB_ENVIRONMENT
+from cluster.ray_head import Head, running_head, state_folder, stop_head
+from cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
+from datagen import cli
+from datagen.jobs.detach import hand_over
+from schemas.jobs import Jobs
+from schemas.storage import open_storage
+from tests.other_user import as_another_user, needs_root, traces_of
+from tests.refusals import refused
+from tests.small_runs import PER_SCENE, submit_arguments
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+SECRET = "AWS_SECRET_ACCESS_KEY"
+# A job: says which credentials its driver and a worker have, and ends when it is let go.
+PROGRAM = f"""
+import hashlib, json, os, sys, time
+from pathlib import Path
+from cluster.environment import job_environment
+from cluster.ray_cluster import RaySettings, ray_cluster
+def seen():
+    return hashlib.sha256(os.environ["{SECRET}"].encode()).hexdigest()
+with job_environment(), ray_cluster(RaySettings(address="auto")) as ray:
+    answer = [seen(), ray.get(ray.remote(num_cpus=0)(seen).remote())]
+    Path(sys.argv[1]).write_text(json.dumps(answer))
+    while not Path(sys.argv[2]).exists():
+        time.sleep(0.1)
+"""
+
+
+@pytest.fixture(scope="module")
+def first_key() -> str:
+    """The key of the shell that starts the head."""
+    return secrets.token_hex(16)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, first_key: str) -> Iterator[Path]:
+    """A run made by a detached job of a shell with a key; its head stays until the tests are done."""
+    folder = tmp_path_factory.mktemp("detached")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DATAGEN_STATE", str(folder / "state"))
+        patch.setenv(SECRET, first_key)
+        words = [*submit_arguments(folder / "run", PER_SCENE, workers=2), "--detach"]
+        subprocess.run([sys.executable, "-m", "datagen.cli", *words], cwd=REPOSITORY, check=True, timeout=290)
+        try:
+            head, _ = head_and_jobs()
+            while list(Path(head.folder).glob("*.json")):  # removed as the job's last act
+                time.sleep(0.2)
+            assert Jobs(open_storage(folder / "run")).all()[0].health() == "ended"
+            yield folder / "run"
+        finally:
+            stop_head()
+
+
+def head_and_jobs() -> tuple[Head, RayJobs]:
+    head = running_head()
+    assert head is not None
+    return head, open_ray_jobs(head.jobs_api, head.token)
+
+
+def await_end(jobs: RayJobs, submission: str) -> str:
+    while (state := jobs.state(submission)) not in ENDED:
+        time.sleep(0.2)
+    return state
+
+
+def test_each_job_on_a_head_has_its_own_credentials_and_nothing_shows_them(
+    run: Path, first_key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head, jobs = head_and_jobs()
+    keys, submissions = [first_key, secrets.token_hex(16)], ["datagen-a", "datagen-b"]
+    program, go = tmp_path / "program.py", tmp_path / "go"
+    program.write_text(PROGRAM)
+    for key, submission in zip(keys, submissions, strict=True):
+        monkeypatch.setenv(SECRET, key)
+        file = hand_over(jobs, Path(head.folder), submission)
+        assert file.stat().st_mode & 0o777 == 0o600
+        command = f"{sys.executable} {program} {tmp_path / submission} {go}"
+        jobs.submit(command, submission, {JOB_ENVIRONMENT: str(file)})
+    answers = [tmp_path / submission for submission in submissions]
+    while not all(answer.exists() for answer in answers):
+        assert not {jobs.state(s) for s in submissions} & {"FAILED", "STOPPED"}, jobs.output("datagen-a")
+        time.sleep(0.2)
+    for key, answer in zip(keys, answers, strict=True):
+        assert json.loads(answer.read_text()) == [hashlib.sha256(key.encode()).hexdigest()] * 2
+    own = [Path(head.folder, f"{submission}.json") for submission in submissions]
+    for key, file in zip(keys, own, strict=True):  # at work, the key is in the job's own file alone
+        assert traces_of(key, [Path(head.folder), state_folder(), run.parent]) == [str(file)]
+    assert traces_of(head.token, [Path(head.folder), run]) == []
+    assert traces_of(head.token, [state_folder()]) == [str(state_folder() / "head.json")]
+    go.touch()
+    assert [await_end(jobs, submission) for submission in submissions] == ["SUCCEEDED"] * 2
+    for key in keys:
+        assert traces_of(key, [Path(head.folder), state_folder(), run.parent]) == []
+
+
+def test_a_killed_job_s_credentials_go_with_the_next_job(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    head, jobs = head_and_jobs()
+    monkeypatch.setenv(SECRET, "left")
+    left = hand_over(jobs, Path(head.folder), "datagen-killed")
+    jobs.submit("kill -9 $$", "datagen-killed", {JOB_ENVIRONMENT: str(left)})
+    assert await_end(jobs, "datagen-killed") == "FAILED" and left.exists()
+    waiting = hand_over(jobs, Path(head.folder), "datagen-not-yet-submitted")
+    hand_over(jobs, Path(head.folder), "datagen-next")
+    assert not left.exists() and waiting.exists()
+
+
+@needs_root
+def test_another_user_sees_nothing_of_a_head(run: Path, first_key: str) -> None:
+    head, _ = head_and_jobs()
+    tried = as_another_user(
+        "from pathlib import Path\n"
+        "for place in sys.argv[1:]:\n"
+        "    try: print(list(Path(place).iterdir()))\n"
+        "    except PermissionError: print('refused')\n"
+        "for place in Path('/proc').glob('[0-9]*/environ'):\n"
+        "    try: print(place if sys.argv[1].encode() in place.read_bytes() else '')\n"
+        "    except OSError: pass\n",
+        head.folder, state_folder(),
+    ).split()  # fmt: skip
+    assert tried == ["refused"] * 2
+
+
+def test_a_state_folder_that_others_can_write_to_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    monkeypatch.setenv("DATAGEN_STATE", str(shared))
+    words = submit_arguments(tmp_path / "run", PER_SCENE, workers=1)
+    refused([*words, "--detach"], capsys, "shared", "other users can write to it")
+    assert list(shared.iterdir()) == []
+    # A head that another user describes is none: its address and its folder would be that user's.
+    shared.chmod(0o700)
+    head = Head(jobs_api="http://127.0.0.1:1", token="0" * 64, group=2, folder="/tmp/datagen-head-theirs")
+    (shared / "head.json").write_text(head.model_dump_json())
+    (shared / "head.json").chmod(0o666)
+    assert not stop_head() and cli.run(["cancel", "--head"]) == 0
+    assert "none runs" in capsys.readouterr().out
+
+
+def test_a_password_in_an_address_is_refused_and_not_repeated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["submit", "heuristic", "--n", "8", "--out", str(tmp_path / "run"), "--detach"]
+    told = refused(
+        [*words, "--address", "http://me:hidden@127.0.0.1:9"], capsys, "--address", "RAY_AUTH_TOKEN"
+    )
+    assert "hidden" not in told and not list(tmp_path.iterdir())
