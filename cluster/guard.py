@@ -29,6 +29,7 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
+from cluster.private_folder import is_private
 from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from schemas.cost import StageClock
 from schemas.run_records import Cost, Host, Outcome
@@ -125,6 +126,8 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
         return
     note, stack = _note_path(task.notes, task.attempt), _stack_path(task.notes, task.attempt)
     note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not is_private(note.parent.lstat()):
+        raise PermissionError(f"{note.parent}: another user's folder, or others can write to it")
     draft = note.with_suffix(".part")
     draft.write_text(json.dumps({"host": this_host().model_dump(), "started": started}))
     draft.rename(note)

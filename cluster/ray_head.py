@@ -85,7 +85,7 @@ def head_token(jobs_api: str) -> str:
 @contextmanager
 def _locked() -> Generator[None]:
     folder = state_folder()
-    mend = "Name a folder of your own as DATAGEN_STATE"
+    mend = "Name a folder of your own, of mode 0700, as DATAGEN_STATE"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not is_private(folder.stat()):

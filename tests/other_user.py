@@ -11,17 +11,18 @@ from pathlib import Path
 import pytest
 
 NOBODY = 65534
+REPOSITORY = Path(__file__).resolve().parents[1]
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
 
 
-def as_another_user(code: str, *arguments: object) -> str:
+def as_another_user(code: str, *arguments: object, user: int = NOBODY) -> str:
     """What Python code prints as another user id, which it takes on after its imports."""
-    become = f"import os, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY})\n"
+    become = f"import os, sys; os.setgroups([]); os.setgid({user}); os.setuid({user})\n"
     imports = "".join(f"{line}\n" for line in code.splitlines() if line.startswith(("import ", "from ")))
     environment = {"PATH": os.environ["PATH"], "RAY_AUTH_MODE": "disabled"}
     done = subprocess.run(
         [sys.executable, "-c", imports + become + code, *map(str, arguments)],
-        check=False, env=environment, cwd="/", capture_output=True, text=True, timeout=120,
+        check=False, env=environment, cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -11,7 +11,6 @@ import fcntl
 import io
 import os
 import stat
-import tempfile
 import time
 import zipfile
 from collections.abc import Generator, Mapping
@@ -33,13 +32,16 @@ _ABANDONED_S = 3600.0  # a half written file this old is of a process that was k
 
 
 def cache_folder() -> Path:
-    """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories)."""
+    """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories).
+
+    Where the user has no home, a path that holds nothing: one below /tmp could be another user's.
+    """
     if explicit := os.environ.get("DATAGEN_CACHE"):
         return Path(explicit)
     try:
         home = Path.home()
     except RuntimeError:  # a container may run a user id without a home
-        home = Path(tempfile.gettempdir())
+        home = Path(os.devnull)
     return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "datagen"
 
 

@@ -47,6 +47,13 @@ esac
 """
 
 
+def words_of(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
 def committed(place: Path) -> int:
     try:
         return len(Run.open(place).committed())
@@ -83,6 +90,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
+    folders: set[Path] = set()
     try:
         while committed(run) == 0:
             assert job.poll() is None, (tmp_path / "output").read_text()
@@ -90,18 +98,24 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
         (token,) = here.glob(".datagen-token-*")
         assert stat.S_IMODE(token.stat().st_mode) == 0o600 and len(token.read_text().strip()) == 64
         machines = job.children(recursive=True)
+        folders = {
+            Path(w.partition("=")[2]) for p in machines for w in words_of(p) if w.startswith("--temp_dir=")
+        }
+        # Ray opens its folder to everybody, so it lies in one that is closed.
+        assert len(folders) == 2 and {stat.S_IMODE(f.parent.stat().st_mode) for f in folders} == {0o700}
         assert sum(process.name() == "raylet" for process in machines) == 2
         job.send_signal(signal.SIGTERM)
         code = job.wait(timeout=300)
     finally:
         for process in [*job.children(recursive=True), job] if job.is_running() else []:
             process.kill()
-        shutil.rmtree(f"/tmp/ray-{os.getuid()}-{job_id}", ignore_errors=True)
+        for folder in folders:
+            shutil.rmtree(folder.parent, ignore_errors=True)
     said = (tmp_path / "output").read_text()
     assert code == 130, said
     assert (here / "requeued").read_text().split() == [job_id]
     started = (here / "started").read_text()
-    assert "alpha: ray start" in started and "beta: ray start" in started
+    assert "alpha: bash -c exec ray start" in started and "beta: bash -c exec ray start" in started
     assert "0.0.0.0" not in started and "--include-dashboard=false" in started
     _, alive = psutil.wait_procs(machines, timeout=120)
     assert not token.exists() and not alive  # nothing is left behind on the machines

@@ -20,6 +20,7 @@ from schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import make_run, write
+from tests.other_user import NOBODY, needs_root
 
 POLICY = Policy(max_quarantined_share=0.2, backoff_s=0.01)
 
@@ -121,3 +122,18 @@ def test_the_guard_reports_and_leaves_nothing_behind(tmp_path: Path) -> None:
     text = "ImportError: no module\n" + "a long story\n" * 100
     long = obituary(ScriptedTask(7, "c", 60, str(notes)), "failed", text)
     assert long.stack == text and len(long.cause) == 300 and "\n" not in long.cause
+
+
+@needs_root
+@pytest.mark.parametrize("kind", ["folder", "link"])
+def test_notes_are_not_written_where_another_user_could_have_planted_links(tmp_path: Path, kind: str) -> None:
+    notes, target = tmp_path / "notes", tmp_path / "target"
+    target.mkdir()
+    if kind == "link":
+        notes.symlink_to(target)
+    else:
+        notes.mkdir()
+        os.chown(notes, NOBODY, NOBODY)
+    with pytest.raises(PermissionError, match="another user's folder"):
+        guarded(lambda task, meter: None, ScriptedTask(7, "a", 60, str(notes)), deadline=False)  # type: ignore[arg-type,return-value]
+    assert not list(target.iterdir()) and not list(notes.iterdir())

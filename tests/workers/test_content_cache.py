@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.other_user import as_another_user, needs_root
 from workers.content_cache import Arrays, Shelf, alone_in, drop_unused, read_arrays, refresh, whole_file
 
 SHELF = Shelf(
@@ -262,3 +263,16 @@ def test_processes_wait_for_one_another(tmp_path: Path) -> None:
     assert (tmp_path / "count").read_text() == "600"
     with pytest.raises(OSError), alone_in(tmp_path / "gone"):
         pass
+
+
+@needs_root
+def test_a_user_without_a_home_has_no_cache_rather_than_one_that_others_can_write_to() -> None:
+    printed = as_another_user(
+        "from workers.content_cache import cache_folder, whole_file\n"
+        "print(cache_folder())\n"
+        "try:\n"
+        "    with whole_file(cache_folder() / 'x'): print('written')\n"
+        "except OSError: print('nowhere')\n",
+        user=54321,
+    )
+    assert printed.split() == ["/dev/null/.cache/datagen", "nowhere"]
