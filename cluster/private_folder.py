@@ -22,6 +22,7 @@ _STOP_WITHIN_S = 4.0  # politely; some of Ray's processes ignore that
 
 # Variable that names the folder to each process that belongs to it; Ray reads it too.
 OWNER = "RAY_TMPDIR"
+RAY = "ray"  # the part that Ray writes to, and opens to everybody who can reach it
 
 
 @contextmanager
@@ -36,7 +37,7 @@ def private_folder() -> Generator[Path]:
     lock = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        ray_folder(folder).mkdir()  # from here on another program may ask whether it is abandoned
+        (folder / RAY).mkdir()  # from here on another program may ask whether it is abandoned
         yield folder
     finally:
         remove_folder(folder)
@@ -46,11 +47,6 @@ def private_folder() -> Generator[Path]:
 def new_folder(kind: str) -> Path:
     """A new folder below /tmp with mode 0700; its name begins with `kind`."""
     return Path(tempfile.mkdtemp(prefix=kind, dir=_PARENT))
-
-
-def ray_folder(folder: Path) -> Path:
-    """The part of a private folder that Ray writes to, and opens to everybody who can reach it."""
-    return folder / "ray"
 
 
 def write_private(path: Path, text: str) -> None:
@@ -78,7 +74,7 @@ def end_processes(processes: list[psutil.Process]) -> None:
         for process in processes:
             try:
                 process.send_signal(number)
-            except psutil.NoSuchProcess:
+            except psutil.Error:
                 continue
         _, processes = psutil.wait_procs(processes, timeout=_STOP_WITHIN_S)
 
@@ -91,7 +87,7 @@ def _remove_abandoned() -> None:
         except OSError:
             continue  # another user's, or no folder
         try:
-            if is_private(os.fstat(lock)) and ray_folder(folder).is_dir():
+            if is_private(os.fstat(lock)) and (folder / RAY).is_dir():
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 remove_folder(folder)
         except BlockingIOError:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from cluster.environment import changed_environment
-from cluster.private_folder import private_folder, ray_folder
+from cluster.private_folder import RAY, private_folder
 from cluster.ray_local import START_MEND, slim_node
 from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token, token_environment
 from schemas.errors import InputError
@@ -58,7 +58,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
                 "num_cpus": settings.workers,
                 "include_dashboard": False,
                 "object_store_memory": settings.object_store_bytes,
-                "_temp_dir": str(ray_folder(folder)),
+                "_temp_dir": str(folder / RAY),
             }
         else:
             address = _resolved(settings.address)

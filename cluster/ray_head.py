@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationError
 
 from cluster.environment import is_of_the_shell
-from cluster.private_folder import is_private, new_folder, ray_folder, remove_folder, write_private
+from cluster.private_folder import RAY, is_private, new_folder, remove_folder, write_private
 from cluster.ray_settings import head_arguments, head_environment, new_token
 from schemas.errors import InputError
 from schemas.run_records import StoredRecord
@@ -133,7 +133,7 @@ def _started(workers: int, folder: Path, until_s: float) -> Head | str:
     token, said = new_token(), folder / "start.txt"
     # Jobs bring stores and caches of their own: one must never work with the credentials of another.
     inherited = {n: value for n, value in os.environ.items() if n != "RAY_ADDRESS" and not is_of_the_shell(n)}
-    arguments = [*head_arguments(max(1, workers)), f"--temp-dir={ray_folder(folder)}"]
+    arguments = [*head_arguments(max(1, workers)), f"--temp-dir={folder / RAY}"]
     with said.open("w") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "ray.scripts.scripts", *arguments],

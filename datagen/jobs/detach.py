@@ -69,8 +69,9 @@ def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
         if jobs.state(left.stem) in ENDED:
             left.unlink(missing_ok=True)
     file = folder / f"{submission}.json"
-    given = {name: value for name, value in os.environ.items() if is_of_the_shell(name)}
-    write_private(file, json.dumps({n: v for n, v in given.items() if n not in (SUBMISSION, JOBS_API)}))
+    own = (SUBMISSION, JOBS_API, JOB_ENVIRONMENT)  # where this shell is itself a detached job
+    given = {n: value for n, value in os.environ.items() if is_of_the_shell(n) and n not in own}
+    write_private(file, json.dumps(given))
     return file
 
 

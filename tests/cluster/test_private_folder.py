@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.private_folder import OWNER, private_folder, ray_folder
+from cluster.private_folder import OWNER, RAY, private_folder
 from tests.other_user import NOBODY, as_another_user, needs_root
 
 # Owns a folder with a process in it, says both, and waits to be killed.
@@ -47,7 +47,7 @@ def test_a_folder_is_closed_and_goes_with_its_processes(
     owner: tuple[subprocess.Popen[str], Path, int],
 ) -> None:
     process, folder, child = owner
-    assert folder.stat().st_mode & 0o777 == 0o700 and ray_folder(folder).is_dir()
+    assert folder.stat().st_mode & 0o777 == 0o700 and (folder / RAY).is_dir()
     process.communicate()  # ends its input
     assert process.returncode == 0 and not folder.exists() and not psutil.pid_exists(child)
 
@@ -72,11 +72,11 @@ def test_folders_of_others_and_planted_links_are_left_alone(tmp_path: Path) -> N
     planted = Path(tempfile.mkdtemp(prefix="datagen-ray-planted-", dir="/tmp"))
     link = planted.with_name(f"{planted.name}-link")
     try:
-        ray_folder(planted).mkdir()
+        (planted / RAY).mkdir()
         os.chown(planted, NOBODY, NOBODY)
         link.symlink_to(tmp_path)
         with private_folder() as folder:
-            assert ray_folder(planted).is_dir() and (tmp_path / "ray").is_dir() and link.is_symlink()
+            assert (planted / RAY).is_dir() and (tmp_path / "ray").is_dir() and link.is_symlink()
             tried = as_another_user(
                 "from pathlib import Path\n"
                 "for act in (lambda p: list(p.iterdir()), lambda p: (p / 'planted').symlink_to('/etc'),\n"

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -101,6 +102,10 @@ def test_each_job_on_a_head_has_its_own_credentials_and_nothing_shows_them(
     own = [Path(head.folder, f"{submission}.json") for submission in submissions]
     for key, file in zip(keys, own, strict=True):  # at work, the key is in the job's own file alone
         assert traces_of(key, [Path(head.folder), state_folder(), run.parent]) == [str(file)]
+    request = Request(f"{head.jobs_api}/api/jobs/", headers={"Authorization": f"Bearer {head.token}"})
+    with urlopen(request, timeout=120) as answer:
+        answered = answer.read().decode()
+    assert "datagen-b" in answered and not [key for key in keys if key in answered]
     assert traces_of(head.token, [Path(head.folder), run]) == []
     assert traces_of(head.token, [state_folder()]) == [str(state_folder() / "head.json")]
     go.touch()
@@ -118,6 +123,21 @@ def test_a_killed_job_s_credentials_go_with_the_next_job(run: Path, monkeypatch:
     waiting = hand_over(jobs, Path(head.folder), "datagen-not-yet-submitted")
     hand_over(jobs, Path(head.folder), "datagen-next")
     assert not left.exists() and waiting.exists()
+
+
+def test_nothing_of_the_shell_travels_to_another_cluster(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head, _ = head_and_jobs()
+    key = secrets.token_hex(16)
+    monkeypatch.setenv(SECRET, key)
+    monkeypatch.setenv("RAY_AUTH_TOKEN", head.token)
+    words = submit_arguments(tmp_path / "run", PER_SCENE, workers=1)
+    # The cluster may have no `datagen` on its PATH: then the job has ended at once, and been handed over too.
+    assert cli.run([*words, "--detach", "--address", head.jobs_api]) in (0, 2)
+    said = capsys.readouterr()
+    assert "datagen-2" in said.out + said.err and key not in said.out + said.err
+    assert traces_of(key, [Path(head.folder), state_folder(), tmp_path]) == []
 
 
 @needs_root
