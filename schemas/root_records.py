@@ -39,9 +39,11 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
 
 def refuse_other(place: str, there: Manifest, asked: Manifest) -> None:
     """Refuse to go on with a run of another specification, naming every field that differs."""
-    ours, theirs = asked.model_dump(mode="json"), there.model_dump(mode="json")
-    keys = ("spec", "schema_name")  # not its version: a run goes on in the one it was begun with
-    rows = different_fields({k: ours[k] for k in keys}, {k: theirs[k] for k in keys})
+    # Not the schema's version: a run goes on in the one it was begun with.
+    ours, theirs = (
+        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (asked, there)
+    )
+    rows = different_fields(ours, theirs)
     where, each = f"{place}/manifest.json", there.layout.candidates_per_scene
     if each != asked.layout.candidates_per_scene:
         problem = f"{each}, not the {asked.layout.candidates_per_scene} asked"

@@ -7,7 +7,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_serializer,
+    model_serializer,
+)
 
 from schemas.specification import Specification
 
@@ -64,6 +71,11 @@ class Manifest(StoredRecord):
     created: str
     # Where the sources were found and under which licences; information, not identity.
     sources: dict[str, str] = Field(default_factory=dict)
+
+    @field_serializer("spec")
+    def _as_stored(self, spec: Specification) -> dict[str, Any]:
+        """A manifest that is written again, by a merge, keeps what its hash is over."""
+        return spec.document()
 
 
 class Plan(StoredRecord):

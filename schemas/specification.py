@@ -6,9 +6,9 @@ what. A specification defines an endless sequence of scenes; n only says how far
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
 from schemas.identity import digest_of
 
@@ -18,6 +18,13 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _all_set(self, info: ValidationInfo) -> Self:
+        # Unset is then only what a stored record lacks: a field that came with a later version.
+        if info.mode != "json":
+            self.model_fields_set.update(type(self).model_fields)
+        return self
 
 
 class Source(_Frozen):
@@ -273,12 +280,16 @@ class Specification(_Frozen):
     # Versions of the label code and of the engines that move bits, by name.
     engines: dict[str, str] = Field(default_factory=dict)
 
+    def document(self, without_none: bool = False) -> dict[str, Any]:
+        """The fields as they are stored; one read from a record has those of the record alone."""
+        return self.model_dump(mode="json", exclude_unset=True, exclude_none=without_none)
+
     def hash(self) -> str:
         """sha256 of the canonical JSON: the identity of the endless sequence of samples.
 
-        What is None is left out, so that a later section, None by default, leaves older hashes alone.
+        What is None is left out, and so is what its record lacks: later fields leave older hashes alone.
         """
-        return digest_of(self.model_dump(mode="json", exclude_none=True))
+        return digest_of(self.document(without_none=True))
 
     @property
     def scenes_hash(self) -> str:

@@ -81,5 +81,5 @@ def _part(sealed: SealedRun) -> dict[str, Any]:
         "n": sealed.n,
         "shards": len(sealed.shards),
         "missing_shards": list(sealed.missing_shards),
-        "specification": sealed.run.manifest.spec.model_dump(mode="json"),
+        "specification": sealed.run.manifest.spec.document(),
     }
