@@ -15,7 +15,7 @@ from cyclopts.exceptions import CycloptsError, UnknownCommandError
 
 from cluster.environment import job_environment
 from datagen import __version__
-from schemas.errors import InputError
+from schemas.errors import InputError, refuse_not_utf8
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -125,7 +125,7 @@ def run(arguments: Sequence[str]) -> int:
     Defects of this program are not caught: their traceback is what a report of them needs.
     """
     try:
-        result = build_app(next(iter(arguments), ""))(list(arguments))
+        result = build_app(next(iter(arguments), ""))([refuse_not_utf8(word) for word in arguments])
         sys.stdout.flush()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")

@@ -28,6 +28,16 @@ class InputError(ValueError):
         return (type(self), (self.place, self.field, self.problem, self.mend))
 
 
+def refuse_not_utf8(text: str) -> str:
+    """The text. InputError where it is no Unicode, as the name of a file may be: no record holds it."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        mend = "Rename it, or reach it through a link in UTF-8"
+        raise InputError(repr(text)[:300], "", "the name is not UTF-8", mend) from None
+    return text
+
+
 def choices(valid: object) -> str:
     """`choose one of: a, b, c` for an error's mend."""
     return "Choose one of: " + ", ".join(sorted(str(v) for v in valid))  # type: ignore[attr-defined]

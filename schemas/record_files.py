@@ -35,7 +35,11 @@ def encode_record(record: BaseModel) -> bytes:
 
 def signed_json(fields: Mapping[str, Any]) -> bytes:
     """A record's file from its fields, as `encode_record` writes it."""
-    return _signed(json.dumps(fields, indent=1, allow_nan=False).encode().removesuffix(b"\n}"))
+    text = json.dumps(fields, indent=1, allow_nan=False)
+    if "\\ud" in text:  # half characters, of a file's name in an error or of a host, which no reader takes
+        text = json.dumps(fields, indent=1, ensure_ascii=False).encode(errors="replace").decode()
+        text = json.dumps(json.loads(text), indent=1)
+    return _signed(text.encode().removesuffix(b"\n}"))
 
 
 def compact_record(record: BaseModel) -> bytes:

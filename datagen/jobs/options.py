@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from cluster.ray_cluster import refuse_unusable
 from datagen.console.whole_number import WHOLE_NUMBER
-from schemas.errors import InputError
+from schemas.errors import InputError, refuse_not_utf8
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -110,7 +110,7 @@ def absolute_source(ref: str) -> str:
     kind, _, text = ref.partition(":")
     # What names no file is a parameter of the source, as in builtin:400.
     is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
-    return f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref
+    return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
 
 
 def absolute_place(place: str) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.at_once import in_order
-from schemas.errors import InputError
+from schemas.errors import InputError, refuse_not_utf8
 from schemas.storage.errors import FileTooLarge, storage_error
 from schemas.storage.local_files import LocalFiles
 from schemas.storage.stored_file import StoredFile
@@ -216,7 +216,9 @@ def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> 
             f"{scheme}://...", "", problem, "Name a folder or an s3:// address that you can write"
         )
     else:
-        storage = _open_folder(Path(rest if colon else text).expanduser().absolute(), create)
+        folder = Path(rest if colon else text).expanduser().absolute()
+        refuse_not_utf8(str(folder))  # records name it
+        storage = _open_folder(folder, create)
     if probe:
         _probe(storage)
     return storage
