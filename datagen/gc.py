@@ -28,7 +28,11 @@ def gc(
     run: RunPlace,
     *,
     older_than: Annotated[
-        str, Parameter(help="What was written later than this ago stays: 90s, 30m, 24h or 7d.")
+        str,
+        Parameter(
+            help="What was written later than this ago stays: 90s, 30m, 24h or 7d. A merge that runs needs "
+            "more than it takes: with 0s it loses files and must be run again."
+        ),
     ] = "24h",
     dry_run: Annotated[bool, Parameter(negative=(), help="Tell what would go, and remove nothing.")] = False,
     json: AsJson = False,

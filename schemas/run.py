@@ -6,6 +6,8 @@ create-only, so that of two racing attempts one wins and the other is waste.
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -44,6 +46,7 @@ _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
 Removal = Literal["removed", "spared", "damaged"]
 _MOST_PLANS = 10**9
+AGAIN = "Run the same command again once `datagen gc` has ended: it makes what is missing"
 # A commit with its file entries takes some 30 kB of memory.
 _COMMITS_KEPT = 1000
 
@@ -239,13 +242,15 @@ class Run:
             yield
         except StoreFailure:
             raise  # it would not delete either
-        except InputError:
+        except InputError as error:
             with suppress(InputError):
                 if ours:
                     self.storage.delete([file.key for file in self.storage.list(folder)])
                     self.storage.remove_empty(folder)
                 else:
                     self.remove_attempt(shard, attempt)
+            if error.problem == os.strerror(errno.ENOENT):  # `gc` took it
+                raise InputError(error.place, error.field, error.problem, AGAIN) from error
             raise
 
     def remove_attempt(self, shard: int, attempt: str) -> Removal:
@@ -299,10 +304,11 @@ class Run:
 
     def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
+        mend = AGAIN if committing else "Restore the file from a copy, or mend the run with `datagen repair`"
         sizes = {f.key: f.size for f in self.storage.list(folder)}
         if committing and (mark := f"{folder}/{REMOVING}") in sizes:
             place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
-            return InputError(place, "", problem, "Make it again with `datagen resume`")
+            return InputError(place, "", problem, mend)
         for entry in commit.files:
             size = sizes.get(f"{folder}/{entry.path}")
             if size != entry.size:
@@ -310,7 +316,7 @@ class Run:
                     f"{self.storage.url}/{folder}/{entry.path}",
                     "",
                     "missing" if size is None else f"{size} bytes, where the commit has {entry.size}",
-                    "Restore the file from a copy, or mend the run with `datagen repair`",
+                    mend,
                 )
         return None
 

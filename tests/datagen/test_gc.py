@@ -133,6 +133,28 @@ def test_a_claim_to_a_lost_commit_record_stays(tmp_path: Path) -> None:
     assert run.storage.exists(commit_copy_key(1, "a-1"))
 
 
+@pytest.mark.parametrize("step", ["sync", "put"])  # the shard's files are there, or all but its commit
+def test_a_merge_that_gc_takes_files_from_says_what_to_do(
+    step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, shards in (("a", [0, 1]), ("b", [1, 2])):
+        make_run(tmp_path / name, 30, shards=shards)
+    out, plain = tmp_path / "out", getattr(Storage, step)
+    merge = ["merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(out)]
+
+    def after_gc(storage: Storage, *arguments: Any) -> None:
+        monkeypatch.undo()
+        place = open_storage(out, probe=False)
+        for piece in find_garbage(place, 0, time.time() + DAY_S):
+            sweep(piece)
+        plain(storage, *arguments)
+
+    monkeypatch.setattr(Storage, step, after_gc)
+    refused(merge, capsys, str(out), "same command again", "datagen gc")
+    assert cli.run(merge) == 0 and cli.run(["verify", str(out)]) == 0
+    assert Run.open(out).committed() == {0, 1, 2}
+
+
 def test_a_removal_that_was_cut_short_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, garbage = littered(tmp_path)
     before = kept_of(tmp_path, garbage)
