@@ -10,7 +10,7 @@ from schemas.errors import InputError
 from schemas.keys import MERGED, part_folder
 from schemas.record_files import read_record
 from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION, Merged
+from schemas.run_records import FORMAT_VERSION, Merged, other_value
 from schemas.storage import Storage, open_storage
 
 
@@ -30,7 +30,11 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
             f"{merged.format_version}, and this program reads {FORMAT_VERSION}",
             "Use the version of the program that made the run",
         )
-    return [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
+    runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
+    for run, spec_hash in zip(runs, merged.parts, strict=True):
+        if found := other_value(run.manifest, spec_hash=spec_hash):
+            raise InputError(f"{run.storage.url}/manifest.json", *found, "Mend it with `datagen repair`")
+    return runs
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from schemas.run_records import (
     Plan,
     QuarantineRecord,
     foreign_field,
+    other_value,
 )
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage, open_storage
@@ -147,9 +148,10 @@ class Run:
             if number >= _MOST_PLANS:  # its next would have a name that is no plan's
                 place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
                 raise InputError(place, "", problem, "Move it away")
-            plan = Plan(n=n, created=created or now())
+            number, spec_hash = number + 1, self.manifest.spec_hash
+            plan = Plan(n=n, created=created or now(), spec_hash=spec_hash, number=number)
             # Losing this race means that another plan appeared: look again.
-            publish(self.storage, f"plans/{number + 1}.json", encode_record(plan))
+            publish(self.storage, f"plans/{number}.json", encode_record(plan))
 
     def plan(self) -> Plan | None:
         """The newest plan; None where a run was made and its first plan not yet."""
@@ -160,9 +162,11 @@ class Run:
         numbers = self._numbers("plans", width=1)
         if not numbers:
             return 0, 0
-        key = f"plans/{max(numbers)}.json"
-        plan = read_record(self.storage, key, Plan)
-        return (max(numbers), plan.n) if plan else self._newest_plan()
+        number = max(numbers)
+        plan = read_record(self.storage, key := f"plans/{number}.json", Plan)
+        if plan and (found := other_value(plan, spec_hash=self.manifest.spec_hash, number=number)):
+            raise InputError(f"{self.storage.url}/{key}", *found, "Mend it with `datagen repair`")
+        return (number, plan.n) if plan else self._newest_plan()
 
     # Shards and commits.
 

@@ -83,6 +83,9 @@ class Plan(StoredRecord):
 
     n: int = Field(ge=1, le=10**12)
     created: str
+    # Whose it is, and which; None in older records.
+    spec_hash: Digest | None = None
+    number: int | None = Field(default=None, ge=1)
 
 
 class Merged(StoredRecord):
@@ -160,14 +163,14 @@ class Commit(StoredRecord):
 
 def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
     """(field, problem) where a commit cannot be that of this shard of the run; None where it can."""
-    expected = {
-        "shard": shard,
-        "spec_hash": manifest.spec_hash,
-        "scenes": manifest.layout.scenes_per_shard,
-        "samples": manifest.layout.samples_per_shard,
-    }
+    scenes, samples = manifest.layout.scenes_per_shard, manifest.layout.samples_per_shard
+    return other_value(commit, shard=shard, spec_hash=manifest.spec_hash, scenes=scenes, samples=samples)
+
+
+def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:
+    """(field, problem) of the first field that has another value; None where each has its own or none."""
     for field, value in expected.items():
-        if (given := getattr(commit, field)) != value:
+        if (given := getattr(record, field)) not in (None, value):
             return field, f"{given}, where this run has {value}"
     return None
 

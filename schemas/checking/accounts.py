@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from schemas.checking.commits import odd_cost
+from schemas.checking.commits import account_finding, odd_cost
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.checking.records import read
 from schemas.ledger import lost_end, start_from_end
 from schemas.quarantine import name_before
 from schemas.record_files import encode_record, now
 from schemas.run import Run
-from schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord
+from schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
 
 _GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, at a cost unknown"
 
@@ -63,8 +63,7 @@ def _check_end(
         return
     noted = end.record
     if start.record is None:
-        cure = Restore(encode_record(start_from_end(noted)))
-        yield curable(start.key, "account", start.problem, cure, noted.shard)
+        yield account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
     if odd := odd_cost(noted.cost):
         mend = "Look at what wrote it: the record is as it was written"
         yield Finding(end.key, "account", odd, mend, noted.shard)
@@ -103,7 +102,10 @@ def check_quarantine(run: Run) -> Iterator[Finding]:
         record = read(run.storage, file.key, QuarantineRecord)
         problem = record.problem
         if record.record is not None:
-            problem = _misnamed(f"{record.record.shard:06d}.json", name_before(name))
+            shard = record.record.shard
+            problem = _misnamed(f"{shard:06d}.json", name_before(name))
+            first, seed = shard * run.layout.scenes_per_shard, run.manifest.spec.seed
+            problem = problem or ": ".join(other_value(record.record, seed=seed, first_scene=first) or ())
         if problem:
             yield Finding(file.key, "record", problem, mend)
 

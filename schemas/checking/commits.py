@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
 
 from schemas.checking.finding import Finding, Restore, curable
-from schemas.checking.records import Read, compare, read
+from schemas.checking.records import AnyRecord, Read, compare, read
+from schemas.errors import InputError
 from schemas.keys import commit_copy_key, commit_key
 from schemas.ledger import end_from_commit, end_key, start_from_end, start_key
-from schemas.record_files import encode_record
+from schemas.record_files import decode_record, encode_record
 from schemas.run import Run
 from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
-from schemas.storage import StoredFile
+from schemas.storage import Storage, StoredFile
 
 _ROUNDING = 1e-6
 _ROUNDING_S = 1e-3  # of clocks
@@ -33,12 +37,17 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Committ
     """
     ours = read(run.storage, commit_key(shard), Commit, lambda c: foreign_to(run, shard, c))
     if ours.record is not None:
-        copy_key = commit_copy_key(shard, ours.record.attempt)
-        copy = read(run.storage, copy_key, Commit)
-        return CommittedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
+        attempt = ours.record.attempt
+        copy = _copy(run, shard, attempt)
+        is_won = copy.data == ours.data or _says_committed(run, shard, attempt)
+        copies = [] if is_won else sound_copies(run, shard, listed)
+        if not any(c.record and _says_committed(run, shard, c.record.attempt) for c in copies):
+            return CommittedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
+        # The record of a loser, or of another run of the specification, has taken its place.
+        ours = Read(ours.key, ours.data, None, "is not that of the attempt that won")
     copies = sound_copies(run, shard, listed)
     if len(copies) > 1:  # losers that were killed left theirs too
-        copies = [c for c in copies if c.record is not None and _says_committed(run, c.record.attempt)]
+        copies = [c for c in copies if c.record and _says_committed(run, shard, c.record.attempt)]
     if len(copies) == 1:
         return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
@@ -56,10 +65,17 @@ def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Re
     for key in sorted(listed):
         names = key.split("/")
         if len(names) == 4 and names[3] == "commit.json":
-            copy = read(run.storage, key, Commit, lambda c: foreign_to(run, shard, c))
-            if copy.record is not None and copy.record.attempt == names[2]:
+            copy = _copy(run, shard, names[2])
+            if copy.record is not None:
                 found.append(copy)
     return found
+
+
+def _copy(run: Run, shard: int, attempt: str) -> Read[Commit]:
+    def refuse(commit: Commit) -> str:
+        return foreign_to(run, shard, commit) or "is another attempt's" * (commit.attempt != attempt)
+
+    return read(run.storage, commit_copy_key(shard, attempt), Commit, refuse)
 
 
 def foreign_to(run: Run, shard: int, commit: Commit) -> str:
@@ -87,15 +103,14 @@ def check_account(run: Run, commit: Commit) -> list[Finding]:
                 problem = f"{field}: is not that of the attempt's commit"
     if problem:
         known = end_from_commit(commit, start.record.started if start.record else "")
-        cure = Restore(encode_record(known))
-        findings.append(curable(end.key, "account", f"{problem}; it is known from the commit", cure, shard))
+        problem = f"{problem}; it is known from the commit"
+        findings.append(account_finding(run.storage, end, problem, known, shard))
     problem = start.problem
     if start.record is not None and (start.record.attempt, start.record.shard) != (commit.attempt, shard):
         problem = "is not that of this attempt"
     if problem:
-        known = end_from_commit(commit, end.record.started if end.record else "")
-        cure = Restore(encode_record(start_from_end(known)))
-        findings.append(curable(start.key, "account", problem, cure, shard))
+        known = start_from_end(end_from_commit(commit, end.record.started if end.record else ""))
+        findings.append(account_finding(run.storage, start, problem, known, shard))
     if odd := odd_cost(commit.cost):
         mend = "Look at what wrote it: the record is as it was written"
         findings.append(Finding(commit_key(shard), "account", odd, mend, shard))
@@ -116,6 +131,21 @@ def odd_cost(cost: Cost | None) -> str:
     return ""
 
 
-def _says_committed(run: Run, attempt: str) -> bool:
+def _says_committed(run: Run, shard: int, attempt: str) -> bool:
     end = read(run.storage, end_key(attempt), LedgerEntry).record
-    return end is not None and end.outcome == "committed"
+    return end is not None and (end.outcome, end.attempt, end.shard) == ("committed", attempt, shard)
+
+
+def account_finding(
+    storage: Storage, found: Read[Any], problem: str, known: BaseModel, shard: int
+) -> Finding:
+    """A record of the ledger that is wrong: cured by what is known, unless it is all there is of another."""
+    try:
+        other = decode_record("", found.data or b"", AnyRecord).model_extra or {}
+    except InputError:
+        other = {}
+    key_of = end_key if "outcome" in other else start_key
+    home = key_of(str(other.get("attempt"))[:100])
+    if "attempt" in other and home != found.key and read(storage, home, AnyRecord).data != found.data:
+        return Finding(found.key, "account", problem, f"It belongs at {home}: put each back", shard)
+    return curable(found.key, "account", problem, Restore(encode_record(known)), shard)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
 from schemas.at_once import in_order
@@ -21,12 +21,16 @@ from schemas.errors import InputError
 from schemas.run import Run
 from schemas.run_records import FileEntry
 from schemas.sealing import SEALED, seal
+from schemas.sealing.contents import read_contents
 from schemas.sealing.metadata import ROOT
 from schemas.shard_files import chunk_key
+from schemas.shard_reading import read_metadata
 from schemas.storage import Storage, StoredFile
 
 # Mending a record shows what rests on it: commits, then files, then the sealed store.
 _PASSES = 5
+# Findings on which it depends what rows there are.
+_UNDECIDED = ("record", "lost", "foreign", "sealed")
 
 RemakeShard = Callable[[Run, int], Mapping[str, bytes]]
 Seen = Callable[[int, int], None]
@@ -116,7 +120,10 @@ def _pass(
     if bad:
         files = _mend_files(place, remake, workers, bad, mended, refused)
     relink = bool(files) and mended.checked.is_sealed and place.folder is not None
-    if sealed or relink:
+    if any(finding.kind in _UNDECIDED for finding in mended.left):
+        why = "Mend the other findings first: nothing is sealed until they are decided"
+        mended.left += [replace(finding, mend=why, cure=None) for finding in sealed]
+    elif sealed or relink:
         done |= _mend_sealed(place, sealed, mended, refused)
     return done or bool(files)
 
@@ -264,6 +271,7 @@ def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refuse
     """Mend the sealed store: as a whole where one rename does it, else file by file."""
     roots = {SEALED, f"{SEALED}/{ROOT}"}
     try:
+        _refuse_fewer_rows(place)
         if place.folder is not None or any(
             f.key in roots and isinstance(f.cure, Reseal) and f.cure.data is None for f in findings
         ):
@@ -280,6 +288,20 @@ def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refuse
         mended.left += [_refused(finding, refused) for finding in findings]
         return False
     return True
+
+
+def _refuse_fewer_rows(place: Storage) -> None:
+    """Raise InputError where sealing would leave out rows that the store has by all of its arrays."""
+    contents = read_contents(place, check=False)
+    names = [field.name for field in contents.schema.sample_fields]
+    try:
+        held = min(array.shape[0] for array in read_metadata(place, SEALED, names).values())
+    except InputError:
+        return  # what is damaged says nothing
+    if (rows := contents.rows("sample")) < held:
+        problem = f"has {held} samples, and {rows} are committed and wanted"
+        mend = "Restore the plans or commits that it was laid over, or drop it with `datagen unseal`"
+        raise InputError(f"{place.url}/{SEALED}", "", problem, mend)
 
 
 def _mend_one(place: Storage, key: str, cure: Reseal) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from schemas.checking.finding import Finding, Restore, curable
 from schemas.errors import InputError
@@ -16,6 +16,12 @@ from schemas.storage import Storage
 Record = TypeVar("Record", bound=BaseModel)
 
 BACKUP = "Restore the file from a backup"
+
+
+class AnyRecord(BaseModel):
+    """A record of which only the signature is checked: nothing about data rests on it."""
+
+    model_config = ConfigDict(extra="allow")
 
 
 @dataclass(frozen=True, eq=False)

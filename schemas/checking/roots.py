@@ -5,27 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from pydantic import BaseModel, ConfigDict
-
 from schemas.checking.finding import Finding, Restore, curable
-from schemas.checking.records import compare, read, sound
+from schemas.checking.records import AnyRecord, compare, read, sound
 from schemas.errors import InputError
 from schemas.keys import MERGED, part_folder
 from schemas.lineage import LINEAGE, Lineage
 from schemas.record_files import encode_record
 from schemas.root_records import copy_key
 from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION, Manifest, Merged, Plan
+from schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
 from schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
 _BROKEN_OFF = "Merge the runs again: a merge was broken off, and the next one finishes it"
-
-
-class AnyRecord(BaseModel):
-    """A record of which only the signature is checked: nothing about data rests on it."""
-
-    model_config = ConfigDict(extra="allow")
 
 
 @dataclass
@@ -57,12 +49,9 @@ def open_roots(place: Storage) -> Roots:
         folder = part_folder(spec_hash)
         run, found = None, list[Finding]()
         if next(iter(place.list(folder)), None) is not None:
-            run, found = _open_run(place.below(folder))
+            run, found = _open_run(place.below(folder), spec_hash)
         if run is None and not found:
             found = [Finding(_MANIFEST, "record", "missing, and so is its copy", "Merge the runs again")]
-        elif run is not None and run.manifest.spec_hash != spec_hash:
-            found.append(Finding(_MANIFEST, "record", "is that of another run", "Merge the runs again"))
-            run = None
         roots.findings += [below(folder + "/", finding) for finding in found]
         if run is not None:
             roots.runs.append(run)
@@ -100,14 +89,32 @@ def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]
     return parts, [curable(MERGED, "record", f"{ours.problem}; its parts tell what it held", Restore(data))]
 
 
-def _open_run(storage: Storage) -> tuple[Run | None, list[Finding]]:
-    ours = read(storage, _MANIFEST, Manifest, _bad_hash)
-    copy = read(storage, copy_key(_MANIFEST), Manifest, _bad_hash)
+def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | None, list[Finding]]:
+    """The run, of this specification where one is given."""
+
+    def refuse(manifest: Manifest) -> str:
+        if spec_hash not in (None, manifest.spec_hash):
+            return "is that of another run"
+        return _bad_hash(manifest)
+
+    ours = read(storage, _MANIFEST, Manifest, refuse)
+    copy = read(storage, copy_key(_MANIFEST), Manifest, refuse)
     manifest = sound(ours, copy)
+    if ours.record and copy.record and ours.record.spec_hash != copy.record.spec_hash:
+        named = _named(storage)
+        if len(named) == 1 and named < {ours.record.spec_hash, copy.record.spec_hash}:
+            return _open_run(storage, named.pop())
     if manifest is None:
         return None, compare(ours, copy)
     _refuse_other_format(storage, _MANIFEST, manifest.format_version)
     return Run(storage, manifest), compare(ours, copy)
+
+
+def _named(storage: Storage) -> set[str]:
+    """The specifications that the commits and the plans of a run name."""
+    commits = (read(storage, file.key, Commit).record for file in storage.list("commits"))
+    plans = (read(storage, file.key, Plan).record for file in storage.list("plans"))
+    return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}
 
 
 def _bad_hash(manifest: Manifest) -> str:
@@ -139,7 +146,10 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
         return 0, [Finding("plans", "record", problem, "Move it away")]
     for number in range(1, max(numbers) + 1):
         key = f"plans/{number}.json"
-        ours, copy = read(run.storage, key, Plan), read(run.storage, copy_key(key), Plan)
+        ours, copy = (
+            read(run.storage, k, Plan, lambda plan, number=number: _foreign_plan(run, number, plan))
+            for k in (key, copy_key(key))
+        )
         found, plan = compare(ours, copy), sound(ours, copy)
         if plan is None and not found:
             found = [Finding(key, "record", "missing, and so is its copy", mend)]
@@ -151,6 +161,10 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
     if not n:
         findings.append(Finding("plans", "record", "no plan says how many samples are wanted", mend))
     return n, findings
+
+
+def _foreign_plan(run: Run, number: int, plan: Plan) -> str:
+    return ": ".join(other_value(plan, spec_hash=run.manifest.spec_hash, number=number) or ())
 
 
 def check_notes(storage: Storage) -> Iterator[Finding]:

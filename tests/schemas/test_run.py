@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from schemas.errors import InputError
-from schemas.record_files import signed_json
+from schemas.record_files import encode_record, signed_json
 from schemas.root_records import copy_key, publish
 from schemas.run import Run
-from schemas.run_records import FileEntry, Layout, LedgerEntry, QuarantineRecord
+from schemas.run_records import FileEntry, Layout, LedgerEntry, Plan, QuarantineRecord
 from schemas.storage import open_storage
 from tests.made_runs import commit_of, files_of, make_run, manifest_of, small_spec, write
 
@@ -49,7 +49,7 @@ def test_racing_plans_end_at_the_largest(tmp_path: Path):
 
 def test_a_plan_after_which_none_can_be_named_is_refused(tmp_path: Path):
     run = make_run(tmp_path, n=1, shards=[])
-    (tmp_path / f"plans/{10**18 - 1}.json").write_bytes((tmp_path / "plans/1.json").read_bytes())
+    (tmp_path / f"plans/{10**18 - 1}.json").write_bytes(encode_record(Plan(n=1, created="")))
     with pytest.raises(InputError, match=r"plans/9{18}\.json: no run has so many plans\. Move it away"):
         run.grow(2)
 

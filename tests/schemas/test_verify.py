@@ -15,7 +15,7 @@ from schemas.errors import InputError
 from schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
 from schemas.record_files import encode_record, signed_json
 from schemas.run import Run
-from schemas.run_records import Merged, QuarantineRecord
+from schemas.run_records import Merged, Plan, QuarantineRecord
 from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
@@ -112,6 +112,9 @@ def test_plans_that_are_gone_or_shrink(tmp_path: Path):
     assert found(folder) == [("record", "plans/2.json")]
     for key in ("plans/2.json", "copies/plans/2.json"):
         (folder / key).write_bytes((folder / "plans/1.json").read_bytes())
+    assert found(folder) == [("record", "plans/2.json"), ("record", "copies/plans/2.json")]
+    for key in ("plans/2.json", "copies/plans/2.json"):  # as one that does not name its number
+        (folder / key).write_bytes(encode_record(Plan(n=10, created="")))
     assert found(folder) == [("record", "plans/2.json")]
 
 

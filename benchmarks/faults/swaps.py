@@ -1,0 +1,55 @@
+"""Whole files that exchanged their places: what checks miss, and what mending gets wrong or loses.
+
+    python -m benchmarks.faults.swaps [--each 30]
+
+Two files of one sort exchange their names: records and their copies, and chunks of equal size; within a
+run, between the parts of a merged place, and between a sealed run, one that is not sealed and a merged
+place. After each swap the places are checked, mended and checked again. `restored`: every byte is as before.
+`left`: something is left to find, and nothing but the two files differs. Anything else is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from tests.faults.damage_campaign import fewer_arrays, findings_at
+from tests.faults.swap_campaign import PLACES, Swaps, make_world, swaps, try_swap
+
+
+def main() -> None:
+    """Print the table; ends with 1 where a promise was broken."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--each", type=int, default=30, help="pairs of each sort; 0 takes all")
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument(
+        "--folder", type=Path, help="where the runs are made [the system's temporary folder]"
+    )
+    chosen = options.parse_args()
+    with fewer_arrays(), tempfile.TemporaryDirectory(dir=chosen.folder) as folder:
+        clean, found, began_s = Path(folder) / "clean", Swaps(), time.perf_counter()
+        make_world(clean)
+        if any(findings_at(clean / place) for place in PLACES):
+            raise SystemExit("the sound places have findings")
+        for swap in swaps(clean, chosen.each or None, np.random.default_rng(chosen.seed)):
+            try_swap(clean, Path(folder) / "world", swap, found)
+    print(f"{'swapped':<26}{'tried':>10}{'restored':>10}{'left':>10}")
+    sums = Counter({"tried": 0})
+    for kind in sorted(found.tried):
+        print(f"{kind:<26}{found.tried[kind]:>10}{found.restored[kind]:>10}{found.left[kind]:>10}")
+        sums.update(tried=found.tried[kind], restored=found.restored[kind], left=found.left[kind])
+    print(f"{'all':<26}{sums['tried']:>10}{sums['restored']:>10}{sums['left']:>10}")
+    print(f"{len(found.wrong)} wrong; {time.perf_counter() - began_s:.0f} s")
+    for wrong in found.wrong[:50]:
+        print(wrong)
+    if found.wrong:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""Whole files that exchanged their places: found, and mended where something names what they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen import cli
+from schemas.errors import InputError
+from schemas.keys import commit_copy_key, commit_key
+from schemas.merged import open_runs
+from schemas.record_files import encode_record
+from schemas.run import Run
+from schemas.run_records import Plan
+from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, mend_at
+from tests.faults.swap_campaign import Swap, Swaps, exchange, make_world, swaps, try_swap
+from tests.made_runs import attempt, files_of, make_run, small_spec, write
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Runs of few files."""
+    with fewer_arrays():
+        yield
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three sound places. Tests only copy them."""
+    world = tmp_path_factory.mktemp("swaps") / "clean"
+    make_world(world)
+    return world
+
+
+def test_a_swap_of_each_kind_is_found_and_mended_or_left_whole(clean: Path, tmp_path: Path) -> None:
+    found = Swaps()
+    for swap in swaps(clean, 1, np.random.default_rng(3)):
+        try_swap(clean, tmp_path / "world", swap, found)
+    assert found.wrong == []
+    assert {"manifest.json", "plans", "commits", "commit copy", "copy of plans"} <= found.restored.keys()
+    assert found.left.keys() == {"start", "end", "quarantine"} and len(found.tried) > 10
+
+
+def test_the_campaign_sees_what_is_missed(clean: Path, tmp_path: Path) -> None:
+    found, equal = Swaps(), Swap("plans", "run/plans/1.json", "run/copies/plans/1.json")
+    try_swap(clean, tmp_path / "world", equal, found)
+    assert len(found.wrong) == 1 and "missed" in found.wrong[0]
+
+
+@pytest.mark.parametrize("folders", [("plans",), ("plans", "copies/plans")], ids=str)
+@pytest.mark.parametrize("is_old", [True, False], ids=["old", "new"])
+def test_a_sealed_place_is_not_sealed_over_plans_that_were_exchanged(
+    is_old: bool, folders: tuple[str, ...], clean: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy_run(clean / "merged", tmp_path / "merged")
+    one, other = (Path(run.storage.url) for run in open_runs(tmp_path / "merged"))
+    if is_old:  # plans as they were, which do not say whose they are
+        for part in (one, other):
+            for number in (1, 2):
+                run = Run.open(part)
+                plan = Plan(n=run.n - 9 * (2 - number), created="2026-01-01")
+                for folder in ("plans", "copies/plans"):
+                    (part / f"{folder}/{number}.json").write_bytes(encode_record(plan))
+        assert findings_at(tmp_path / "merged") == []
+    whole = files_of(tmp_path / "merged")
+    for folder in folders:
+        for number in (1, 2):
+            exchange(one / f"{folder}/{number}.json", other / f"{folder}/{number}.json")
+    before = files_of(tmp_path / "merged")
+    is_decided = not is_old and len(folders) == 1
+    if not is_old:
+        with pytest.raises(InputError, match=r"spec_hash.*datagen repair"):
+            _ = Run.open(one).n
+    assert cli.run(["verify", str(tmp_path / "merged")]) == 1
+    assert cli.run(["repair", str(tmp_path / "merged")]) == (0 if is_decided else 1)
+    assert files_of(tmp_path / "merged") == (whole if is_decided else before)
+    told = capsys.readouterr().out
+    assert is_decided or "plans/1.json" in told or "samples, and 20 are committed and wanted" in told
+
+
+def test_a_manifest_of_another_part_is_not_read(clean: Path, tmp_path: Path) -> None:
+    copy_run(clean / "merged", tmp_path / "merged")
+    whole = files_of(tmp_path / "merged")
+    one, other = (Path(run.storage.url) for run in open_runs(tmp_path / "merged"))
+    exchange(one / "manifest.json", other / "manifest.json")
+    with pytest.raises(InputError, match=r"spec_hash.*datagen repair"):
+        open_runs(tmp_path / "merged")
+    assert mend_at(tmp_path / "merged").left == []
+    assert files_of(tmp_path / "merged") == whole
+
+
+def test_a_commit_that_the_ledger_does_not_know_gives_way_to_the_winners(tmp_path: Path) -> None:
+    """One of another run of the specification, and one of an attempt that lost and was killed."""
+    for name in ("run", "twin"):
+        run = make_run(tmp_path / name, 20, shards=[], spec=small_spec(4))
+        for shard in run.missing():
+            assert attempt(run, shard, f"{name}-{shard}")
+    run = Run.open(tmp_path / "run")
+    run.storage.put(commit_copy_key(1, "loser"), encode_record(write(run, 1, "loser")))
+    whole = files_of(tmp_path)
+    exchange(tmp_path / "run" / commit_key(0), tmp_path / "twin" / commit_key(0))
+    exchange(tmp_path / "run" / commit_key(1), tmp_path / "run" / commit_copy_key(1, "loser"))
+    for name in ("run", "twin"):
+        assert {finding.key for finding in findings_at(tmp_path / name)} >= {commit_key(0)}
+        assert mend_at(tmp_path / name).left == []
+    after = files_of(tmp_path)
+    assert {key for key in whole if after.get(key) != whole[key]} == {f"run/{commit_copy_key(1, 'loser')}"}
+    assert after.keys() == whole.keys()  # the copy of the loser is garbage
