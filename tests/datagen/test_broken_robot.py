@@ -39,7 +39,7 @@ def test_it_is_refused_for_new_and_for_stored_scenes_and_leaves_no_run(
         command = [sys.executable, "-m", "datagen.cli", "submit", kind, "--n", "8", "--out", str(out)]
         asked = subprocess.run(
             [*command, "--robot", "panda", "--workers", "0", *more],
-            env=environment, capture_output=True, text=True, timeout=120, check=False,
+            env=environment, capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         assert asked.returncode == 2, asked.stderr
         (line,) = asked.stderr.splitlines()

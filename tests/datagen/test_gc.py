@@ -107,10 +107,10 @@ def test_what_is_young_stays(tmp_path: Path) -> None:
 
 def test_what_began_under_a_job_that_is_at_work_stays(tmp_path: Path) -> None:
     run, _ = littered(tmp_path)
+    age_all(run, 60)
     jobs = Jobs(run.storage)
     jobs.begin(JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=now(), address="local"))
     write(run, 4, "at-work")
-    time.sleep(0.01)
     found = {piece.key for piece in find_garbage(run.storage, 0, time.time())}
     assert shard_folder(4, "at-work") not in found and shard_folder(1, "late") in found
 
@@ -254,7 +254,7 @@ class Turns:
 
     def take(self, who: bool, do: Callable[[], Any]) -> Any:
         with self.changed:
-            self.changed.wait_for(lambda: self.whose() == who, timeout=30)
+            assert self.changed.wait_for(lambda: self.whose() == who, timeout=600)
             try:
                 return do()
             finally:
@@ -337,7 +337,7 @@ def test_a_commit_that_stands_has_its_files(script: list[bool], dies_at: int | N
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(60)
+        thread.join(600)
     run, swept = Run.open(storage), answers["swept"]
     died_after_its_put = isinstance(answers["commit"], KeyboardInterrupt) and "put_new" in theirs.calls
     if run.committed() == {3}:

@@ -32,7 +32,7 @@ for arguments in json.loads(sys.argv[1]):
 def datagen_without_sim(*commands: list[str]) -> subprocess.CompletedProcess[str]:
     """These commands one after another, up to the first that fails."""
     command = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_heuristic_labels_are_made_shown_and_audited_without_it(tmp_path: Path) -> None:

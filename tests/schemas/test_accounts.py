@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def restored(finding: Finding, model: type[Any]) -> Any:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("attempt", "x"), ("shard", 0), ("outcome", "failed"), ("cost", COST.model_dump()), ("cost", None)],
+    [("shard", 0), ("outcome", "failed"), ("cost", COST.model_dump()), ("cost", None)],
 )
 def test_an_end_that_is_not_its_commits_follows_from_the_commit(run: Run, field: str, value: Any) -> None:
     edit(folder_of(run) / "ledger/a-1.json", **{field: value})
@@ -63,9 +64,19 @@ def test_an_end_that_is_not_its_commits_follows_from_the_commit(run: Run, field:
     assert restored(finding, LedgerEntry) == end_from_commit(run.commit_of(1), start.started)
 
 
-@pytest.mark.parametrize("changes", [{"attempt": "x"}, {"shard": 0}])
-def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run, changes: dict[str, Any]) -> None:
-    edit(folder_of(run) / "ledger/a-1.start.json", **changes)
+@pytest.mark.parametrize("ending", [".json", ".start.json"])
+def test_the_only_record_of_another_attempt_is_not_overwritten(run: Run, ending: str) -> None:
+    edit(folder_of(run) / f"ledger/a-1{ending}", attempt="x")
+    finding = only(run)
+    assert (finding.key, finding.cure) == (f"ledger/a-1{ending}", None)
+    assert f"belongs at ledger/x{ending}" in finding.mend
+    shutil.copy(folder_of(run) / f"ledger/a-1{ending}", folder_of(run) / f"ledger/x{ending}")
+    findings, _ = check(folder_of(run))
+    assert isinstance(next(f for f in findings if f.key == finding.key).cure, Restore)
+
+
+def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run) -> None:
+    edit(folder_of(run) / "ledger/a-1.start.json", shard=0)
     finding = only(run)
     assert (finding.key, finding.problem) == ("ledger/a-1.start.json", "is not that of this attempt")
     assert restored(finding, AttemptStart) == AttemptStart(attempt="a-1", shard=1, started="then", host="h")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -34,10 +35,28 @@ def test_results_come_in_order_and_items_are_taken_as_they_are_needed(
     assert (taken, given_back) == (n, n)
 
 
+class _Pool(ThreadPoolExecutor):
+    """One that knows what was asked of it."""
+
+    def __init__(self, threads: int) -> None:
+        super().__init__(threads)
+        self.asked: list[Future[Any]] = []
+
+    def submit(self, *arguments: Any, **named: Any) -> Future[Any]:
+        self.asked.append(super().submit(*arguments, **named))
+        return self.asked[-1]
+
+    def let_go_when_cancelled(self, event: threading.Event) -> None:
+        """Set the event once the last that was asked is cancelled: then all that waited are."""
+        while len(self.asked) < 4 or not self.asked[-1].cancelled():
+            time.sleep(0.001)
+        event.set()
+
+
 @pytest.mark.parametrize("by", ["failure", "leaving"])
 def test_nothing_is_under_way_when_it_has_ended(by: str) -> None:
     begun, ended = set[int](), set[int]()
-    second = threading.Event()
+    second, let_end = threading.Event(), threading.Event()
 
     def do(i: int) -> int:
         begun.add(i)
@@ -47,12 +66,13 @@ def test_nothing_is_under_way_when_it_has_ended(by: str) -> None:
                 raise ValueError("the first")
         else:
             second.set()
-            time.sleep(0.05)
+            assert let_end.wait(600)
         ended.add(i)
         return i
 
-    with ThreadPoolExecutor(2) as pool:
+    with _Pool(2) as pool:
         results = in_order(pool, 4, do, range(9))
+        threading.Thread(target=lambda: pool.let_go_when_cancelled(let_end), daemon=True).start()
         if by == "failure":
             with pytest.raises(ValueError, match="the first"):
                 next(results)

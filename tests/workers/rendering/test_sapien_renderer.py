@@ -65,7 +65,7 @@ def test_without_a_render_device_the_error_names_the_mend() -> None:
         env={**os.environ, **nowhere},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=True,
     )
     assert done.stdout.startswith("--renderer: sapien: no render device")

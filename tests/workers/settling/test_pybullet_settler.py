@@ -116,7 +116,7 @@ def test_two_processes_agree_bit_for_bit() -> None:
     queue = context.Queue()
     process = context.Process(target=_poses_in_a_new_process, args=(queue,))
     process.start()
-    other = queue.get(timeout=60)
+    other = queue.get(timeout=600)
     process.join()
     models, poses = three_objects()
     settle(models[::-1], poses[::-1])  # what came before leaves nothing behind

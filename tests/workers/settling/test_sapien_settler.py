@@ -61,7 +61,7 @@ def test_two_processes_agree_bit_for_bit() -> None:
     queue = context.Queue()
     process = context.Process(target=_poses_in_a_new_process, args=(queue,))
     process.start()
-    other = queue.get(timeout=60)
+    other = queue.get(timeout=600)
     process.join()
     np.testing.assert_array_equal(settle(*three_objects()).T_world_object, other)
 
