@@ -21,7 +21,7 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         where = f"{self.place}: {self.field}" if self.field else self.place
-        return " ".join(f"{where}: {self.problem}. {self.mend}".split())
+        return one_line(f"{where}: {self.problem}. {self.mend}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
         # Exceptions cross process borders; the default would call __init__ with one argument.
@@ -36,6 +36,18 @@ def refuse_not_utf8(text: str) -> str:
         mend = "Rename it, or reach it through a link in UTF-8"
         raise InputError(repr(text)[:300], "", "the name is not UTF-8", mend) from None
     return text
+
+
+def printable(text: str) -> str:
+    """The text with each character that a terminal or a page acts on as its escape: \\x1b, \\u202e."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """The text on one line, printable, without runs of spaces."""
+    return printable(" ".join(text.split()))
 
 
 def choices(valid: object) -> str:

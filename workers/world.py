@@ -63,12 +63,20 @@ class World:
     target_names: list[str]
     _houses: OrderedDict[str, PreparedHouse] = field(default_factory=OrderedDict)
     _objects: dict[str, PreparedObject] = field(default_factory=dict)
+    _bad_houses: dict[str, tuple[str, str, str, str]] = field(default_factory=dict)
 
     def house(self, house_id: str) -> PreparedHouse:
         if house_id in self._houses:
             self._houses.move_to_end(house_id)
             return self._houses[house_id]
-        prepared = PreparedHouse(self.houses.load(house_id))
+        if house_id in self._bad_houses:
+            raise InputError(*self._bad_houses[house_id])
+        try:
+            prepared = PreparedHouse(self.houses.load(house_id))
+        except InputError as error:
+            # A scene may draw it as often as it may retry.
+            self._bad_houses[house_id] = (error.place, error.field, error.problem, error.mend)
+            raise
         self._houses[house_id] = prepared
         if len(self._houses) > _HOUSES_KEPT:
             self._houses.popitem(last=False)

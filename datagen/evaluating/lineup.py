@@ -37,7 +37,7 @@ def read_heuristic(path: Path, places: Sequence[Place], allow_seen_houses: bool)
     InputError where it has none, and where it says that they were fitted to one of `places`.
     """
     mend = "Give the file that `datagen calibrate` wrote"
-    section = read_toml(path, "--heuristic", mend).get("heuristic")
+    section = read_toml(path, mend).get("heuristic")
     if not isinstance(section, dict):
         raise InputError(path, "heuristic", "there is no such section", mend)
     fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))

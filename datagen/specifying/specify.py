@@ -19,6 +19,7 @@ from datagen.specifying.arms import (
     robot_of,
 )
 from schemas.errors import InputError, choices
+from schemas.foreign_files import read_regular
 from schemas.run_records import Layout
 from schemas.specification import Source, Specification
 from workers.houses.house import HouseSource
@@ -31,6 +32,7 @@ from workers.settling import SETTLERS, first_settler, load_settler
 Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
 
 _MAX_CONFIG_BYTES = 1 << 20
+_MAX_DEPTH = 16
 # Distributions whose version can move bits of a sample, by the engine that needs them.
 _ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
 _SCENES_PER_SHARD = 32
@@ -159,26 +161,28 @@ def scene_engines(spec: Specification) -> dict[str, str]:
     return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 
 
-def read_toml(
-    path: Path, option: str = "--config", mend: str = "Give a TOML file as docs/specification.md shows it"
-) -> dict[str, Any]:
+def read_toml(path: Path, mend: str = "Give a TOML file as docs/specification.md shows it") -> dict[str, Any]:
     """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
-    if "\0" in str(path) or (path.exists() and not path.is_file()):
-        raise InputError(repr(str(path)), option, "is not a file", mend)  # a device has no end
+    data = read_regular(path, _MAX_CONFIG_BYTES, mend)
     try:
-        size = path.stat().st_size
-        if size > _MAX_CONFIG_BYTES:
-            raise InputError(path, "", f"{size} bytes is too large for a configuration", mend)
-        text = path.read_text("utf-8")
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read: {error.strerror}", mend) from None
-    except UnicodeDecodeError as error:
+        return parse_toml(data.decode())
+    except ValueError as error:
         raise InputError(path, "", f"is not TOML: {error}", mend) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """What TOML text holds. ValueError where it is none, or nested more deeply than any configuration."""
     try:
-        return tomllib.loads(text)
-    # A number of too many digits is a plain ValueError; broken TOML is one too.
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "", f"is not TOML: {error}", mend) from None
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level: list[Any] = [document]
+    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond what can be printed
+        tables = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [value for table in tables for value in table if isinstance(value, dict | list)]
+    if level:
+        raise ValueError("nested too deeply")
+    return document
 
 
 def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:

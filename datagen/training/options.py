@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from datagen.specifying.specify import read_toml
+from datagen.specifying.specify import parse_toml, read_toml
 from schemas.errors import InputError, choices
 
 if TYPE_CHECKING:
@@ -26,11 +25,11 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
-            sizes |= read_toml(Path(word), "--model-config", _MEND)
+            sizes |= read_toml(Path(word), _MEND)
             continue
         try:
-            sizes[name.strip()] = tomllib.loads(f"value = {text}")["value"]
-        except (ValueError, RecursionError):
+            sizes[name.strip()] = parse_toml(f"value = {text}")["value"]
+        except ValueError:
             sizes[name.strip()] = text
     return sizes
 
@@ -44,7 +43,7 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
     asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
     if word.endswith(".toml"):
-        asked = read_toml(Path(word), "--augment", _MEND)
+        asked = read_toml(Path(word), _MEND)
     effects: dict[str, Any] = {}
     for name, values in asked.items():
         if name not in kinds:

@@ -13,6 +13,7 @@ Frame of the files: right-handed, y up; world (x, y, z) = (x, -z, y). Rotations 
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -21,10 +22,11 @@ from typing import Any, cast
 import numpy as np
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular, read_regular
 from schemas.identity import digest_of
 from workers.geometry.mesh import F32, F64, Mesh
 from workers.houses.floors import MAX_CORNERS, clean_polygon
-from workers.houses.glb import read_glb
+from workers.houses.glb import MAX_FILE_BYTES, read_glb
 from workers.houses.house import Body, House, Room, Surface
 from workers.houses.layout import CARRYING_TYPES
 from workers.houses.loader import room_ids_at
@@ -35,7 +37,7 @@ _SUFFIX = ".scene_instance.json"
 _SCENES = Path("ai2thor-hab/configs/scenes")
 _OBJECTS = Path("ai2thorhab-uncompressed/assets")
 _CONFIGS = Path("ai2thorhab-uncompressed/configs")
-_MAX_SCENES = 200_000
+_MAX_FILES = 200_000  # of one kind
 _MAX_SCENE_BYTES = 16 << 20
 _MAX_OBJECTS = 5000
 _KEPT_MESHES = 512
@@ -84,7 +86,7 @@ class Ai2thorHouses:
         if house_id not in self.scenes:
             raise InputError(self.root, "", f"no house {house_id!r}", "Choose an id that it holds.")
         path = self.scenes[house_id]
-        text = _read(path, _MAX_SCENE_BYTES)
+        text = read_regular(path, _MAX_SCENE_BYTES, _MEND)
         scene = parse_json(text, str(path))
         digest = hashlib.sha256(text)
         stage, is_stage_turned = self._stage(scene, house_id)
@@ -127,7 +129,7 @@ class Ai2thorHouses:
             return self._templates[file]
         mesh = read_glb(file)
         mesh = mesh.transformed(_Y_UP_TO_WORLD)
-        with file.open("rb") as stream:
+        with open_regular(file, MAX_FILE_BYTES, _MEND) as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         is_stage = "stages" in file.relative_to(self.root).parts  # the folder above may have any name
         template = _Template(mesh, () if is_stage else convex_parts(mesh), digest)
@@ -153,7 +155,7 @@ class Ai2thorHouses:
         """The object type by the semantic id of the template's configuration, else by its name."""
         config = self.root / _CONFIGS / f"{name}.object_config.json"
         if config.is_file():
-            found = parse_json(_read(config, 1 << 20), str(config)).find("semantic_id")
+            found = parse_json(read_regular(config, 1 << 20, _MEND), str(config)).find("semantic_id")
             if found is not None:
                 known = self.types.get(int(found.number(-1, 1e9)))
                 if known is not None:
@@ -177,38 +179,42 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     if root is None:
         raise InputError(folder or "ai2thor", "", "no ai2thor-hab/configs/scenes folder in it", mend)
     top = root / _SCENES
-    scenes = {
-        p.relative_to(top).as_posix().removesuffix(_SUFFIX): p for p in sorted(top.rglob(f"*{_SUFFIX}"))
-    }
-    if not scenes or len(scenes) > _MAX_SCENES:
-        raise InputError(top, "", f"{len(scenes)} scenes where 1 to {_MAX_SCENES} belong", mend)
-    listing = [[i, scenes[i].stat().st_size] for i in sorted(scenes)]
+    sizes = {p.relative_to(top).as_posix().removesuffix(_SUFFIX): n for p, n in _sizes(top, f"*{_SUFFIX}")}
+    if not sizes:
+        raise InputError(top, "", "no scenes in it", mend)
+    listing: list[list[object]] = [[i, sizes[i]] for i in sorted(sizes)]
     places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
-    files = sorted(p for part, pattern in places for p in (root / part).rglob(pattern))
-    listing += [[p.relative_to(root).as_posix(), p.stat().st_size] for p in files]
-    ordered = {i: scenes[i] for i in sorted(scenes)}
+    files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
+    listing += [[p.relative_to(root).as_posix(), n] for p, n in files]
     types = _types(root)
-    return Ai2thorHouses(root, digest_of([listing, sorted(types.items())]), ordered, types)
+    scenes = {i: top / f"{i}{_SUFFIX}" for i in sorted(sizes)}
+    return Ai2thorHouses(root, digest_of([listing, sorted(types.items())]), scenes, types)
+
+
+def _sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
+    """The files below a folder with their sizes. Raises InputError where there are too many, or odd ones."""
+    try:
+        found = [(p, p.stat().st_size) for p in itertools.islice(folder.rglob(pattern), _MAX_FILES + 1)]
+    except OSError as error:
+        raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _MEND) from None
+    odd = next((p for p, _ in found if not p.relative_to(folder).as_posix().isprintable()), None)
+    if odd is not None:
+        raise InputError(odd, "", "a file name with unprintable characters", "Rename the file.")
+    if len(found) > _MAX_FILES:
+        raise InputError(folder, "", f"more than {_MAX_FILES:,} files", "Take some out.")
+    return sorted(found)
 
 
 def _types(root: Path) -> dict[int, str]:
     path = root / "ai2thor-hab/configs/object_semantic_id_mapping.json"
     if not path.is_file():
         return {}
-    node = parse_json(_read(path, 1 << 20), str(path))
+    node = parse_json(read_regular(path, 1 << 20, _MEND), str(path))
     members = cast(dict[str, Any], node.value) if isinstance(node.value, dict) else {}
-    return {int(Node(str(path), f"$.{k}", v).number(-1, 1e9)): k for k, v in members.items()}
-
-
-def _read(path: Path, limit: int) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            text = stream.read(limit + 1)
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
-    if len(text) > limit:
-        raise InputError(path, "", f"larger than {limit >> 20} MiB", _MEND)
-    return text
+    place = str(path)
+    return {
+        int(Node(place, f"$.{k}", v).number(-1, 1e9)): Node(place, "$", k).text() for k, v in members.items()
+    }
 
 
 def _template_name(entry: Node) -> str:

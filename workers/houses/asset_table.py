@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.houses.reading import Node, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
@@ -37,16 +38,11 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     Reads `asset_sizes.json` ({assetId: {objectType, size}}), or else AI2-THOR's own
     `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list).
     """
-    path = next((folder / name for name in TABLE_NAMES if (folder / name).is_file()), None)
+    path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
     mend = "Put asset_sizes.json beside the houses; `datagen assets fetch` brings both."
     if path is None:
         raise InputError(folder, "", f"no size table ({' or '.join(TABLE_NAMES)})", mend)
-    try:
-        if path.stat().st_size > _LARGEST_TABLE_BYTES:
-            raise InputError(path, "", "the size table is larger than 64 MiB", mend)
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
+    text = read_regular(path, _LARGEST_TABLE_BYTES, mend)
     root = parse_json(text, str(path))
     assets = [_own_entry(node) if own else _thor_entry(node) for node, own in _entries(root)]
     if not assets:
@@ -74,7 +70,8 @@ def _entries(root: Node) -> Iterator[tuple[Node, bool]]:
 
 
 def _own_entry(node: Node) -> Asset:
-    asset_id, value = node.value
+    key, value = node.value
+    asset_id = Node(node.place, node.path, key).text()
     entry = Node(node.place, node.path, value)
     sides = [_side(s) for s in entry.get("size").items(3)]
     if len(sides) != 3:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import io
 import struct
 from pathlib import Path
 from typing import Any, cast
@@ -12,18 +12,21 @@ import trimesh
 from PIL import Image
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.geometry.mesh import F64, U8, Mesh
+from workers.houses.reading import parse_json
 
 MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000
-_MAX_COUNT = 50_000_000
+_MAX_COUNT = 10_000_000  # positions, normals, colours and indices of MAX_FACES loose triangles are fewer
+_MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
 _PLAIN = (180, 178, 174)
 _MEND = "Download the asset again, or remove the scenes that use it."
 # What a damaged file makes the reader stumble over.
 _DAMAGE = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, struct.error, RecursionError,
-    ZeroDivisionError, OverflowError, Image.DecompressionBombError,
+    NotImplementedError, ZeroDivisionError, OverflowError, Image.DecompressionBombError,
 )  # fmt: skip
 
 
@@ -32,38 +35,42 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
-    _check_header(path)
+    data = read_regular(path, MAX_FILE_BYTES, _MEND)
+    _check_header(path, data)
     try:
-        scene = cast(Any, trimesh.load_scene(str(path), file_type="glb", skip_materials=False))
-        pieces = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
-        count = sum(len(m.faces) for m in pieces)
+        # From memory, so that no address in the file is followed to another one.
+        scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type="glb", skip_materials=False))
+        placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+        # Counted before meshes are copied to each of their places.
+        count = sum(len(m.faces) for m in placed if isinstance(m, trimesh.Trimesh))
         if 0 < count <= MAX_FACES:
-            return _merged(pieces)
+            return _merged([m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)])
     except _DAMAGE as error:
         raise InputError(path, "", f"a damaged glTF file ({type(error).__name__})", _MEND) from None
     problem = "no triangles" if count == 0 else f"{count} triangles, more than {MAX_FACES}"
     raise InputError(path, "", problem, _MEND)
 
 
-def _check_header(path: Path) -> None:
-    """Refuse by size and by the counts that the file itself states, before anything is unpacked."""
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as stream:
-            head = stream.read(20)
-            length = min(int.from_bytes(head[12:16], "little"), size)
-            text = stream.read(length) if size <= MAX_FILE_BYTES else b""
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})", _MEND) from None
-    if size > MAX_FILE_BYTES:
-        raise InputError(path, "", f"more than {MAX_FILE_BYTES >> 20} MiB", _MEND)
-    if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
+def _check_header(path: Path, data: bytes) -> None:
+    """Refuse by the counts that the file itself states, before anything is unpacked."""
+    if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise InputError(path, "", "not a binary glTF file", _MEND)
+    length = int.from_bytes(data[12:16], "little")
+    if length > _MAX_JSON_BYTES:
+        raise InputError(path, "", f"a description of {length:,} bytes", _MEND)
+    root = parse_json(data[20 : 20 + length], str(path))
     try:
-        counts = [int(a["count"]) for a in json.loads(text).get("accessors", [])]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        counts = [int(a["count"]) for a in root.value.get("accessors", [])]
+        # Each primitive is a mesh of its own, also where many name the same numbers.
+        for primitive in (p for m in root.value.get("meshes", []) for p in m["primitives"]):
+            named = [
+                *primitive["attributes"].values(),
+                *[primitive[k] for k in ("indices",) if k in primitive],
+            ]
+            counts += [counts[k] for k in named]
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
         raise InputError(path, "", "its description is not valid glTF", _MEND) from None
-    if counts and (max(counts) > _MAX_COUNT or min(counts) < 0 or sum(counts) > 4 * _MAX_COUNT):
+    if counts and (min(counts) < 0 or sum(counts) > _MAX_COUNT):
         raise InputError(path, "accessors", "absurd counts of vertices or indices", _MEND)
 
 

@@ -3,19 +3,18 @@
 A compressed file is unpacked once into the cache folder and mapped into memory, so that all
 workers of a machine share its pages. The index (offset, length, sha256 and id of every line) lies
 beside it. Both are named by the digest of the source file and appear by an atomic rename; the
-index comes last, so that its presence means both are whole.
+index comes last, so that its presence means both are whole. Files that are not used for a day are
+dropped, the longest unused first, where there are more than 64.
 """
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import hashlib
 import itertools
 import mmap
 import os
 import re
-import tempfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,17 +25,23 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular, read_regular
 from schemas.identity import canonical_json
-from workers.content_cache import cache_folder, read_arrays, write_arrays
+from workers.content_cache import cache_folder, drop_unused, read_arrays, refresh, whole_file, write_arrays
 from workers.houses.reading import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
+MAX_LINES = 500_000  # fifty times the known sets; each takes half a kilobyte of memory
 _MAX_FILE_BYTES = 64 << 30
+# Houses take a twentieth of their size when compressed; what unpacks to far more was made to fill a disk.
+_MAX_UNPACKED_BYTES, _MAX_RATIO = 256 << 20, 100
 _MAX_IN_MEMORY_BYTES = 2 << 30
 _FORMAT = 2  # raise it when the layout of the cached files changes
 _ID_KEY = re.compile(rb'"_id"\s*:\s*"([^"\\]{1,200})"')
 _MEND = "Restore the file from its source."
-_MAX_INDEX_BYTES = 4 << 30
+_MAX_INDEX_BYTES = 512 * MAX_LINES
+_MOST_CACHED = 64  # files: unpacked houses and their indexes
+_IDLE_S = 86_400.0
 _LAYOUT = {
     "spans": (np.int64, ("lines", 2)),
     "digests": (np.uint8, ("lines", 32)),
@@ -51,7 +56,7 @@ class LineIndex:
     """Lines of one file: `data` holds the bytes, the arrays where each line lies in them."""
 
     path: Path
-    data: mmap.mmap | bytes
+    data: mmap.mmap | bytearray
     spans: npt.NDArray[np.int64]  # (N, 2): offset, length
     digests: npt.NDArray[np.uint8]  # (N, 32): sha256 of each line
     ids: list[str]  # "" where a line names no id of its own
@@ -63,7 +68,7 @@ class LineIndex:
         Raises InputError where the source file has lost the line too.
         """
         offset, length = (int(v) for v in self.spans[row])
-        text = self.data[offset : offset + length]
+        text = bytes(self.data[offset : offset + length])
         if self._is_row(row, text):
             return text
         # The unpacked copy was damaged. Passing the house over would give other scenes in silence.
@@ -115,44 +120,41 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     if path.suffix == ".json":
         yield from _documents(path)
         return
-    total = 0
-    with path.open("rb") as file, _unpacked(path, file) as stream:
+    with open_regular(path, _MAX_FILE_BYTES, _MEND) as file:
+        room, stream = _MAX_FILE_BYTES, cast(IO[bytes], file)
+        if path.suffix == ".gz":
+            room = _MAX_UNPACKED_BYTES + _MAX_RATIO * os.fstat(file.fileno()).st_size
+            stream = cast(IO[bytes], gzip.GzipFile(fileobj=file, mode="rb"))
         for number in itertools.count(1):
             line = stream.readline(MAX_LINE_BYTES + 1)
             if not line:
                 return
-            total += len(line)
-            if len(line) > MAX_LINE_BYTES or total > _MAX_FILE_BYTES:
-                problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB, or a file of more than 64 GiB"
+            room -= len(line)
+            if len(line) > MAX_LINE_BYTES or number > MAX_LINES or room < 0:
+                problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB"
+                if len(line) <= MAX_LINE_BYTES:
+                    problem = f"more than {MAX_LINES:,} lines" if room >= 0 else "it unpacks to far too much"
                 raise InputError(f"{path}:{number}", "", problem, _MEND)
             if line := line.strip():
                 yield number, line
 
 
-def _unpacked(path: Path, file: IO[bytes]) -> IO[bytes]:
-    return cast(IO[bytes], gzip.GzipFile(fileobj=file, mode="rb")) if path.suffix == ".gz" else file
-
-
 def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
     """A .json file is one house, or a list of houses, each of which counts as a line."""
-    with path.open("rb") as stream:
-        text = stream.read(MAX_LINE_BYTES * 4 + 1)
-    if len(text) > MAX_LINE_BYTES * 4:
-        raise InputError(path, "", "a JSON file of more than 64 MiB", "Store one house a line (.jsonl).")
-    text = text.strip()
+    text = read_regular(path, MAX_LINE_BYTES * 4, "Store one house a line (.jsonl).").strip()
     if not text.startswith(b"["):
         yield 1, text
         return
     root = parse_json(text, str(path))
-    for number, node in enumerate(root.items(1_000_000), 1):
+    for number, node in enumerate(root.items(MAX_LINES), 1):
         try:
             yield number, canonical_json(node.value).encode()
-        except ValueError:
+        except (ValueError, RecursionError):
             raise node.error("NaN or infinity in a list of houses", "Store one house a line.") from None
 
 
 def _file_digest(path: Path) -> str:
-    with path.open("rb") as stream:
+    with open_regular(path, _MAX_FILE_BYTES, _MEND) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -198,7 +200,7 @@ class _Collector:
         }
 
 
-def _index(path: Path, data: mmap.mmap | bytes, arrays: dict[str, npt.NDArray[Any]]) -> LineIndex:
+def _index(path: Path, data: mmap.mmap | bytearray, arrays: dict[str, npt.NDArray[Any]]) -> LineIndex:
     count = len(arrays["spans"])
     ids = arrays["ids"].tobytes().decode().split("\n") if count else []
     return LineIndex(path, data, arrays["spans"], arrays["digests"], ids, arrays["numbers"])
@@ -219,7 +221,9 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
         if data_path.stat().st_size != size:
             return None
         with data_path.open("rb") as stream:
-            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else bytearray()
+        refresh(data_path)
+        refresh(index_path)
         return _index(path, data, arrays)
     except (OSError, ValueError):
         return None  # absent or damaged: it is built anew
@@ -229,71 +233,26 @@ def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
     """Unpacks into the cache; None where the cache cannot take it (full, gone, read-only)."""
     data_path, index_path = _names(cache, digest)
     collector = _Collector()
-    with _Scratch(cache) as scratch:
-        for number, line in _lines(path):
-            if not scratch.write(line + b"\n"):
-                return None
-            collector.add(number, line)
-        if not scratch.finish(data_path):
-            return None
+    try:
+        with whole_file(data_path) as file:
+            for number, line in _lines(path):
+                file.write(line + b"\n")
+                collector.add(number, line)
+    except OSError:
+        return None  # where the source is at fault, reading it into memory reports that
     if not write_arrays(index_path, collector.arrays()):
         return None
+    drop_unused(cache, _MOST_CACHED, _IDLE_S)
     return _from_cache(path, cache, digest)
-
-
-class _Scratch:
-    """A file that appears under its name when it is whole, or not at all.
-
-    Its methods return False when the cache cannot take the data, so that the errors of the cache
-    are not mistaken for those of the source that is being read meanwhile.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._path: Path | None = None
-        try:
-            descriptor, name = tempfile.mkstemp(dir=folder, prefix="part-")
-        except OSError:
-            return
-        self._path = Path(name)
-        self._stream = os.fdopen(descriptor, "wb")
-
-    def __enter__(self) -> _Scratch:
-        return self
-
-    def write(self, data: bytes) -> bool:
-        if self._path is None:
-            return False
-        try:
-            self._stream.write(data)
-        except OSError:
-            return False
-        return True
-
-    def finish(self, final: Path) -> bool:
-        if self._path is None:
-            return False
-        try:
-            self._stream.close()
-            self._path.replace(final)
-        except OSError:
-            return False
-        return True
-
-    def __exit__(self, *_: object) -> None:
-        if self._path is None:
-            return
-        with contextlib.suppress(OSError):  # a full disk also fails to flush what is thrown away
-            self._stream.close()
-        self._path.unlink(missing_ok=True)
 
 
 def _build_in_memory(path: Path) -> LineIndex:
     collector = _Collector()
-    lines: list[bytes] = []
+    data = bytearray()
     for number, line in _lines(path):
         collector.add(number, line)
-        lines.append(line)
+        data += line + b"\n"
         if collector.offset > _MAX_IN_MEMORY_BYTES:
             mend = "Set DATAGEN_CACHE to a folder with room for the unpacked houses."
             raise InputError(path, "", "too large to unpack in memory", mend)
-    return _index(path, b"\n".join(lines) + b"\n", collector.arrays())
+    return _index(path, data, collector.arrays())

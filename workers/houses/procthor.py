@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +13,7 @@ from schemas.identity import digest_of
 from workers.houses.asset_table import TABLE_NAMES, Asset, read_asset_table
 from workers.houses.colours import hash_bytes
 from workers.houses.house import House
-from workers.houses.line_index import LineIndex, houses_cache, open_lines
+from workers.houses.line_index import MAX_LINES, LineIndex, houses_cache, open_lines
 from workers.houses.loader import build_house
 from workers.houses.reading import parse_json
 
@@ -65,17 +67,23 @@ def open_procthor(folder: str) -> ProcthorHouses:
     if not folder or not path.is_dir():
         raise InputError(folder or "procthor", "", "no such folder of houses", mend)
     assets, table = read_asset_table(path)
-    names = sorted(
-        p.name for p in path.iterdir()
-        if p.name.endswith(_SUFFIXES) and p.name not in _NOT_HOUSES and p.is_file()
-    )  # fmt: skip
+    with os.scandir(path) as entries:
+        found = (e.name for e in entries if e.name.endswith(_SUFFIXES) and e.name not in _NOT_HOUSES)
+        names = sorted(itertools.islice(found, _MAX_FILES + 1))
     if not names:
         raise InputError(path, "", "no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
     if len(names) > _MAX_FILES:
-        raise InputError(path, "", f"{len(names)} files, more than {_MAX_FILES}", "Join them as JSON lines.")
+        raise InputError(path, "", f"more than {_MAX_FILES} files", "Join them as JSON lines.")
     cache = houses_cache()
-    # Single small files are read where they lie; only what holds many houses is worth unpacking.
-    files = [open_lines(path / n, None if n.endswith(".json") else cache) for n in names]
+    files, houses = list[LineIndex](), 0
+    for name in names:
+        if not name.isprintable():
+            raise InputError(path, name, "a file name with unprintable characters", "Rename the file.")
+        # Single small files are read where they lie; only what holds many houses is worth unpacking.
+        files.append(open_lines(path / name, None if name.endswith(".json") else cache))
+        houses += len(files[-1].ids)
+        if houses > MAX_LINES:
+            raise InputError(path, name, f"more than {MAX_LINES:,} houses", "Spread them over folders.")
     rows, clashes = _rows(files)
     if not rows:
         raise InputError(path, "", "its files hold no house", mend)

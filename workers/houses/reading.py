@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
-from schemas.errors import InputError
+from schemas.errors import InputError, printable
 
 # No house is larger; a larger coordinate is a unit error or garbage.
 EXTENT_M = 1000.0
 _LONGEST_TEXT = 500
+# An empty object takes 3 bytes of text and 70 of memory.
+_MOST_PARTS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,14 @@ class Node:
         return float(value)
 
     def text(self) -> str:
-        """A string of at most 500 characters."""
+        """A string of at most 500 printable characters: records and arrays of a run repeat it."""
         if not isinstance(self.value, str):
             raise self.error(f"{_kind(self.value)} where a text belongs")
         if len(self.value) > _LONGEST_TEXT:
             raise self.error(f"a text of {len(self.value)} characters, more than {_LONGEST_TEXT}")
+        if not self.value.isprintable():
+            bad = printable(next(c for c in self.value if not c.isprintable()))
+            raise self.error(f"a text with the unprintable character {bad}")
         return self.value
 
     def point(self) -> tuple[float, float, float]:
@@ -84,6 +89,8 @@ class Node:
 def parse_json(text: bytes, place: str) -> Node:
     """The document, or an InputError for text that is not JSON or is nested too deeply."""
     mend = "Restore the file from its source."
+    if text.count(b"{") + text.count(b"[") > _MOST_PARTS:
+        raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", mend)
     try:
         return Node(place, "$", json.loads(text))
     except RecursionError:

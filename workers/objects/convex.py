@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.geometry.mesh import F32, F64
 from workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
@@ -86,20 +88,11 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
+    data = read_regular(path, MAX_FILE_BYTES, "Give a PLY file of a simplified mesh")
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(
-                path, "", f"the file has more than {MAX_FILE_BYTES:,} bytes", "Simplify the mesh"
-            )
-        mesh = trimesh.load_mesh(path, file_type="ply", process=False)
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
         vertices = np.asarray(mesh.vertices, np.float64)
         faces = np.asarray(mesh.faces, np.int64)
-    except OSError as error:
-        raise InputError(
-            path, "", f"cannot be read: {error.strerror or error}", "Check the path and its rights"
-        ) from error
-    except InputError:
-        raise
     # Broken PLY files surface in the reader in all of these ways.
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, MemoryError) as error:
         raise InputError(path, "", f"not a PLY mesh ({type(error).__name__})", "Export it again") from error

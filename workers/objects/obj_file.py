@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular
 from workers.geometry.mesh import F64
 
 I64 = npt.NDArray[np.int64]
@@ -21,6 +21,8 @@ I64 = npt.NDArray[np.int64]
 MAX_FILE_BYTES = 512 * 2**20
 MAX_FACES = 2_000_000
 MAX_VERTICES = 4_000_000
+MAX_LINES = 16_000_000  # faces, vertices, and their texture coordinates and normals
+MAX_NAMES = 100_000  # of groups, or of materials
 BLOCK_BYTES = 2**20
 _INTEGER = re.compile(rb"-?\d+")
 _SPACES = re.compile(rb"[ \t]+")
@@ -99,42 +101,31 @@ def read_obj_header(path: Path) -> ObjHeader:
                 libraries[line[7:].strip().decode("utf-8", "replace")] = None
             elif line.startswith(b"usemtl "):
                 materials[line[7:].strip().decode("utf-8", "replace")] = None
+        if max(len(libraries), len(materials)) > MAX_NAMES:
+            raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} materials", "Join them")
     return ObjHeader(next(iter(libraries), ""), tuple(materials))
 
 
 def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
     """Yields (number of the first line, lines), each block about `BLOCK_BYTES` long."""
-    try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise InputError(
-                path,
-                "",
-                f"the file has {size:,} bytes, more than the {MAX_FILE_BYTES:,} allowed",
-                "Simplify the mesh",
-            )
-        with path.open("rb") as file:
-            rest, line_number = b"", 1
-            while block := file.read(BLOCK_BYTES):
-                lines = (rest + block).split(b"\n")
-                rest = lines.pop()
-                if len(rest) > BLOCK_BYTES:
-                    raise InputError(
-                        path, f"line {line_number}", "the line is too long", "Give a text OBJ file"
-                    )
-                yield line_number, lines
-                line_number += len(lines)
-            yield line_number, [rest]
-    except OSError as error:
-        raise InputError(
-            path, "", f"cannot be read: {error.strerror or error}", "Check the path and its rights"
-        ) from error
+    with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
+        rest, line_number = b"", 1
+        while block := file.read(BLOCK_BYTES):
+            lines = (rest + block).split(b"\n")
+            rest = lines.pop()
+            if len(rest) > BLOCK_BYTES:
+                raise InputError(path, f"line {line_number}", "the line is too long", "Give a text OBJ file")
+            yield line_number, lines
+            line_number += len(lines)
+            if line_number > MAX_LINES:
+                raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
+        yield line_number, [rest]
 
 
 def _refuse_at_a_glance(path: Path) -> None:
     """Counts lines that begin a face, hundreds of times faster than reading them."""
     count = 0
-    with suppress(OSError), path.open("rb") as file:  # what cannot be read is reported by `_blocks`
+    with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
         while count <= MAX_FACES and (block := file.read(BLOCK_BYTES)):
             count += block.count(b"\nf ")
     if count > MAX_FACES:
@@ -173,6 +164,8 @@ def _read_block(path: Path, first_line: int, lines: list[bytes], grown: _Growing
     grown.n_vertices += len(vertices)
     grown.n_uv += len(uv)
     grown.n_faces += len(faces)
+    if max(map(len, grown.starts.values())) > MAX_NAMES:
+        raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} groups", "Join them")
     if grown.n_faces > MAX_FACES or max(grown.n_vertices, grown.n_uv) > MAX_VERTICES:
         raise InputError(
             path,

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular
 from schemas.identity import digest_of
 from workers.content_cache import Arrays, Shelf
 from workers.geometry.mesh import F32, Mesh, Texture
 from workers.objects.convex import ConvexParts, read_convex_parts
-from workers.objects.obj_file import ObjMesh, read_obj
+from workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
 from workers.objects.texture import face_colours, read_texture
 
 # Part of every cache key: raise it when the reading changes what comes out.
@@ -62,13 +63,8 @@ def scan_files(visual: Path, texture: Path, collision: Path) -> ScanFiles:
     """Hashes the three files. Raises InputError that names a missing or unreadable one."""
     digests: list[str] = []
     for path in (visual, texture, collision):
-        try:
-            with path.open("rb") as file:
-                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        except OSError as error:
-            raise InputError(
-                path, "", f"cannot be read: {error.strerror or error}", "Fetch or restore the asset"
-            ) from error
+        with open_regular(path, MAX_FILE_BYTES, "Fetch or restore the asset") as file:
+            digests.append(hashlib.file_digest(file, "sha256").hexdigest())
     return ScanFiles(visual, texture, collision, digest_of(digests))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular, read_regular
 from workers.geometry.mesh import F32, I32, U8
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -27,15 +28,12 @@ def read_texture(path: Path) -> U8:
     The size is checked before pixels are decoded. Raises InputError naming the file: missing, not
     an image, broken, or too large.
     """
+    file = open_regular(path, MAX_FILE_BYTES, "Put a smaller image there, or fetch the asset again")
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(
-                path, "", f"the image file has more than {MAX_FILE_BYTES:,} bytes", "Give a smaller one"
-            )
-        with warnings.catch_warnings():
+        with file, warnings.catch_warnings():
             # Our own limit, checked below, is stricter than the one that warns.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=("JPEG", "PNG")) as image:
+            with Image.open(file, formats=("JPEG", "PNG")) as image:
                 width, height = image.size
                 if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
                     raise InputError(
@@ -48,10 +46,6 @@ def read_texture(path: Path) -> U8:
                 pixels = image.convert("RGB")
                 pixels.thumbnail((KEPT_SIDE_PX, KEPT_SIDE_PX), Image.Resampling.BOX)
                 return np.asarray(pixels, np.uint8)
-    except FileNotFoundError as error:
-        raise InputError(
-            path, "", "the texture file is missing", "Put it back or fetch the asset again"
-        ) from error
     except InputError:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -81,17 +75,10 @@ def texture_of_material(library: Path, materials: tuple[str, ...]) -> str:
 
     Raises InputError naming the library: missing, no image, or several images on one mesh.
     """
-    try:
-        if library.stat().st_size > 2**20:
-            raise InputError(library, "", "the material library is larger than 1 MiB", "Export it again")
-        text = library.read_text("utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(
-            library, "", f"cannot be read: {error.strerror or error}", "Put it next to the mesh"
-        ) from error
+    data = read_regular(library, 2**20, "Put the mesh's material library next to it")
     images: dict[str, str] = {}
     material = ""
-    for line in text.splitlines():
+    for line in data.decode("utf-8", "replace").splitlines():
         keyword, _, value = line.strip().partition(" ")
         if keyword == "newmtl":
             material = value.strip()

@@ -8,7 +8,6 @@ The right one is ManiSkill's `mani_skill2_ycb`, as its asset download unpacks it
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +15,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
+from workers.houses.reading import parse_json
 from workers.objects.obj_file import read_obj_header
 from workers.objects.scan import ScanFiles, scan_files
 from workers.objects.texture import texture_of_material
@@ -127,16 +128,7 @@ def _maniskill(folder: Path, index: Path) -> list[Entry]:
 
 
 def _validated(index: Path, adapter: TypeAdapter[Any]) -> Any:
-    try:
-        if index.stat().st_size > MAX_INDEX_BYTES:
-            raise InputError(index, "", f"larger than {MAX_INDEX_BYTES:,} bytes", "Give the set's own index")
-        value = json.loads(index.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(
-            index, "", f"cannot be read: {error.strerror or error}", "Check its rights"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(index, "", f"not JSON: {error}", "Fetch the index again") from error
+    value = parse_json(read_regular(index, MAX_INDEX_BYTES, "Give the set's own index"), str(index)).value
     try:
         return adapter.validate_python(value)
     except ValidationError as error:

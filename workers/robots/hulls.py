@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from functools import lru_cache
 from pathlib import Path
@@ -12,12 +13,15 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.geometry.mesh import F32, F64, I32
 from workers.robots.robot import Parts
 from workers.robots.urdf import Shape
 
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
+_MAX_BYTES = 64 << 20
+_MEND = "Install mani_skill again, or mend the file"
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
@@ -56,14 +60,11 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
-    if not path.is_file():
-        raise _wrong(path, "is missing")
+    data = read_regular(path, _MAX_BYTES, _MEND)
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix, process=False)
         points = np.asarray(mesh.vertices, np.float64)
         edges = np.asarray(mesh.edges, np.int64)
-    except OSError as error:
-        raise _wrong(path, f"cannot be read: {error.strerror or error}") from error
     # Broken meshes surface in the reader in all of these ways.
     except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise _wrong(path, f"is not a mesh ({type(error).__name__})") from error
@@ -144,4 +145,4 @@ def _outside(points: F64, hull: ConvexHull) -> F64:
 
 
 def _wrong(path: Path, problem: str) -> InputError:
-    return InputError(path, "", problem, "Install mani_skill again, or mend the file")
+    return InputError(path, "", problem, _MEND)

@@ -10,9 +10,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20
+_MAX_LINKS = 1000
+_MEND = "Install mani_skill again, or mend the file"
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
@@ -97,15 +100,13 @@ def read_urdf(path: Path) -> Tree:
     finite, a joint between links that do not exist, two parents of one link, a loop.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise _wrong(path, "", f"has more than {_MAX_BYTES:,} bytes")
-        root = ElementTree.fromstring(path.read_bytes())
-    except OSError as error:
-        raise _wrong(path, "", f"cannot be read: {error.strerror or error}") from error
+        root = ElementTree.fromstring(read_regular(path, _MAX_BYTES, _MEND))
     except ElementTree.ParseError as error:
         raise _wrong(path, "", f"is not XML ({error})") from error
     if root.tag != "robot":
         raise _wrong(path, root.tag, "is not <robot>")
+    if max(len(root.findall("link")), len(root.findall("joint"))) > _MAX_LINKS:
+        raise _wrong(path, "", f"has more than {_MAX_LINKS:,} links or joints")
     reader = _Reader(path)
     links = {link.name: link for link in map(reader.link, root.findall("link"))}
     joints = {joint.name: joint for joint in map(reader.joint, root.findall("joint"))}
@@ -258,4 +259,4 @@ def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
 
 
 def _wrong(path: Path, field: str, problem: str) -> InputError:
-    return InputError(path, field, problem, "Install mani_skill again, or mend the file")
+    return InputError(path, field, problem, _MEND)

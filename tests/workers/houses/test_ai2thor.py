@@ -287,7 +287,7 @@ def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.Mo
     with pytest.raises(InputError, match="triangles, more than 11"):
         load(root)
     monkeypatch.setattr(glb, "MAX_FILE_BYTES", 100)
-    with pytest.raises(InputError, match="more than 0 MiB"):
+    with pytest.raises(InputError, match="more than the 100 allowed"):
         load(root)
 
 
@@ -314,7 +314,7 @@ def test_folders_without_scenes(tmp_path: Path):
     with pytest.raises(InputError, match="ai2thor-hab/configs/scenes"):
         open_houses(f"ai2thor:{tmp_path}")
     (tmp_path / "ai2thor-hab/configs/scenes").mkdir(parents=True)
-    with pytest.raises(InputError, match="0 scenes"):
+    with pytest.raises(InputError, match="no scenes"):
         open_houses(f"ai2thor:{tmp_path}")
     with pytest.raises(InputError):
         open_houses("ai2thor:")
