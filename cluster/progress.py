@@ -18,6 +18,7 @@ from rich.text import Text
 
 from cluster.tally import Tally
 from cluster.task import AttemptReport
+from schemas.errors import printable
 
 _RATE_OVER_S = 60.0
 
@@ -140,7 +141,7 @@ class TerminalBar:
 
     def ended(self, report: AttemptReport, action: str) -> None:
         if action in ("retry", "quarantine", "abort"):
-            text = f"shard {report.shard} {report.outcome}: {report.cause} ({action})"
+            text = printable(f"shard {report.shard} {report.outcome}: {report.cause} ({action})")
             self._bar.console.print(Text(text, style="yellow" if action == "retry" else "red"))
 
     def tick(self, tally: Tally) -> None:

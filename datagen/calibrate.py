@@ -16,7 +16,7 @@ from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import steps
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.reports.specified import specification_record
-from schemas.errors import InputError
+from schemas.errors import InputError, one_line, printable
 from schemas.merged import open_runs
 from schemas.specification import HeuristicParams, Specification
 from workers.bases.candidate_sets import CANDIDATE_SETS, in_set
@@ -84,7 +84,7 @@ def calibrate(
     refuse_too_little(trials, ", ".join(runs))
     forms = FORMS if distance == "any" else (distance,)
     for warning in warnings:
-        sys.stderr.write(f"warning: {warning}\n")
+        sys.stderr.write(f"warning: {one_line(warning)}\n")
     with steps("fits", 1 + min(FOLDS, len(set(trials.house))), True if json else None) as step:
         made = _calibrate(trials, specs[0].heuristic, forms, objective, fit_alpha, bootstrap, seed, step)
     report = {
@@ -293,7 +293,7 @@ def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
         *(f"{words} (%): {_told(report, metric)}" for metric, words in _METRICS.items()),
         *(f"warning {warning}" for warning in report["warnings"]),
     ]
-    comments = "".join(f"# {_printable(line)}\n" for line in lines)
+    comments = "".join(f"# {printable(line)}\n" for line in lines)
     section = "".join(
         f"{name} = {value!r}\n" if isinstance(value, float) else f'{name} = "{value}"\n'
         for name, value in params.model_dump().items()
@@ -304,11 +304,6 @@ def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
 def _told(report: dict[str, Any], metric: str) -> str:
     before, after = (_percent(report[name][metric]) for name in ("before", "after"))
     return f"before {before}, after {after} in houses left out of the fit"
-
-
-def _printable(text: str) -> str:
-    """A run's name may hold what no comment can."""
-    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _write_new(path: Path, text: str) -> None:

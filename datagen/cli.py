@@ -1,7 +1,7 @@
 """The program `datagen`: its verbs, and what becomes of errors on the way out.
 
 Exit codes: 0 good, 1 finished and something is wrong (too many failures, findings, differences), 2 bad input,
-130 interrupted. Verbs are loaded only when called, so that `datagen --help` does not wait for simulators.
+130 interrupted, 141 if the reader of the output closed it. Verbs are loaded only when called, so that `datagen --help` does not wait for simulators.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from cyclopts.exceptions import CycloptsError, UnknownCommandError
 
 from cluster.environment import job_environment
 from datagen import __version__
-from schemas.errors import InputError, refuse_not_utf8
+from schemas.errors import InputError, one_line, refuse_not_utf8
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pydantic import ValidationError
 
-EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
+EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
 # Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
@@ -71,11 +71,6 @@ def build_app(called: str = "") -> App:
     for verb, (target, line) in VERBS.items():
         app.command(target, name=verb, help=None if verb == called else line)
     return app
-
-
-def one_line(text: str) -> str:
-    """The text without line breaks, control characters or runs of spaces."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def _usage_line(error: CycloptsError) -> str:
@@ -130,10 +125,13 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # The reader went away (`datagen status | head`). Python's own flush at exit would complain.
+    except (BrokenPipeError, SystemExit) as error:
+        # The reader went away (`datagen status | head`), which rich makes an exit of its own.
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        # Python's own flush at exit would complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_GOOD
+        return EXIT_CLOSED_PIPE
     except Exception as error:
         lines = _lines_for(error)
         if lines is None:
@@ -146,6 +144,9 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """The console script."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:  # closed by the shell (`>&-`): no file may get its number
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     with job_environment():
         code = run(sys.argv[1:])
     sys.exit(code)

@@ -11,10 +11,11 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.console.options import RunPlace
+from datagen.console.printing import print_lines
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import jobs_api_of
 from datagen.reports.events import Event, Known, events_of
-from schemas.errors import InputError
+from schemas.errors import InputError, printable
 from schemas.jobs import Jobs
 from schemas.merged import open_runs
 from schemas.storage import Storage, open_storage
@@ -82,9 +83,9 @@ def _print(event: Event, stacks: bool, as_json: bool) -> None:
         sys.stdout.write(json_text.dumps(fields) + "\n")
     else:
         at = event.at[:23].replace("T", " ") or "at some time"
-        sys.stdout.write(f"{at}  {event.text}\n")
+        print_lines(printable(f"{at}  {event.text}"))
         if event.stack and stacks:
-            sys.stdout.writelines(f"    {line}\n" for line in event.stack.splitlines())
+            print_lines(event.stack, "    ")
     sys.stdout.flush()
 
 
@@ -99,9 +100,10 @@ def _print_driver(place: Storage, follow: bool) -> int:
     while True:
         live = follow and ray.state(record.submission) in ("PENDING", "RUNNING")
         output = ray.output(record.submission)
-        sys.stdout.write(output[told:])
-        sys.stdout.flush()
-        told = len(output)
+        # A line that is still being written is printed when it is whole.
+        whole = output.rfind("\n") + 1 if live else len(output)
+        print_lines(output[told:whole])
+        told = max(told, whole)
         if not live:
             return 0
         time.sleep(_LOOK_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -13,13 +12,13 @@ import numpy as np
 from cyclopts import Parameter
 
 from datagen.console.options import AsJson, RunPlace
-from datagen.console.printing import counted, print_json, print_rows, seconds, size
+from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
 from schemas.checking.finding import Finding
 from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
+from schemas.errors import InputError, printable
 from schemas.run import Run
 from schemas.storage import Storage, open_storage
 
@@ -172,12 +171,7 @@ def print_findings(title: str, findings: list[Finding], total: int) -> None:
         return
     lines = [f"{title}: the file, what is wrong, how to mend it"]
     for finding in findings[:_SHOWN]:
-        lines += [f"  {_plain(finding.key)}", f"      {_plain(finding.problem)}. {_plain(finding.mend)}"]
+        lines += [f"  {printable(finding.key)}", f"      {printable(f'{finding.problem}. {finding.mend}')}"]
     if total > _SHOWN:
         lines.append(f"  and {total - _SHOWN:,} more: --json tells them")
-    sys.stdout.write("\n".join(lines) + "\n")
-
-
-def _plain(text: str) -> str:
-    """The text without what would move a terminal's cursor."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+    print_lines("\n".join(lines))

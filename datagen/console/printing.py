@@ -1,15 +1,21 @@
-"""What verbs print: tables for people, JSON for programs."""
+"""What verbs print: tables for people, JSON for programs.
+
+Records of a run may be another user's. So whatever a terminal acts on is printed as its escape, and brackets
+are not markup.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from schemas.errors import printable
 
 
 def print_json(value: Any) -> None:
@@ -22,13 +28,22 @@ def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] =
     """A table; the first column is left-aligned, the others right-aligned when there are heads."""
     table = Table(show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
     for k in range(len(heads)) if heads else range(2):
-        table.add_column(heads[k] if heads else "", justify="right" if heads and k else "left")
+        table.add_column(
+            Text(printable(heads[k])) if heads else "", justify="right" if heads and k else "left"
+        )
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
     # A table's own title is wrapped to the table's width.
-    console.print(Text(title, style="italic"), soft_wrap=True)
+    console.print(Text(printable(title), style="italic"), soft_wrap=True)
     console.print(table)
+
+
+def print_lines(text: str, indent: str = "", stream: TextIO | None = None) -> None:
+    """The lines of a text on standard output, or on another stream."""
+    stream = stream or sys.stdout
+    stream.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
+    stream.flush()
 
 
 def counted(n: int, what: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from html import escape
+from html import escape as html_escape
 
 from datagen.evaluating import rows
 from datagen.evaluating.curves import draw_curves, draw_intervals
@@ -11,6 +11,7 @@ from datagen.evaluating.grid_pictures import draw_examples
 from datagen.evaluating.rows import Shown
 from datagen.evaluating.svg import svg_of
 from datagen.evaluating.wording import Report
+from schemas.errors import printable
 from train.evaluation.columns import Gathered
 
 _STYLE = """
@@ -55,6 +56,11 @@ def page_of(report: Report, gathered: Gathered) -> str:
         + "\n".join(body)
         + "\n</body></html>\n"
     )
+
+
+def escape(text: str) -> str:
+    """The text as HTML that shows it, with nothing in it that a browser acts on."""
+    return html_escape(printable(text))
 
 
 def _about(report: Report) -> str:

@@ -28,7 +28,7 @@ from cluster.watch import Together, Watch
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing, command_line
-from schemas.errors import InputError
+from schemas.errors import InputError, one_line
 from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from schemas.record_files import now
 from schemas.run import Run
@@ -231,7 +231,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
         most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
         see = command_line(["status", name])
-        sys.stderr.write(f"error: {name}: too many shards failed{most}. See: {see}\n")
+        sys.stderr.write(one_line(f"error: {name}: too many shards failed{most}. See: {see}") + "\n")
     if summary.end == "interrupted":
         left = counted(summary.remaining, "shard")
         sys.stderr.write(f"interrupted with {left} to go. Go on with:\n  {resume}\n")

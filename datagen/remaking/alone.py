@@ -9,7 +9,7 @@ import traceback
 from hashlib import sha256
 from typing import Any
 
-from datagen.console.printing import print_json, print_rows
+from datagen.console.printing import print_json, print_lines, print_rows
 from datagen.remaking.shards import Origin, remade_files, remake
 from schemas.errors import InputError
 from schemas.run import Run
@@ -96,9 +96,8 @@ def _print_recorded(
     print_rows(f"shard {shard} of {place}{state}", [(f["attempt"], f["cause"]) for f in failed])
     stacks = [f["stack"].rstrip() for f in failed if f["stack"].strip()]
     if stacks:
-        sys.stdout.write(f"the last recorded stack:\n{stacks[-1]}\n")
-    sys.stdout.write("now here:\n")
-    sys.stdout.flush()
+        print_lines(f"the last recorded stack:\n{stacks[-1]}")
+    print_lines("now here:")
 
 
 def _print_made(place: str, report: dict[str, Any]) -> None:

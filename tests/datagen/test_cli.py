@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -146,8 +147,22 @@ def test_every_verb_exists(verb: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert "datagen " + verb in capsys.readouterr().out
 
 
-def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
+@pytest.mark.parametrize("words", ["--help", "assets list", "assets list --json"])
+def test_a_closed_pipe_is_quiet(words: str, tmp_path: Path) -> None:
     errors = tmp_path / "stderr"
-    command = f"'{sys.executable}' -m datagen.cli --help 2>'{errors}' | head -c 1 >/dev/null"
-    subprocess.run(["bash", "-c", command], check=False)
-    assert errors.read_text() == ""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as out, errors.open("wb") as err:
+        command = [sys.executable, "-m", "datagen.cli", *words.split()]
+        done = subprocess.run(command, check=False, stdout=out, stderr=err)
+    assert errors.read_text() == "" and done.returncode == cli.EXIT_CLOSED_PIPE
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "assets list", "assets list --json"])
+@pytest.mark.parametrize("closed", ["<&-", ">&-", ">&- <&-", ">&- 2>&- <&-"])
+def test_closed_streams_are_quiet(words: str, closed: str, tmp_path: Path) -> None:
+    errors = "" if "2>" in closed else f"2>'{tmp_path / 'stderr'}'"
+    (tmp_path / "stderr").touch()
+    command = f"'{sys.executable}' -m datagen.cli {words} {errors} {closed}"
+    done = subprocess.run(["bash", "-c", command], check=False, capture_output=True)
+    assert (done.returncode, (tmp_path / "stderr").read_text()) == (0, "")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects as go
 
+from schemas.errors import printable
 from schemas.specification import CandidateParams
 from train.prediction.answer import told
 from train.prediction.candidates import STATES
@@ -22,7 +24,7 @@ def write_page(prediction: Prediction, out: Path) -> None:
     half_m = float(np.abs(prediction.places.offset_m).max()) + 0.5
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
     figure = go.Figure(data=[_cloud(prediction, rows), *_places(prediction), *_best(prediction)])
-    lines = "<br>".join(f"<b>{head}</b> {text}" for head, text in told(prediction))
+    lines = "<br>".join(f"<b>{head}</b> {escape(printable(text))}" for head, text in told(prediction))
     figure.update_layout(
         title={"text": f"<span style='font-size:12px'>{lines}</span>", "y": 0.98, "yanchor": "top"},
         margin={"l": 0, "r": 0, "b": 0, "t": 40 + 15 * len(told(prediction))},

@@ -182,7 +182,7 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     sizes = {p.relative_to(top).as_posix().removesuffix(_SUFFIX): n for p, n in _sizes(top, f"*{_SUFFIX}")}
     if not sizes:
         raise InputError(top, "", "no scenes in it", mend)
-    listing: list[list[object]] = [[i, sizes[i]] for i in sorted(sizes)]
+    listing: list[object] = [[i, sizes[i]] for i in sorted(sizes)]
     places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
     files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
     listing += [[p.relative_to(root).as_posix(), n] for p, n in files]

@@ -1,0 +1,111 @@
+"""Records of another user's run, printed: nothing in them reaches a terminal but as text."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+from datagen import cli
+from datagen.console.printing import print_lines, print_rows
+from datagen.evaluating.page import escape
+from schemas.jobs import JobRecord, Jobs, JobState, StopOrder
+from schemas.lineage import LINEAGE, Origin, encode_lineage
+from schemas.record_files import encode_record
+from schemas.run import Run
+from schemas.run_records import LedgerEntry, QuarantineRecord
+from tests.made_runs import make_run
+
+# A colour, the clipboard (OSC 52), a bell, a carriage return, C1 controls, text that runs backwards, markup.
+EVIL = (
+    "\x1b[31m\x1b]52;c;cm0gLXJmIH4=\x07\r\x08\x9b2J\u202egnp\u2066x\u2069\u200f"
+    "[red]told[/red][link=http://example.org]y[/link][/]<script>\u2028"
+)
+AT = "2026-01-01T00:00:00.000+00:00"
+ATTEMPT = "000001-aaaaaaaa-000001"
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose every free text is hostile."""
+    run = make_run(tmp_path_factory.mktemp("foreign") / "run", n=50, shards=[0, 2, 4])
+    stack = f"line one {EVIL}\nline two {EVIL}"
+    entry = LedgerEntry(
+        attempt=ATTEMPT, shard=1, outcome="failed", cause=EVIL, stack=stack, started=AT, ended=AT
+    )
+    run.ledger.end(entry)
+    given_up = QuarantineRecord(
+        shard=1, seed=0, first_scene=2, scenes=2, attempts=(ATTEMPT,), causes=(EVIL,), stacks=(stack,), created=AT
+    )  # fmt: skip
+    run.quarantine(given_up)
+    for number, end in enumerate(("failed", "")):
+        job = f"20260101T00000{number}-aaaaaaaa"
+        jobs = Jobs(run.storage)
+        jobs.begin(
+            JobRecord(
+                id=job, command=("submit", EVIL), host=EVIL, pid=1, started=AT, address=EVIL, submission=EVIL, jobs_api=EVIL
+            )
+        )  # fmt: skip
+        jobs.tell(
+            JobState(id=job, updated=AT, phase="making", end=end, cause=EVIL, stopping=EVIL)
+        )  # fmt: skip
+        if not end:
+            order = StopOrder(id=job, now=False, asked=AT, host=EVIL)
+            run.storage.put(f"jobs/{job}.stop.json", encode_record(order))
+    origin = Origin(address=f"/runs/{EVIL}", created=AT, platform=EVIL, code_version=EVIL)
+    run.storage.put(LINEAGE, encode_lineage({origin: [0, 2, 4]}))
+    return Path(run.storage.url)
+
+
+VERBS = [
+    ["logs", "{run}"],
+    ["logs", "{run}", "--stacks"],
+    ["logs", "{run}", "--stacks", "--shard", "1"],
+    ["logs", "{run}", "--stacks", "--json"],
+    ["logs", "{run}", "--driver"],
+    ["status", "{run}"],
+    ["status", "{run}", "--stacks"],
+    ["status", "{run}", "--json"],
+    ["audit", "{run}"],
+    ["verify", "{run}"],
+    ["repair", "{run}", "--workers", "0"],
+    ["gc", "{run}", "--dry-run"],
+    ["show", "{run}", "--scene", "0", "--out", "{out}.png"],
+    ["replay", "{run}", "--shard", "1"],
+    ["merge", "{run}", "--out", "{out}"],
+    ["resume", "{run}", "--workers", "0"],
+    ["extend", "{run}", "--n", "60", "--workers", "0"],
+]
+
+
+@pytest.mark.parametrize("words", VERBS, ids=lambda words: " ".join(words[:1] + words[2:4]))
+def test_no_verb_prints_what_a_terminal_acts_on(
+    words: list[str], foreign: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run([word.format(run=foreign, out=tmp_path / "out") for word in words]) in (0, 1, 2)
+    told = capfd.readouterr()
+    for text in (told.out, told.err):
+        assert all(c.isprintable() or c == "\n" for c in text), [c for c in text if not c.isprintable()]
+    assert "Traceback" not in told.err
+    if words[0] in ("logs", "status") and words[-1] not in ("--json", "--driver"):
+        assert "\\x1b]52;c" in told.out and "[red]told" in "".join(told.out.split())
+
+
+def test_tables_take_brackets_for_brackets(capsys: pytest.CaptureFixture[str]) -> None:
+    print_rows(f"title {EVIL}", [("a [red]b[/red]", "[/]"), (EVIL, "")], ("[bold]head", "n"))
+    told = capsys.readouterr().out
+    assert "a [red]b[/red]" in told and "[/]" in told and "[bold]head" in told
+    assert all(c.isprintable() or c == "\n" for c in told)
+
+
+def test_a_page_shows_what_it_is_given() -> None:
+    assert escape(EVIL).isprintable() and "<" not in escape(EVIL) and "\\u202e" in escape(EVIL)
+
+
+def test_lines_keep_their_breaks() -> None:
+    stream = io.StringIO()
+    print_lines("one\x1b\r\ntwo\rthree\u2028four\tfive", "> ", stream)
+    assert stream.getvalue() == "> one\\x1b\n> two\n> three\n> four\\tfive\n"
+    assert sys.stdout is not stream
