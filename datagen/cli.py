@@ -1,7 +1,8 @@
 """The program `datagen`: its verbs, and what becomes of errors on the way out.
 
 Exit codes: 0 good, 1 finished and something is wrong (too many failures, findings, differences), 2 bad input,
-130 interrupted, 141 if the reader of the output closed it. Verbs are loaded only when called, so that `datagen --help` does not wait for simulators.
+130 interrupted, 141 if the reader of the output closed it. Verbs are loaded only when called, so that
+`datagen --help` does not wait for simulators.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 
 _CHUNK_BYTES = 2**18
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
@@ -124,12 +125,12 @@ class _Part:
         self._note = target.with_name(target.name + ".part.json")
         self.validator = ""
         try:
-            note = json.loads(self._note.read_text("utf-8"))
+            note = json.loads(read_regular(self._note, 2**16, ""))
             if note["url"] == url and isinstance(note["validator"], str) and note["validator"].isprintable():
                 self.validator = note["validator"]
             else:
                 self.discard()
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             self.discard()
 
     @property

@@ -17,10 +17,13 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from schemas.errors import InputError
+from schemas.foreign_files import open_regular, read_regular
 from schemas.run_records import Digest, StoredRecord
 
 LOCK_NAME = "assets.lock.json"
-_MAX_LOCK_BYTES = 256 * 2**20
+_MAX_LOCK_BYTES = 64 * 2**20
+_MAX_FILE_BYTES = 2**40
+_MAX_FILES = 200_000
 Size = Annotated[int, Field(ge=0, le=2**50)]
 
 
@@ -69,19 +72,18 @@ class Verification:
 
 def sha256_of(path: Path) -> str:
     """The sha256 of a file's bytes, 64 hexadecimal digits."""
-    with path.open("rb") as file:
+    with open_regular(path, _MAX_FILE_BYTES, "Put the file back, or fetch it again") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_lock(folder: Path) -> Lock | None:
     """The folder's lock, or None where there is none. Raises InputError for a broken one."""
     path = folder / LOCK_NAME
-    if not path.is_file():
+    if not path.exists():
         return None
-    if path.stat().st_size > _MAX_LOCK_BYTES:
-        raise InputError(path, "", "the lock file is absurdly large", "Write it anew: datagen assets lock")
+    data = read_regular(path, _MAX_LOCK_BYTES, "Remove it and write it anew: datagen assets lock")
     try:
-        lock = Lock.model_validate_json(path.read_bytes())
+        lock = Lock.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(step) for step in first["loc"])
@@ -176,4 +178,6 @@ def _files(folder: Path) -> list[str]:
         found += [
             (base / name).as_posix() for name in names if not name.startswith(".") and name != LOCK_NAME
         ]
+        if len(found) > _MAX_FILES:
+            raise InputError(folder, "", f"more than {_MAX_FILES:,} files", "Name the folder of assets")
     return sorted(found)

@@ -11,14 +11,14 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from schemas.archives import DAMAGED_ZIP, open_member
 from schemas.errors import InputError
 
 _CHUNK_BYTES = 2**20
-# tarfile reads a header's extension in one piece, so a huge piece is a header that lies.
-_LARGEST_READ = 16 * 2**20
+# zipfile reads its list of members in one piece, tarfile a header's extension, which may hold another one.
+_ZIP_LIST = 16 * 2**20
 _ADVICE = "Do not use this archive; fetch it from its publisher"
 
 
@@ -61,7 +61,7 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
                 total += _copy(archive, member, staging / relative, limits.total_bytes - total)
         except InputError:
             raise
-        except (tarfile.TarError, gzip.BadGzipFile, *DAMAGED_ZIP) as error:
+        except (tarfile.TarError, gzip.BadGzipFile, RecursionError, *DAMAGED_ZIP) as error:
             raise _damaged(archive, error) from error
         except OSError as error:
             if error.errno != errno.EINVAL:  # an offset before the archive begins; all else is the disk's
@@ -83,13 +83,13 @@ def _damaged(archive: Path, error: Exception) -> InputError:
 
 def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
     if zipfile.is_zipfile(archive):
-        yield from _zip_members(archive)
+        yield from _zip_members(archive, limits)
         return
     with archive.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
         plain: Any = gzip.GzipFile(fileobj=raw) if packed else raw
-        careful: Any = _Careful(archive, plain)
+        careful: Any = _Careful(archive, plain, _CHUNK_BYTES)
         with tarfile.open(fileobj=careful, mode="r:") as tar:
             for count, info in enumerate(tar):
                 if count > 2 * limits.files:
@@ -106,8 +106,14 @@ def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
                 yield _Member(info.name, info.size, stream)
 
 
-def _zip_members(archive: Path) -> Iterator[_Member]:
-    with zipfile.ZipFile(archive) as packed:
+def _zip_members(archive: Path, limits: Limits) -> Iterator[_Member]:
+    with (
+        archive.open("rb") as raw,
+        zipfile.ZipFile(cast(IO[bytes], _Careful(archive, raw, _ZIP_LIST))) as packed,
+    ):
+        claimed = sum(info.file_size for info in packed.infolist())
+        if claimed > limits.total_bytes:
+            raise InputError(archive, "", f"claims to unpack to {claimed:,} bytes", _ADVICE)
         for info in packed.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)
             if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
@@ -162,17 +168,22 @@ def _refuse_links(archive: Path, folder: Path, relative: PurePosixPath) -> None:
 class _Careful:
     """A readable, seekable stream that refuses huge single reads."""
 
-    def __init__(self, archive: Path, stream: Any) -> None:
+    def __init__(self, archive: Path, stream: Any, largest: int) -> None:
         self._archive = archive
+        self._largest = largest
         self._stream = stream
 
     def read(self, size: int = -1) -> bytes:
-        if size < 0 or size > _LARGEST_READ:
+        data = b"" if size > self._largest else self._stream.read(size if size >= 0 else self._largest + 1)
+        if max(size, len(data)) > self._largest:
             raise InputError(self._archive, "", "a header of absurd size", _ADVICE)
-        return self._stream.read(size)
+        return data
 
     def seek(self, offset: int, whence: int = 0) -> int:
         return self._stream.seek(offset, whence)
+
+    def seekable(self) -> bool:
+        return True
 
     def tell(self) -> int:
         return self._stream.tell()

@@ -319,3 +319,18 @@ def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.Capture
     given = arguments(made)
     given[1] = str(tmp_path / "bad.ckpt")
     refused(given, capsys, "bad.ckpt")
+
+
+@pytest.mark.parametrize("z", [0.0, 1.0])
+def test_a_cloud_of_equal_points(
+    z: float, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has an answer or an error, and no traceback: a point was drawn more than once into the sample."""
+    n, target = 4000, "property uchar target\n"
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex {n}\n{axes}{target}end_header\n"
+    (tmp_path / "equal.ply").write_text(head + f"0.5 0.2 {z} 1\n" * n)
+    drop = ("--rgb", "--depth", "--intrinsics", "--mask")
+    given = arguments(made, "--frame", str(tmp_path / "equal.ply"), "--gravity", "0,1,0", drop=drop)
+    assert cli.run(given) in (0, 1, 2)
+    assert "Traceback" not in capsys.readouterr().err

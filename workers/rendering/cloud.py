@@ -123,6 +123,7 @@ def farthest_points(points_m: F32, count: int) -> npt.NDArray[np.int64]:
     dx, dy, dz = np.empty_like(x), np.empty_like(x), np.empty_like(x)
     for row in range(1, count):
         last = chosen[row - 1]
+        gap2[last] = -1.0  # never chosen again, also where all that are left equal a chosen one
         np.subtract(x, x[last], out=dx)
         np.subtract(y, y[last], out=dy)
         np.subtract(z, z[last], out=dz)

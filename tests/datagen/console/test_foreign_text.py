@@ -14,7 +14,6 @@ from datagen.evaluating.page import escape
 from schemas.jobs import JobRecord, Jobs, JobState, StopOrder
 from schemas.lineage import LINEAGE, Origin, encode_lineage
 from schemas.record_files import encode_record
-from schemas.run import Run
 from schemas.run_records import LedgerEntry, QuarantineRecord
 from tests.made_runs import make_run
 
@@ -37,7 +36,8 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     run.ledger.end(entry)
     given_up = QuarantineRecord(
-        shard=1, seed=0, first_scene=2, scenes=2, attempts=(ATTEMPT,), causes=(EVIL,), stacks=(stack,), created=AT
+        shard=1, seed=0, first_scene=2, scenes=2, attempts=(ATTEMPT,), causes=(EVIL,), stacks=(stack,),
+        created=AT,
     )  # fmt: skip
     run.quarantine(given_up)
     for number, end in enumerate(("failed", "")):
@@ -45,7 +45,8 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         jobs = Jobs(run.storage)
         jobs.begin(
             JobRecord(
-                id=job, command=("submit", EVIL), host=EVIL, pid=1, started=AT, address=EVIL, submission=EVIL, jobs_api=EVIL
+                id=job, command=("submit", EVIL), host=EVIL, pid=1, started=AT, address=EVIL, submission=EVIL,
+                jobs_api=EVIL,
             )
         )  # fmt: skip
         jobs.tell(
