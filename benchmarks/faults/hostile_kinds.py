@@ -56,7 +56,10 @@ ODD_FILES: dict[str, Callable[[Path], None]] = {
 
 
 def _text(text: str) -> Callable[[Path], None]:
-    return lambda path: path.write_text(text) and None
+    def put(path: Path) -> None:
+        path.write_text(text)
+
+    return put
 
 
 TOML_FILES: dict[str, Callable[[Path], None]] = {
@@ -115,7 +118,6 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
     "tar, twice": lambda: _tar(("a", b"x", _FILE, ""), ("A", b"y", _FILE, "")),
     "tar, escape in a name": lambda: _tar(("a\x1b[31m", b"x", _FILE, "")),
     "tar, a file of 8 GB": lambda: gzip.compress(_tar_claiming(8 * 10**9)),
-    "tar, 20 GB of zeros": lambda: _packed(_tar_claiming(900_000_000), 1) + _packed(bytes(10**7), 2000),
     "tar, names of names": lambda: _long_names(5000),
     "zip, parent": lambda: _zip(("../../out.txt", b"x")),
     "zip, symbolic link": lambda: _zip(("a", b"/etc"), mode=0o120777),

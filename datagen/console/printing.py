@@ -41,9 +41,9 @@ def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] =
 
 def print_lines(text: str, indent: str = "", stream: TextIO | None = None) -> None:
     """The lines of a text on standard output, or on another stream."""
-    stream = stream or sys.stdout
-    stream.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
-    stream.flush()
+    out: TextIO = stream or sys.stdout
+    out.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
+    out.flush()
 
 
 def counted(n: int, what: str) -> str:
