@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from datagen.console.options import RunPlace
-from datagen.console.printing import print_lines
+from datagen.console.printing import print_json, print_lines
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import jobs_api_of
 from datagen.reports.events import Event, Known, events_of
@@ -80,7 +79,7 @@ def _print(event: Event, stacks: bool, as_json: bool) -> None:
             fields["shard"] = event.shard
         if event.stack and stacks:
             fields["stack"] = event.stack
-        sys.stdout.write(json_text.dumps(fields) + "\n")
+        print_json(fields, indent=None)
     else:
         at = event.at[:23].replace("T", " ") or "at some time"
         print_lines(printable(f"{at}  {event.text}"))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from schemas.errors import InputError
 from train.inputs import Array, Batch, is_clear
 
 if TYPE_CHECKING:
@@ -63,7 +64,18 @@ class ModelScorer:
                 chance = torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
         finally:
             self.model.train(trained)
-        return np.where(is_clear(batch), chance, 0.0) if self.only_clear else chance
+        # A place that is not clear hides no score that is not a number.
+        return np.where(is_clear(batch) | np.isnan(chance), chance, 0.0) if self.only_clear else chance
+
+
+def scored(scorer: Scorer, batch: Batch[Array]) -> npt.NDArray[np.float64]:
+    """Scores (N,) of a batch. InputError names a sample whose score is missing or not a finite number."""
+    score = np.asarray(scorer.score(batch), np.float64)
+    if score.shape != (len(batch),) or not np.isfinite(score).all():
+        row = int(np.argmin(np.isfinite(score))) if score.shape == (len(batch),) else 0
+        problem = f"no finite score for sample {batch.sample_id[row].tobytes().hex()}"
+        raise InputError(scorer.name, "score", problem, "Train the model again, or leave this method out")
+    return score
 
 
 def use_threads(n: int) -> None:

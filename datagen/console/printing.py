@@ -18,10 +18,9 @@ from rich.text import Text
 from schemas.errors import printable
 
 
-def print_json(value: Any) -> None:
-    """One JSON document on standard output."""
-    json.dump(value, sys.stdout, indent=2, allow_nan=False)
-    sys.stdout.write("\n")
+def print_json(value: Any, indent: int | None = 2) -> None:
+    """One JSON document on standard output: whole or, where a value has no place in JSON, nothing of it."""
+    sys.stdout.write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
 def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datagen.console.printing import print_json
 from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check
 from datagen.doctor.engines import engine_checks
@@ -56,10 +55,10 @@ def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
     return [_count("houses", houses or "builtin", _houses), _count("objects", objects or "builtin", _objects)]
 
 
-def as_json(checks: list[Check]) -> str:
+def as_json(checks: list[Check]) -> dict[str, Any]:
     """`{"ok": bool, "checks": [{"name", "status", "detail", "mend"}, ...]}`, in the order of the table."""
     good = all(check.status != "fail" for check in checks)
-    return json.dumps({"ok": good, "checks": [asdict(check) for check in checks]}, indent=2)
+    return {"ok": good, "checks": [asdict(check) for check in checks]}
 
 
 def as_table(checks: list[Check]) -> Table:
@@ -92,7 +91,7 @@ def doctor(
     checks = [*host_checks(), *engine_checks(), *arm_checks(), *asset_checks(houses, objects)]
     failures = sum(check.status == "fail" for check in checks)
     if json:
-        sys.stdout.write(as_json(checks) + "\n")
+        print_json(as_json(checks))
     else:
         console = Console(highlight=False)
         console.print(as_table(checks))

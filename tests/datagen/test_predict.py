@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from datagen import cli
@@ -312,6 +313,21 @@ def test_a_floor_out_of_sight_is_asked_for(
     height = (rays * (depth / 1000)[..., None]) @ pose[2, :3] + pose[2, 3]
     depth[height < 0.3] = 0
     refused(arguments(made, "--depth", saved(depth, tmp_path)), capsys, "floor", "--gravity")
+
+
+@pytest.mark.parametrize("json_too", [False, True])
+@pytest.mark.parametrize(("value", "words"), [(np.nan, "NaN or infinite"), (3e38, "no finite score")])
+def test_a_model_without_finite_scores_gives_no_answer(
+    made: Path, tmp_path: Path, value: float, words: str, json_too: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = torch.load(made / "model.ckpt", weights_only=True)
+    filled = {k: torch.full_like(v, value) if k.startswith("weights/") else v for k, v in whole.items()}
+    torch.save(filled, tmp_path / "bad.ckpt")
+    given = arguments(made)
+    given[1] = str(tmp_path / "bad.ckpt")
+    assert cli.run([*given, *(["--json"] if json_too else [])]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and words in told.err and told.err.count("\n") == 1
 
 
 def test_a_foreign_checkpoint(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

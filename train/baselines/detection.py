@@ -13,6 +13,7 @@ from train.baselines.detector import Detector
 from train.baselines.views import render_views
 from train.inputs import Array, Batch, column
 from train.observed_visibility import eyes
+from train.scorers import scored
 
 _VIEWS_AT_ONCE = 8
 
@@ -92,7 +93,7 @@ class ThresholdDetector:
     def fit(self, batches: Sequence[Batch[Array]]) -> ThresholdDetector:
         """With the best cut; where all feasible ones are alike there is none to find, and it stays."""
         label = labels(batches, self.name)
-        score = np.concatenate([self.score(b) for b in batches])
+        score = np.concatenate([scored(self, b) for b in batches])
         feasible = score >= 0
         if label[feasible].all() or not label[feasible].any():
             return self

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from schemas.errors import InputError
 from train.evaluation.metrics import F64, Bools
 from train.inputs import Array, Batch
-from train.scorers import Scorer
+from train.scorers import Scorer, scored
 from workers.bases.candidate_sets import in_set
 
 F32 = npt.NDArray[np.float32]
@@ -132,7 +132,7 @@ def gather(
             part = _rows(batch, n_scenes, n_robots)
             for name, scorer in scorers.items():
                 started_s = time.perf_counter()
-                part[f"score {name}"] = _checked(scorer, batch)
+                part[f"score {name}"] = scored(scorer, batch)
                 seconds[name] += time.perf_counter() - started_s
             scenes = len(batch.clouds)
             part |= _scenes(batch, run, cells)
@@ -171,15 +171,6 @@ def _scenes(batch: Batch[Array], run: int, cells: int) -> dict[str, Array]:
         "run": np.full(n, run, np.int64),
         "is_grid": (robots == 1) & (candidates == cells) & (cells > 0),
     }
-
-
-def _checked(scorer: Scorer, batch: Batch[Array]) -> F64:
-    score = np.asarray(scorer.score(batch), np.float64)
-    if score.shape != (len(batch),) or np.isnan(score).any():
-        row = int(np.argmax(np.isnan(score))) if score.shape == (len(batch),) else 0
-        problem = f"no score for sample {batch.sample_id[row].tobytes().hex()}"
-        raise InputError(scorer.name, "score", problem, "Train the model again, or leave this method out")
-    return score
 
 
 def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> None:

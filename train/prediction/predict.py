@@ -28,7 +28,7 @@ from train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from train.prediction.ground import Ground, find_ground
 from train.prediction.growing import grow_mask
 from train.prediction.target import Filled, TargetBox, fill_target, locate
-from train.scorers import ModelScorer, Scorer
+from train.scorers import ModelScorer, Scorer, scored
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse, yaw_pose
 from workers.rendering.cloud import Cloud
@@ -184,7 +184,7 @@ def predict(
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
     places = look_at_places(seen, centre, robot, _grid(grid, half_width_m))
-    score = scorer.score(_batch(cloud, target, robot, places))
+    score = scored(scorer, _batch(cloud, target, robot, places))
     best = _best(score, places, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
     notes = _notes(grounds, filled, cloud)
     return Prediction(

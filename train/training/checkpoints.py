@@ -25,7 +25,7 @@ from torch import Tensor
 from schemas.errors import InputError
 from train.dataset import Origin
 from train.models import Model, build_model
-from train.training.inert import MAX_BYTES, refuse_foreign
+from train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
 from train.training.validation import Measured
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
@@ -126,11 +126,15 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         problem = first["msg"].lower() if first else f"incomplete ({e})"
         raise InputError(place, where, problem, _MEND) from None
     tensors = {name: value for name, value in stored.items() if isinstance(value, Tensor)}
+    _refuse_not_finite(place, tensors, _MEND)
     return Checkpoint(head, _below("weights/", tensors), _below("resume/", tensors), loop)
 
 
 def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Replace the file as a whole: after a crash at any point it is the old one or the new one."""
+    """Replace the file as a whole: after a crash at any point it is the old one or the new one.
+
+    InputError, and the file stays, where a weight or the optimiser's state is not finite.
+    """
     path = Path(path)
     document = {
         "format": FORMAT,
@@ -141,6 +145,8 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     stored: dict[str, Any] = {"head": json.dumps(document, allow_nan=False)}
     stored |= {f"weights/{k}": _own(v) for k, v in checkpoint.weights.items()}
     stored |= {f"resume/{k}": _own(v) for k, v in checkpoint.resume.items()}
+    mend = "Nothing was overwritten. Train again with a smaller --lr and a new --out"
+    _refuse_not_finite(str(path), {k: v for k, v in stored.items() if k != "head"}, mend)
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(f".{path.name}.new")
     try:
@@ -180,6 +186,12 @@ def only_writer(path: str | Path) -> Generator[None]:
             lock.unlink(missing_ok=True)
 
 
+def _refuse_not_finite(place: str, tensors: Mapping[str, Tensor], mend: str) -> None:
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise InputError(place, name, "holds NaN or infinite numbers", mend)
+
+
 def _own(tensor: Tensor) -> Tensor:
     """A dense copy on the CPU: a view would be saved with all of what it is a view of."""
     return tensor.detach().cpu().contiguous().clone()
@@ -208,6 +220,7 @@ def _document(place: str, text: object) -> dict[str, Any]:
         document = None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(place, "head", "not a checkpoint of this program", _MEND)
+    refuse_odd_values(place, document)
     version = document.get("format_version")
     if version != FORMAT_VERSION:
         problem = f"{version!r:.20}, and this program reads {FORMAT_VERSION}"

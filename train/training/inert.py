@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import math
 import pickletools
+import re
 import zipfile
 from dataclasses import dataclass
 from typing import Any
@@ -43,6 +44,8 @@ class _Tensor:
 
 
 _MARK = object()
+_NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+_MAX_TEXT = 4096
 
 
 def refuse_foreign(place: str, data: bytes) -> None:
@@ -53,6 +56,28 @@ def refuse_foreign(place: str, data: bytes) -> None:
         raise InputError(place, "", f"no checkpoint, or one that was cut ({e})", _MEND) from None
     except (*DAMAGED_ZIP, IndexError, KeyError, TypeError) as e:
         raise InputError(place, "", f"not a checkpoint of this program ({e})", _MEND) from None
+
+
+def refuse_odd_values(place: str, document: dict[str, Any]) -> None:
+    """InputError at a number that is not finite or beyond 64 bits, and at text that no terminal may print."""
+    left: list[tuple[str, Any]] = [("", document)]
+    while left:
+        where, value = left.pop()
+        match value:
+            case dict():
+                left += [(where, key) for key in value]
+                left += [(f"{where}.{key:.40}".lstrip("."), item) for key, item in value.items()]
+            case list():
+                left += [(where, item) for item in value]
+            case str() if len(value) > _MAX_TEXT or _NO_TEXT.search(value):
+                problem = (
+                    f"text with control characters or surrogates, or of more than {_MAX_TEXT} characters"
+                )
+                raise InputError(place, where, problem, _MEND)
+            case int() | float() if not -(2.0**63) < value < 2.0**63:
+                raise InputError(place, where, f"{value!s:.20} is not a usable number", _MEND)
+            case _:
+                pass
 
 
 def _check(data: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -65,8 +64,10 @@ class Options:
                 "datagen train", "--house-share", f"{self.house_share}", "Give a share above 0, at most 1"
             )
         for name, value, low in (("lr", self.lr, 0), ("weight-decay", self.weight_decay, -1)):
-            if not math.isfinite(value) or value <= low or value < 0:
-                raise InputError("datagen train", f"--{name}", f"{value}", "Give a positive number")
+            if not max(low, 0) <= value <= 1000 or value == low:
+                raise InputError(
+                    "datagen train", f"--{name}", f"{value}", "Give a positive number, below 1000"
+                )
 
     def document(self) -> dict[str, Any]:
         """As plain data, without the model, which a checkpoint states by itself."""

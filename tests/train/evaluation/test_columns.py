@@ -18,15 +18,15 @@ CELLS = 4
 
 @dataclass(frozen=True)
 class ByX:
-    """A scorer that likes positive x; where `broken`, its second score is no number."""
+    """A scorer that likes positive x; where `broken`, its second score is not finite."""
 
     name: str = "x"
     threshold: float = 0.0
-    broken: bool = False
+    broken: float = 0.0
 
     def score(self, batch: Batch[Array]) -> np.ndarray:
         scores = batch.candidates.base_xy_m[:, 0].astype(np.float64)
-        scores[1] = np.nan if self.broken else scores[1]
+        scores[1] += self.broken
         return scores
 
 
@@ -100,8 +100,9 @@ def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
 
 def test_a_score_that_is_no_number_and_a_run_named_twice_are_refused() -> None:
     rng = np.random.default_rng(0)
-    with pytest.raises(InputError, match="x: score: no score for sample 0301"):
-        gather([(0, [make_batch(3, [1])])], {"x": ByX(broken=True)}, rng)
+    for broken in (np.nan, np.inf, -np.inf):
+        with pytest.raises(InputError, match="x: score: no finite score for sample 0301"):
+            gather([(0, [make_batch(3, [1])])], {"x": ByX(broken=broken)}, rng)
     with pytest.raises(InputError, match="03000000000000000000000000000000 comes twice"):
         gather([(0, [make_batch(3, [1])]), (0, [make_batch(3, [1])])], {"x": ByX()}, rng)
 

@@ -250,6 +250,52 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path):
             load_model(tmp_path / "c.ckpt")
 
 
+def stored_with(path: Path, source: Path, **changes: Any) -> Path:
+    """The checkpoint with other entries, as torch alone writes it."""
+    torch.save({**torch.load(source, weights_only=True), **changes}, path)
+    return path
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_numbers_that_are_not_finite_are_refused(written: Path, tmp_path: Path, value: float):
+    name = "token.1.bias"
+    bias = torch.load(written, weights_only=True)[f"weights/{name}"]
+    bias[-1] = value
+    for key in (f"weights/{name}", "weights/token.1.running_var", f"resume/{name}"):
+        path = stored_with(tmp_path / "bad.ckpt", written, **{key: bias})
+        with pytest.raises(InputError, match=f"{key}: holds NaN or infinite numbers"):
+            load_model(path)
+    whole = read_checkpoint(written)
+    path = tmp_path / "kept.ckpt"
+    write_checkpoint(path, whole)
+    before = path.read_bytes()
+    for weights, resume in (({name: bias}, {}), (whole.weights, {"model.x": bias})):
+        with pytest.raises(InputError, match="Nothing was overwritten"):
+            write_checkpoint(path, Checkpoint(whole.head, weights, resume))
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir() if p.name != "bad.ckpt"] == ["kept.ckpt"]
+
+
+def test_every_text_and_number_of_the_document_is_checked(written: Path, tmp_path: Path):
+    document = json.loads(torch.load(written, weights_only=True)["head"])
+    texts = ["\ud800", "a\0b", "a\nb", "\x1b[31m", "a" * 5000]
+    numbers: list[Any] = [float("nan"), float("inf"), 10**400, -(10**20)]
+    changes: list[tuple[str, str, Any]] = [("head", "stage", value) for value in texts]
+    changes += [("head", "house_ids", [value]) for value in texts]
+    changes += [("head", "options", {value: 1}) for value in texts]
+    changes += [("head", "cost", {"train_cpu_s": value}) for value in numbers]
+    changes += [("head", "options", {"deep": [[{"lr": value}]]}) for value in numbers]
+    changes += [("loop", "sums", [value, 0.0, 0.0, 0.0]) for value in numbers]
+    for part, field, value in changes:
+        text = json.dumps({**document, part: {**document[part], field: value}})
+        with pytest.raises(
+            InputError, match=r"not a usable number|control characters or surrogates"
+        ) as error:
+            read_checkpoint(stored_with(tmp_path / "odd.ckpt", written, head=text))
+        assert f"{part}.{field}" in error.value.field
+        str(error.value).encode()
+
+
 @pytest.mark.parametrize("at", ["fsync", "replace"])
 def test_killed_while_it_is_written_the_old_file_is_whole(tmp_path: Path, at: str):
     path = tmp_path / "c.ckpt"

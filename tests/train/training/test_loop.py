@@ -17,7 +17,7 @@ from train.inputs import Array, Batch
 from train.training.checkpoints import load_model, read_checkpoint
 from train.training.loop import Batches, run
 from train.training.ranks import Ranks
-from train.training.stages import prepare
+from train.training.stages import keep, prepare
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +131,19 @@ def test_a_gradient_that_is_no_number_ends_it_too(heuristic_run: Path, tmp_path:
     with pytest.raises(InputError, match="gradient: not a number, at "):
         run(training, lambda: None, Recorder())
     assert equal(training.model.state_dict(), before)
+
+
+def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: Path, tmp_path: Path):
+    """A loss is looked at before a step, so that weights can be lost where the step is the last one."""
+    job = job_of(heuristic_run, tmp_path / "c.ckpt")
+    assert train_until(job, 2)[0] is False
+    before = Path(job.out).read_bytes()
+    training, head = prepare(job, Ranks())
+    weight = next(iter(training.model.parameters()))
+    training.optimiser.register_step_post_hook(lambda *_: weight.data.fill_(float("inf")))
+    with pytest.raises(InputError, match=r"holds NaN or infinite numbers\. Nothing was overwritten"):
+        run(training, lambda: keep(job.out, training, head), Recorder(), lambda: True)
+    assert Path(job.out).read_bytes() == before
 
 
 def test_what_a_step_tells(heuristic_run: Path, whole: Path, tmp_path: Path):
