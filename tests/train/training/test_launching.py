@@ -5,7 +5,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import stat
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +59,53 @@ def test_two_processes_train_like_one_on_both_their_batches_and_end_together(
     assert one.keys() == two.keys()
     for name, value in one.items():
         assert value == pytest.approx(two[name], rel=1e-4), name
+
+
+WAITING = """
+import sys
+from pathlib import Path
+from tests.train.training.rank_work import wait_for_stop
+from train.training.launching import train_in_processes
+job = sys.argv[1]
+assert train_in_processes(wait_for_stop, job, 1, "cpu", lambda: Path(job + ".stop").exists())
+"""
+
+
+def test_the_folder_of_a_killed_training_is_removed_by_the_next_and_that_of_a_living_one_stays(
+    tmp_path: Path,
+):
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    running: list[subprocess.Popen[bytes]] = []
+
+    def begin(name: str) -> Path:
+        """A training that has begun; its folder."""
+        known = set(temporary.iterdir())
+        command = [sys.executable, "-c", WAITING, str(tmp_path / name)]
+        running.append(subprocess.Popen(command, env={**os.environ, "TMPDIR": str(temporary)}))
+        while not (tmp_path / name).exists():
+            assert running[-1].poll() is None
+            time.sleep(0.05)
+        (folder,) = set(temporary.glob("datagen-*")) - known
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        return folder
+
+    try:
+        dead = begin("killed")
+        running[0].kill()
+        running[0].wait()
+        assert dead.is_dir()
+        living = begin("living")
+        assert not dead.exists()
+        third = begin("third")
+        assert living.is_dir() and third.is_dir()
+        for name in ("living", "third"):
+            (tmp_path / f"{name}.stop").touch()
+        assert [process.wait() for process in running[1:]] == [0, 0]
+        assert not list(temporary.glob("datagen-*"))
+    finally:
+        for process in running:
+            process.kill()
 
 
 def test_the_first_interrupt_is_noted_and_the_second_ends():
