@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import zipfile
 import zlib
@@ -189,6 +190,17 @@ def bad_files(folder: Path) -> None:
     write_npy(folder / "bomb.npz", npy_header("|u1", (70_000_000,)) + bytes(70_000_000))
     write_npy(folder / "junk.npz", b"junk")
     (folder / "noarchive.npz").write_text("no archive")
+    with zipfile.ZipFile(folder / "records.npz", "w") as archive:
+        for number in range(10_001):
+            archive.writestr(f"{number}.npy", b"")
+    with open(folder / "sparse.npz", "wb") as file:
+        file.truncate(2**40)
+    for name in ("fifo", "fifo.npz", "fifo.png", "fifo.json"):
+        os.mkfifo(folder / name)
+    for name in ("zero.npz", "zero.png"):
+        (folder / name).symlink_to("/dev/zero")
+    (folder / "frame").mkdir()
+    os.mkfifo(folder / "frame" / "color.png")
 
 
 # The option that is changed, its value, and words of the refusal. `-` leaves the option out.
@@ -244,6 +256,16 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--frame", "{bad}/bomb.npz", "unpacks"),
     ("--frame", "{bad}/junk.npz", "not an array"),
     ("--frame", "{bad}/noarchive.npz", "not a .npz"),
+    ("--frame", "{bad}/records.npz", "not a .npz"),
+    ("--frame", "{bad}/sparse.npz", "more than 268,435,456 bytes"),
+    ("--frame", "{bad}/fifo", "no frame"),
+    ("--frame", "{bad}/fifo.npz", "not a file"),
+    ("--frame", "{bad}/zero.npz", "not a file"),
+    ("--frame", "{bad}/frame", "not a file"),
+    *((option, "{bad}/fifo.png", "not a file") for option in ("--rgb", "--depth", "--mask")),
+    ("--depth", "{bad}/zero.png", "not a file"),
+    ("--intrinsics", "{bad}/fifo.json", "not a file"),
+    ("--camera-pose", "{bad}/fifo.json", "not a file"),
     ("--frame", "{made}/frame", "pose"),  # one more, where the first has none
     ("--frame-dir", "{bad}/missing", "no such folder"),
     ("--out", "{bad}/a.jpg", ".png"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import warnings
 from pathlib import Path
 
@@ -36,9 +37,8 @@ def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
     if not path.is_file():
         raise InputError(path, "", "not a file" if path.exists() else "no such file", mend)
     with open(path, "rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise InputError(path, "", f"more than {most:,} bytes", "Give a smaller file")
+        if os.fstat(file.fileno()).st_size > most or len(data := file.read(most + 1)) > most:
+            raise InputError(path, "", f"more than {most:,} bytes", "Give a smaller file")
     return data
 
 

@@ -17,6 +17,7 @@ from train.prediction.files import MAX_FILE_BYTES, MAX_PIXELS, read_bytes
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS
+_MAX_RECORDS = 10_000
 _MEND = (
     "Write it with numpy.savez: depth, rgb, intrinsics (fx, fy, cx, cy), and if you like mask, T_world_camera"
 )
@@ -27,6 +28,9 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     data = read_bytes(path, MAX_FILE_BYTES)
     found: dict[str, npt.NDArray[Any]] = {}
     try:
+        # Every record of the zip's directory begins with these bytes; counted before a list is made of them.
+        if data.count(b"PK\1\2") > _MAX_RECORDS:
+            raise ValueError("too many records")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for name in NAMES:
                 if (info := archive.NameToInfo.get(f"{name}.npy")) is not None:
