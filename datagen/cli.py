@@ -17,6 +17,7 @@ from cyclopts.exceptions import CycloptsError, UnknownCommandError
 from cluster.environment import job_environment
 from datagen import __version__
 from schemas.errors import InputError, one_line, refuse_not_utf8
+from workers.registry import missing_library
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -106,6 +107,8 @@ def _lines_for(error: Exception) -> list[str] | None:
         from schemas.storage.errors import machine_error
 
         return [str(known)] if (known := machine_error(error)) else None
+    if (missing := missing_library(error)) is not None:
+        return [str(missing)]
     # pydantic takes 0.1 s to import; whoever raised its error has imported it.
     if "pydantic" in sys.modules:
         from pydantic import ValidationError

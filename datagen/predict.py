@@ -188,6 +188,8 @@ def _direction(text: str) -> F64:
 
 def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
     """What is written must be new, or an older picture or page; never one of the inputs."""
+    if html is not None:
+        import train.prediction.page  # noqa: F401 - a missing library is known before anything is scored
     read = {path.resolve() for path in inputs if path is not None}
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:

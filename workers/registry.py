@@ -12,9 +12,35 @@ from typing import Any
 
 from schemas.errors import InputError, choices
 
-# What the `sim` extra brings, by the names that are imported; the core works without.
-SIM_MODULES = ("pinocchio", "coal", "mani_skill")
-SIM_MEND = "Install the extra that brings it: pip install 'datagen[sim]'"
+# What extras bring, by the names that are imported: what pip calls it, and the extra. The core works without.
+EXTRAS = {
+    "torch": ("torch", "train"),
+    "tensorboard": ("tensorboard", "train"),
+    "plotly": ("plotly", "train"),
+    "transformers": ("transformers", "detect"),
+    "pinocchio": ("pin", "sim"),
+    "coal": ("coal", "sim"),
+    "mani_skill": ("mani-skill", "sim"),
+}
+SIM_MODULES = tuple(name for name, (_, extra) in EXTRAS.items() if extra == "sim")
+
+
+def install_line(*modules: str) -> str:
+    """How to install these modules of one extra, for an error's mend."""
+    packages = " ".join(EXTRAS[name][0] for name in modules)
+    return (
+        f"Install it: pip install {packages}, or the extra `{EXTRAS[modules[0]][1]}` of the folder or URL "
+        "that datagen was installed from"
+    )
+
+
+SIM_MEND = install_line(*SIM_MODULES)
+
+
+def missing_library(error: Exception) -> InputError | None:
+    """The one line for a library of an extra that is not installed; None for any other error."""
+    name = (error.name or "").split(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    return InputError(name, "", "is not installed", install_line(name)) if name in EXTRAS else None
 
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
@@ -30,7 +56,7 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
         return getattr(import_module(module), attribute)
     except ImportError as error:
         mend = f"Run `datagen doctor`, or take another one: {', '.join(sorted(registry))}"
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in SIM_MODULES:
+        if missing_library(error) is not None:
             mend = SIM_MEND
         raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
 

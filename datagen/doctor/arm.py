@@ -34,7 +34,7 @@ from datagen.doctor.lift import main
 raise SystemExit(main())
 """
 
-_AGAIN = "Install it again: pip install --force-reinstall 'datagen[sim]'"
+_AGAIN = "Install it again: pip install --force-reinstall pin coal mani-skill"
 # Several times what it takes where every file is read for the first time and the cores are busy.
 _DEADLINE_S = 120.0
 # An arm stands so high where its own limits allow any height.

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from schemas.errors import InputError, choices
 from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
+from workers.registry import SIM_MEND
 from workers.robots import ROBOTS, robot_limits
 
 # Label sources that move an arm, and the distributions whose version can move bits of their labels.
@@ -31,9 +32,7 @@ def refuse_missing_packages(label_source: str) -> None:
             version(name)
         except PackageNotFoundError:
             problem = f"needs {name}, which is not installed"
-            raise InputError(
-                "label source", label_source, problem, "Run `pip install datagen[sim]`"
-            ) from None
+            raise InputError("label source", label_source, problem, SIM_MEND) from None
 
 
 def arm_versions(label_source: str) -> dict[str, str]:

@@ -12,6 +12,7 @@ from datagen import cli, doctor
 from datagen.doctor import arm, engines, host
 from datagen.doctor.check import Check, probe
 from datagen.doctor.host import ENOUGH_DISK_BYTES
+from workers.registry import SIM_MEND
 from workers.robots import ROBOTS
 
 
@@ -62,7 +63,7 @@ def test_a_missing_extra_is_one_warning_that_names_it(monkeypatch: pytest.Monkey
     monkeypatch.setattr(arm, "_LIBRARIES", "import sys; sys.modules['coal'] = None; import coal")
     (check,) = arm.arm_checks()
     assert check.status == "warn" and "coal" in check.detail
-    assert check.mend == "Install the extra that brings it: pip install 'datagen[sim]'"
+    assert check.mend == SIM_MEND and "pip install pin coal mani-skill" in SIM_MEND
 
 
 def test_what_is_broken_of_the_arm_stack_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError
+from workers.registry import install_line
 
 U8 = npt.NDArray[np.uint8]
 
@@ -52,7 +53,7 @@ class ZeroShotDetector:
         try:
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
         except ImportError as error:
-            mend = "Install it with `pip install 'datagen[detect]'`"
+            mend = install_line("transformers")
             raise InputError("--detector", "transformers", f"not usable ({error})", mend) from None
         try:
             self._processor: Any = AutoProcessor.from_pretrained(where, local_files_only=True)

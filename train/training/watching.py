@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from schemas.errors import InputError
+from workers.registry import install_line
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class TensorBoard:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            mend = "Install the extra `train` (it holds tensorboard), or leave --tensorboard out"
+            mend = install_line("tensorboard")
             raise InputError("--tensorboard", "", "the package tensorboard is not installed", mend) from None
         self._writer = SummaryWriter(folder, purge_step=step + 1)
         self._step = step
