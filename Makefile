@@ -51,7 +51,7 @@ test: lint
 	&& rm -rf $$scratch
 
 # Each ends with an error where a promise was broken.
-FAULTS := crash_points damage kills executors two_drivers s3 confinement listing swaps storage_errors hostile_files
+FAULTS := crash_points damage kills executors two_drivers s3 confinement listing swaps storage_errors hostile_files many_scenes
 faults: venv
 	@set -e; for name in $(FAULTS); do echo; echo "== $$name"; $(BIN)/python -m benchmarks.faults.$$name; done
 	@echo; echo "== driver"; $(BIN)/python -m benchmarks.driver
