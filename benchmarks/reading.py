@@ -16,6 +16,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ from train.reader import load_shard
 
 REPEATS = 5
 FIELDS = (*SCENES, *SAMPLES, "sample_scene_index")
+STREAMED = (*FIELDS, "scene_index")
+TRAINED_A_SECOND = 4000  # docs/training-data.md
 ALL = Augmentation(SensorNoise(), DepthHoles(), PointDropout(), ColourJitter(), Rotation())
 
 
@@ -62,6 +65,7 @@ def main() -> None:
         seal(run.storage)
         print(f"sealed {len(run.committed())} shards in {time.perf_counter() - started:.2f} s")
         _print_sizes(run)
+        _print_digests(Path(run.storage.url))
         _print_rates(Path(run.storage.url))
 
 
@@ -70,6 +74,28 @@ def _print_sizes(run: Run) -> None:
     size = sum(p.stat().st_size for p in paths if p.is_file())
     blocks = sum(p.stat().st_blocks * 512 for p in paths)
     print(f"{size / run.n:.0f} bytes a sample, {blocks / run.n:.0f} on disk with files' and folders' blocks")
+
+
+def _print_digests(folder: Path) -> None:
+    """What it costs to hold every file that a stream reads against its commit, once in a process."""
+    stream = SampleStream([folder])
+    shards = sorted((folder / "shards").glob("*/*"))
+    paths = [p for s in shards for name in STREAMED for p in (s / name).glob("c.*")]
+    spent: list[tuple[float, float]] = []
+    for _ in range(REPEATS):
+        begun = time.process_time()
+        _ = sum(len(batch) for batch in stream.epoch(0))
+        epoch_s, hash_s = time.process_time() - begun, 0.0
+        for path in paths:
+            data = path.read_bytes()
+            begun = time.process_time()
+            sha256(data).digest()
+            hash_s += time.process_time() - begun
+        spent.append((hash_s, epoch_s))
+    hash_s, epoch_s = (statistics.median(column) for column in zip(*spent, strict=True))
+    share = hash_s / (stream.n_samples / TRAINED_A_SECOND)
+    print(f"sha256 of all files, once in a process: {1000 * hash_s:.0f} CPU ms; of an epoch of reading alone")
+    print(f"{hash_s / epoch_s:.1%}, of one of training at {TRAINED_A_SECOND:,} samples a second {share:.2%}")
 
 
 def _print_rates(folder: Path) -> None:

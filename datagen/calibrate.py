@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AsJson
+from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import steps
 from datagen.console.whole_number import WHOLE_NUMBER
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 Sets = Literal["grid", "clear", "in-range"]
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
 
-_MOST_RESAMPLES = 10_000
 _SAMPLE_FIELDS = ("distance_m", "mount_distance_m", "arm_reach_m", "visibility", "base_is_clear", "label")
 _COUNTS = ("true_positive", "false_positive", "false_negative", "true_negative")
 _METRICS = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
@@ -65,6 +64,7 @@ def calibrate(
         int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
     ] = 1000,
     seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of folds and resamples.")] = 0,
+    allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
     """Fit what the paper leaves open in its rule, mu, sigma_l, sigma_r and tau, to labels of grasp trials.
@@ -80,7 +80,7 @@ def calibrate(
     if specs[0].heuristic.alpha == 1 and not fit_alpha:
         problem = "1 in these runs: distance has no weight, and nothing to fit"
         raise InputError(runs[0], "heuristic.alpha", problem, "Give --fit-alpha")
-    trials = _read(runs, candidates)
+    trials = _read(runs, candidates, allow_incomplete)
     refuse_too_little(trials, ", ".join(runs))
     forms = FORMS if distance == "any" else (distance,)
     for warning in warnings:
@@ -118,11 +118,7 @@ def calibrate(
 
 
 def _refuse_odd(out: Path, bootstrap: int, seed: int) -> None:
-    if not 1 <= bootstrap <= _MOST_RESAMPLES:
-        mend = f"Give 1 to {_MOST_RESAMPLES}; 1000 is usual"
-        raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
-    if seed < 0:
-        raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+    refuse_odd_draws(bootstrap, seed)
     if out.suffix.lower() != ".toml":
         raise InputError(out, "--out", "is not a .toml file", "Give a name that ends in .toml")
     if not out.parent.is_dir():
@@ -169,14 +165,14 @@ def _specifications(
     return [spec for _, spec in found], warnings
 
 
-def _read(places: Sequence[str], candidates: Sets) -> Trials:
+def _read(places: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Trials:
     """The labels of all runs over the named set of candidates."""
     import numpy as np
 
     from train.calibration import Trials
     from train.reader import SampleReader
 
-    reader = SampleReader(places, scene_fields=("house_id",), sample_fields=_SAMPLE_FIELDS)
+    reader = SampleReader(places, ("house_id",), _SAMPLE_FIELDS, allow_incomplete)
     parts: list[dict[str, Any]] = []
     n_scenes = 0
     for columns in reader.shards():

@@ -7,13 +7,11 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AsJson
+from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
-
-_MOST_RESAMPLES = 10_000
 
 
 def evaluate(
@@ -48,6 +46,7 @@ def evaluate(
     allow_seen_houses: Annotated[
         bool, Parameter(negative=(), help="Tell apart of houses that were trained on, instead of refusing.")
     ] = False,
+    allow_incomplete: AllowIncomplete = False,
     threads: Annotated[
         int | None, WHOLE_NUMBER, Parameter(help="Threads that models compute on [torch's choice].")
     ] = None,
@@ -76,13 +75,13 @@ def evaluate(
         from train.scorers import use_threads
 
         use_threads(threads)
-    opened = open_places(runs)
+    opened = open_places(runs, allow_incomplete)
     sets = sets_of(opened, candidates or [])
     models = open_models(checkpoints)
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    lineup = line_up(baselines, fit or [], detector, rule, seed, opened, allow_seen_houses)
+    lineup = line_up(baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete)
     contestants = [*lineup.baselines, *models]
     if not contestants:
         mend = "Name a checkpoint, or leave --baselines out"
@@ -134,11 +133,7 @@ def write_page(path: Path, text: str) -> None:
 
 
 def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:
-    if not 1 <= bootstrap <= _MOST_RESAMPLES:
-        mend = f"Give 1 to {_MOST_RESAMPLES}; 1000 is usual"
-        raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
-    if seed < 0:
-        raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+    refuse_odd_draws(bootstrap, seed)
     if threads is not None and not 1 <= threads <= 1024:
         raise InputError("--threads", str(threads), "not a usable number of threads", "Give 1 or more")
     if html is not None and html.suffix.lower() not in (".html", ".htm"):

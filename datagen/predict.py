@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -189,7 +190,7 @@ def _direction(text: str) -> F64:
 def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
     """What is written must be new, or an older picture or page; never one of the inputs."""
     if html is not None:
-        import train.prediction.page  # noqa: F401 - a missing library is known before anything is scored
+        import_module("train.prediction.page")  # a missing library is named before anything is scored
     read = {path.resolve() for path in inputs if path is not None}
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:

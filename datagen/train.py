@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AsJson
+from datagen.console.options import AllowIncomplete, AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.training.options import model_sizes, read_augmentation, share_cores
@@ -66,6 +66,7 @@ def train(
     ] = None,
     threads: Annotated[Whole, Parameter(help="Threads of each process [cores over processes].")] = None,
     tensorboard: Annotated[str | None, Parameter(help="A folder for TensorBoard's curves.")] = None,
+    allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
     """Train a model and keep it, with all that made it, in one file.
@@ -114,6 +115,7 @@ def train(
         each,
         tensorboard=tensorboard,
         json_lines=json,
+        allow_incomplete=allow_incomplete,
     )
     return _report(out, _train(job, n_processes), json)
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.fields import SceneRows
-from schemas.keys import shard_folder
 from schemas.run import Run
-from schemas.shard_reading import Array, committed_place, read_metadata
+from schemas.shard_reading import Array, read_committed
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:
@@ -59,8 +58,5 @@ def committed_scenes(run: Run) -> int:
 
 def read_shard(run: Run, shard: int) -> dict[str, Array]:
     """Every array of a committed shard, all of its rows. InputError for a missing or damaged file."""
-    commit = run.commit_of(shard)
-    folder = shard_folder(shard, commit.attempt)
-    place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)
     names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
-    return place.read(read_metadata(run.storage, folder, names).values())
+    return read_committed(run.storage, run.commit_of(shard), names)

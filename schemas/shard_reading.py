@@ -1,5 +1,6 @@
 """Arrays read straight from a run's chunk files: a whole shard at a time, every byte checked.
 
+A committed file is held against its sha256 when a process first reads it, and against its own crc32c always.
 Works on committed shards and on a sealed store, on any storage, and needs no array library to open
 fifty arrays a shard. What the files hold is taken from their own zarr.json, so that runs of older
 schema versions read on.
@@ -9,8 +10,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import google_crc32c
@@ -20,6 +23,7 @@ from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
 from schemas.errors import InputError
+from schemas.keys import shard_folder
 from schemas.run_records import Commit
 from schemas.shard_files import MAX_TEXT_BYTES
 from schemas.storage import Storage
@@ -28,6 +32,7 @@ Array = npt.NDArray[Any]
 
 MAX_META_BYTES = 2**20
 MAX_DECODED_BYTES = 2**30  # no chunk of ours comes near; a larger one is hostile
+_CHECKED = b""
 _MEND = "Restore the file from a copy, or mend the run with `datagen repair`"
 
 
@@ -106,7 +111,8 @@ class ShardPlace:
     """Where one shard's rows lie: in a committed attempt's folder, or as a slice of a sealed store.
 
     `ordinal` is the shard's place in the folder's arrays: 0 in its own folder. `scenes` and
-    `samples` are the rows wanted of it; `sizes` are the committed file sizes where known.
+    `samples` are the rows wanted of it. `digests` are the committed files' sha256 by path, "" once they were
+    checked; None where no commit came along.
     """
 
     storage: Storage
@@ -116,20 +122,40 @@ class ShardPlace:
     samples: int
     full_scenes: int
     full_samples: int
-    sizes: Mapping[str, int] | None = None
+    digests: dict[str, bytes] | None = None
+
+    def metadata(self, names: Iterable[str]) -> dict[str, StoredArray]:
+        """The named arrays' metadata. InputError names a missing, foreign or damaged file."""
+        found: dict[str, StoredArray] = {}
+        paths = [f"{name}/zarr.json" for name in names]
+        for path, place, data in self._files(paths, MAX_META_BYTES):
+            name = path.removesuffix("/zarr.json")
+            found[name] = parse_metadata(place, name, data)
+        return found
 
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
         """The shard's rows of each array. InputError names a missing, foreign or damaged file."""
-        wanted = list(arrays)
-        chunks = [(array, path) for array in wanted for path in self._paths(array)]
-        keys = (f"{self.folder}/{path}" if self.folder else path for _, path in chunks)
-        parts: dict[str, list[Array]] = {array.name: [] for array in wanted}
-        found = self.storage.get_many(keys, MAX_DECODED_BYTES)
-        for (array, path), (key, data) in zip(chunks, found, strict=True):
-            place = f"{self.storage.url}/{key}"
-            self._refuse_other_size(place, path, array, data)
-            parts[array.name].append(decode_chunk(place, array, data or b""))
-        return {array.name: self._joined(array, parts[array.name]) for array in wanted}
+        wanted = {array.name: array for array in arrays}
+        paths = [path for array in wanted.values() for path in self._paths(array)]
+        parts: dict[str, list[Array]] = {name: [] for name in wanted}
+        for path, place, data in self._files(paths, MAX_DECODED_BYTES):
+            name = path.partition("/")[0]
+            parts[name].append(decode_chunk(place, wanted[name], data))
+        return {name: self._joined(array, parts[name]) for name, array in wanted.items()}
+
+    def _files(self, paths: Sequence[str], most: int) -> Iterator[tuple[str, str, bytes]]:
+        """(path, where it lies, bytes) of files, those of a commit held against it."""
+        keys = (f"{self.folder}/{path}" if self.folder else path for path in paths)
+        for path, (key, data) in zip(paths, self.storage.get_many(keys, most), strict=True):
+            place, name = f"{self.storage.url}/{key}", path.partition("/")[0]
+            if data is None:
+                raise InputError(place, name, "no such file", _MEND)
+            if self.digests is not None and (digest := self.digests.get(path)) != _CHECKED:
+                if sha256(data).digest() != digest:
+                    problem = f"{len(data)} bytes whose sha256 is not that of the commit"
+                    raise InputError(place, name, problem, _MEND)
+                self.digests[path] = _CHECKED
+            yield path, place, data
 
     def _paths(self, array: StoredArray) -> list[str]:
         """Paths of the chunks that hold the wanted rows."""
@@ -142,32 +168,30 @@ class ShardPlace:
 
     def _joined(self, array: StoredArray, parts: list[Array]) -> Array:
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        if whole.dtype.kind == "f" and not np.isfinite(whole).all():
+            place = f"{self.storage.url}/{self.folder}"
+            raise InputError(place, array.name, "holds NaN or infinite numbers", _MEND)
         return whole[: self.scenes if array.dims[0] == "scene" else self.samples]
 
-    def _refuse_other_size(self, place: str, path: str, array: StoredArray, data: bytes | None) -> None:
-        if data is None:
-            raise InputError(place, array.name, "no such file, though it was committed", _MEND)
-        if self.sizes is not None and self.sizes.get(path) != len(data):
-            problem = f"{len(data)} bytes, where the commit has {self.sizes.get(path)}"
-            raise InputError(place, array.name, problem, _MEND)
+
+def committed_place(
+    storage: Storage, commit: Commit, names: Iterable[str], scenes: int, samples: int
+) -> ShardPlace:
+    """Where the wanted rows of a committed shard lie, for reading these arrays."""
+    wanted, folder = set(names), shard_folder(commit.shard, commit.attempt)
+    # Interned: every shard of a run has files of the same names, and readers hold all shards.
+    digests = {
+        sys.intern(entry.path): bytes.fromhex(entry.sha256)
+        for entry in commit.files
+        if entry.path.partition("/")[0] in wanted
+    }
+    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, digests)
 
 
-def committed_place(storage: Storage, folder: str, commit: Commit, scenes: int, samples: int) -> ShardPlace:
-    """Where the wanted rows of a committed shard lie."""
-    sizes = {entry.path: entry.size for entry in commit.files}
-    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, sizes)
-
-
-def read_metadata(storage: Storage, folder: str, names: Iterable[str]) -> dict[str, StoredArray]:
-    """The named arrays' metadata from a group's folder."""
-    listed = list(names)
-    keys = (f"{folder}/{name}/zarr.json" if folder else f"{name}/zarr.json" for name in listed)
-    found: dict[str, StoredArray] = {}
-    for name, (key, data) in zip(listed, storage.get_many(keys, MAX_META_BYTES), strict=True):
-        if data is None:
-            raise InputError(f"{storage.url}/{key}", "", "no such file", _MEND)
-        found[name] = parse_metadata(f"{storage.url}/{key}", name, data)
-    return found
+def read_committed(storage: Storage, commit: Commit, names: Sequence[str]) -> dict[str, Array]:
+    """The named arrays of a committed shard, all of its rows. InputError as `ShardPlace.read`."""
+    place = committed_place(storage, commit, names, commit.scenes, commit.samples)
+    return place.read(place.metadata(names).values())
 
 
 def _content_bytes(frame: bytes) -> int:

@@ -65,7 +65,8 @@ class SampleStream:
     which houses count, by house_id. `extra` names further columns of the store. Of `world` ranks each
     gives batches of its own, equally many, that together are the epoch. With `shuffle`, scenes are
     shuffled within `buffer_shards` shards; without, they keep their stored order. Two such buffers are
-    in memory at most. docs/training-data.md says what stays the same when what changes.
+    in memory at most. Runs that lack planned samples are read with `allow_incomplete` alone.
+    docs/training-data.md says what stays the same when what changes.
 
     InputError names what is missing, foreign or damaged, in the constructor or while reading.
     """
@@ -84,6 +85,7 @@ class SampleStream:
         shuffle: bool = True,
         rank: int = 0,
         world: int = 1,
+        allow_incomplete: bool = False,
     ) -> None:
         _refuse_below("scenes_per_batch", scenes_per_batch, 1)
         _refuse_below("buffer_shards", buffer_shards, 1)
@@ -100,9 +102,9 @@ class SampleStream:
         self.rank, self.world = rank, world
 
         needs = augment.fields if augment else ()
-        parts = open_parts(places, list(dict.fromkeys([*_CORE, *TABLE_FIELDS, *extra, *needs])))
-        self._extra = tuple(dict.fromkeys(extra))
         names = list(dict.fromkeys([*_CORE, *extra, *needs]))
+        parts = open_parts(places, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete)
+        self._extra = tuple(dict.fromkeys(extra))
         self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
         self._scenes = read_scene_table(parts, candidates_per_robot, houses)

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from schemas.errors import InputError, choices
-from schemas.keys import shard_folder
 from schemas.merged import open_runs
 from schemas.run import Run
 from schemas.run_records import Commit
-from schemas.shard_reading import ShardPlace, StoredArray, committed_place, read_metadata
+from schemas.shard_reading import ShardPlace, StoredArray, committed_place
 from schemas.storage import open_storage
 from train.sealed import is_sealed_store, open_sealed
 
@@ -33,15 +32,18 @@ class Part:
     cost: Mapping[str, float] | None
 
 
-def open_parts(places: Sequence[Path | str], names: Sequence[str]) -> list[Part]:
+def open_parts(
+    places: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
+) -> list[Part]:
     """The runs of all places, in order, with the named arrays, which are alike in all of them.
 
-    InputError where a place is no run, of a schema that this program does not know, without shards or
-    without such a field, and where two of them store a field differently.
+    InputError where a place is no run, of a schema that this program does not know, without such a field,
+    or lacks samples that its plan has (without any, if `allow_incomplete`), and where two of them store a
+    field differently.
     """
     if not places:
         raise InputError("training data", "", "no run is named", "Name at least one run's folder")
-    parts = [part for place in places for part in _open(place, names)]
+    parts = [part for place in places for part in _open(place, names, allow_incomplete)]
     for part in parts[1:]:
         for name, ours in part.arrays.items():
             first = parts[0].arrays[name]
@@ -55,7 +57,7 @@ def _words(array: StoredArray) -> str:
     return f"{array.dtype} {array.shape[1:]} a {array.dims[0]}"
 
 
-def _open(place: Path | str, names: Sequence[str]) -> list[Part]:
+def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[Part]:
     """The run, each of the merged ones, or the sealed store."""
     if is_sealed_store(place):
         sealed = open_sealed(place, names)
@@ -71,57 +73,59 @@ def _open(place: Path | str, names: Sequence[str]) -> list[Part]:
             )
         ]
     storage = open_storage(place, probe=False, create=False)
-    opened = [part for run in open_runs(storage) if (part := _open_run(run, names)) is not None]
+    found = (_open_run(run, names, allow_incomplete) for run in open_runs(storage))
+    opened = [part for part in found if part is not None]
     if not opened:
         raise InputError(storage.url, "commits", "no shard is committed", "Make some with `datagen resume`")
     return opened
 
 
-def _open_run(run: Run, names: Sequence[str]) -> Part | None:
+def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> Part | None:
     _ = run.schema  # refuses a version that this program does not know
-    n = run.n
-    commits = [commit for commit in run.commits() if commit.shard < run.layout.shards_for(n)]
-    if not commits:
+    n, url = run.n, run.storage.url
+    paths = {f"{name}/zarr.json" for name in names}
+    shards: list[ShardPlace] = []
+    arrays: dict[str, StoredArray] = {}
+    first: dict[str, str] = {}
+    cost = {"wall_s": 0.0, "cpu_s": 0.0}
+    for commit in run.commits():
+        if commit.shard >= run.layout.shards_for(n):
+            continue
+        place = committed_place(run.storage, commit, names, *run.layout.rows_wanted(commit.shard, n))
+        metadata = {entry.path: entry.sha256 for entry in commit.files if entry.path in paths}
+        if not shards:
+            _refuse_unknown(url, names, commit)
+            first, arrays = metadata, place.metadata(names)
+        # Merged runs may come from programs that word an array's meaning otherwise.
+        elif metadata != first:
+            _refuse_other_arrays(place, arrays)
+        shards.append(place)
+        for kind in ("wall", "cpu"):
+            cost[f"{kind}_s"] += commit.cost.all_s[kind]
+    missing = n - sum(place.samples for place in shards)
+    if missing and not allow_incomplete:
+        problem = f"{missing:,} of the {n:,} planned samples are not committed"
+        mend = f"Make them with `datagen resume {url}`, or accept a part of the run with --allow-incomplete"
+        raise InputError(url, "commits", problem, mend)
+    if not shards:
         return None
-    arrays = _arrays(run, commits, names)
-    shards = [
-        committed_place(run.storage, _folder(commit), commit, *run.layout.rows_wanted(commit.shard, n))
-        for commit in commits
-    ]
-    cost = {
-        "wall_s": sum(commit.cost.all_s["wall"] for commit in commits),
-        "cpu_s": sum(commit.cost.all_s["cpu"] for commit in commits),
-    }
     manifest = run.manifest
     version = manifest.schema_version
-    return Part(run.storage.url, (manifest.spec_hash,), manifest.schema_name, version, shards, arrays, cost)
+    return Part(url, (manifest.spec_hash,), manifest.schema_name, version, shards, arrays, cost)
 
 
-def _arrays(run: Run, commits: Sequence[Commit], names: Sequence[str]) -> dict[str, StoredArray]:
-    """The named arrays as the first shard has them. InputError where another has them otherwise."""
-    digests = [{entry.path: entry.sha256 for entry in commit.files} for commit in commits]
-    paths = [f"{name}/zarr.json" for name in names]
-    for name, path in zip(names, paths, strict=True):
-        if path not in digests[0]:
-            stored = [p.removesuffix("/zarr.json") for p in digests[0] if p.endswith("/zarr.json")]
-            raise InputError(run.storage.url, name, "the run stores no such field", choices(stored))
-    arrays = read_metadata(run.storage, _folder(commits[0]), names)
-    for commit, digest in zip(commits, digests, strict=True):
-        # Merged runs may come from programs that word an array's meaning otherwise.
-        if any(digest.get(path) != digests[0][path] for path in paths):
-            _refuse_other_arrays(run, _folder(commit), arrays)
-    return arrays
+def _refuse_unknown(url: str, names: Sequence[str], commit: Commit) -> None:
+    stored = [e.path.removesuffix("/zarr.json") for e in commit.files if e.path.endswith("/zarr.json")]
+    for name in names:
+        if name not in stored:
+            raise InputError(url, name, "the run stores no such field", choices(stored))
 
 
-def _folder(commit: Commit) -> str:
-    return shard_folder(commit.shard, commit.attempt)
-
-
-def _refuse_other_arrays(run: Run, folder: str, arrays: Mapping[str, StoredArray]) -> None:
-    for name, array in read_metadata(run.storage, folder, arrays).items():
+def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> None:
+    for name, array in place.metadata(list(arrays)).items():
         if replace(array, attributes=arrays[name].attributes) != arrays[name]:
             raise InputError(
-                f"{run.storage.url}/{folder}/{name}/zarr.json",
+                f"{place.storage.url}/{place.folder}/{name}/zarr.json",
                 name,
                 "differs from the other shards' metadata",
                 "Mend it with `datagen repair`",

@@ -40,7 +40,8 @@ class SampleReader:
     """Shards of one or more runs, merged or not, sealed or not; also of a sealed store that came alone.
 
     `scene_fields` and `sample_fields` choose what is read (text fields on request). Float16 clouds
-    come as float32. InputError names what is missing, foreign or damaged.
+    come as float32. A run that lacks planned samples is read with `allow_incomplete` alone. InputError
+    names what is missing, foreign or damaged.
     """
 
     def __init__(
@@ -48,8 +49,10 @@ class SampleReader:
         places: Sequence[Path | str],
         scene_fields: Sequence[str] = SCENE_FIELDS,
         sample_fields: Sequence[str] = SAMPLE_FIELDS,
+        allow_incomplete: bool = False,
     ) -> None:
-        parts = open_parts(places, list(dict.fromkeys([*scene_fields, *sample_fields, *JOIN_FIELDS])))
+        names = list(dict.fromkeys([*scene_fields, *sample_fields, *JOIN_FIELDS]))
+        parts = open_parts(places, names, allow_incomplete)
         arrays = parts[0].arrays
         for dim, names in (("scene", scene_fields), ("sample", sample_fields)):
             for name in names:

@@ -11,7 +11,7 @@ from typing import Any
 from schemas.errors import InputError, choices
 from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
 from schemas.keys import MERGED
-from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, read_metadata
+from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray
 from schemas.storage import open_storage
 
 _MEND = "Seal the run again, and copy its data.zarr whole"
@@ -63,17 +63,19 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
     for name in names:
         if name not in stored:
             raise InputError(storage.url, name, "the store has no such field", choices(stored))
-    arrays = read_metadata(storage, "", names)
+    arrays = ShardPlace(storage, "", 0, 0, 0, 0, 0).metadata(names)
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
     if len(scenes) != 1 or len(samples) != 1 or per_shard < 1 or per_scene < 1:
         raise InputError(where, "shape", "arrays of one table differ in length", _MEND)
     n_scenes, n_samples = scenes.pop(), samples.pop()
     full = per_shard * per_scene
+    if (shards := -(-n_scenes // per_shard)) != -(-n_samples // full):
+        raise InputError(where, "shape", f"{n_scenes} scenes, and {n_samples} samples of other scenes", _MEND)
     for array in arrays.values():
         if (per_shard if array.dims[0] == "scene" else full) % array.chunk_rows:
             raise InputError(where, array.name, "chunks that do not divide a shard", _MEND)
-    shards = [
+    slices = [
         ShardPlace(
             storage,
             "",
@@ -83,6 +85,6 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
             per_shard,
             full,
         )
-        for i in range(min(-(-n_scenes // per_shard), -(-n_samples // full)))
+        for i in range(shards)
     ]
-    return SealedStore(spec_hashes, schema, version, shards, arrays)
+    return SealedStore(spec_hashes, schema, version, slices, arrays)

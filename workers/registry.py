@@ -13,25 +13,20 @@ from typing import Any
 from schemas.errors import InputError, choices
 
 # What extras bring, by the names that are imported: what pip calls it, and the extra. The core works without.
-EXTRAS = {
-    "torch": ("torch", "train"),
-    "tensorboard": ("tensorboard", "train"),
-    "plotly": ("plotly", "train"),
-    "transformers": ("transformers", "detect"),
-    "pinocchio": ("pin", "sim"),
-    "coal": ("coal", "sim"),
-    "mani_skill": ("mani-skill", "sim"),
+SIM_MODULES = {"pinocchio": "pin", "coal": "coal", "mani_skill": "mani-skill"}
+_EXTRAS = {
+    "train": {"torch": "torch", "tensorboard": "tensorboard", "plotly": "plotly"},
+    "detect": {"transformers": "transformers"},
+    "sim": SIM_MODULES,
 }
-SIM_MODULES = tuple(name for name, (_, extra) in EXTRAS.items() if extra == "sim")
 
 
 def install_line(*modules: str) -> str:
     """How to install these modules of one extra, for an error's mend."""
-    packages = " ".join(EXTRAS[name][0] for name in modules)
-    return (
-        f"Install it: pip install {packages}, or the extra `{EXTRAS[modules[0]][1]}` of the folder or URL "
-        "that datagen was installed from"
-    )
+    extra = next(name for name, brings in _EXTRAS.items() if modules[0] in brings)
+    packages = " ".join(_EXTRAS[extra][name] for name in modules)
+    source = "of the folder or URL that datagen was installed from"
+    return f"Install it: pip install {packages}, or the extra `{extra}` {source}"
 
 
 SIM_MEND = install_line(*SIM_MODULES)
@@ -40,7 +35,8 @@ SIM_MEND = install_line(*SIM_MODULES)
 def missing_library(error: Exception) -> InputError | None:
     """The one line for a library of an extra that is not installed; None for any other error."""
     name = (error.name or "").split(".")[0] if isinstance(error, ModuleNotFoundError) else ""
-    return InputError(name, "", "is not installed", install_line(name)) if name in EXTRAS else None
+    found = [module for brings in _EXTRAS.values() for module in brings]
+    return InputError(name, "", "is not installed", install_line(name)) if name in found else None
 
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:

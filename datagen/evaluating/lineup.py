@@ -59,6 +59,7 @@ def line_up(
     seed: int,
     places: Sequence[Place],
     allow_seen_houses: bool,
+    allow_incomplete: bool = False,
 ) -> Lineup:
     """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
 
@@ -75,7 +76,13 @@ def line_up(
     if fit:
         for place in fit:
             refuse_no_trials(place)
-        stream = SampleStream(fit, scenes_per_batch=SCENES_PER_BATCH, extra=FIELDS, shuffle=False)
+        stream = SampleStream(
+            fit,
+            scenes_per_batch=SCENES_PER_BATCH,
+            extra=FIELDS,
+            shuffle=False,
+            allow_incomplete=allow_incomplete,
+        )
         if not allow_seen_houses:
             for place in places:
                 refuse_shared_houses(stream, place.stream)

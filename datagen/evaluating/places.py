@@ -72,7 +72,7 @@ def tell_apart(places: Sequence[str]) -> tuple[list[str], list[str]]:
     return checkpoints, runs
 
 
-def open_places(places: Sequence[str]) -> list[Place]:
+def open_places(places: Sequence[str], allow_incomplete: bool = False) -> list[Place]:
     """The runs. InputError where labels are no trials, or runs hold labels of different kinds or scenes."""
     opened: list[Place] = []
     by_scenes: dict[str, str] = {}
@@ -87,7 +87,13 @@ def open_places(places: Sequence[str]) -> list[Place]:
                 problem = "its scenes are those of another run here, labelled otherwise"
                 raise InputError(place, "scenes", problem, "Evaluate the two apart")
         extra = tuple(dict.fromkeys((*EXTRA, *FIELDS)))
-        stream = SampleStream([place], scenes_per_batch=SCENES_PER_BATCH, extra=extra, shuffle=False)
+        stream = SampleStream(
+            [place],
+            scenes_per_batch=SCENES_PER_BATCH,
+            extra=extra,
+            shuffle=False,
+            allow_incomplete=allow_incomplete,
+        )
         opened.append(Place(place, specs, stream))
     return opened
 

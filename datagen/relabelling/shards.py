@@ -17,7 +17,7 @@ from schemas.keys import shard_folder
 from schemas.run import Run
 from schemas.run_records import Commit, FileEntry
 from schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
-from schemas.shard_reading import committed_place, read_metadata
+from schemas.shard_reading import read_committed
 from workers.labels import heuristic as formula
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -58,7 +58,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
     with clock.stage("draw"):
         before = source.commit_of(task.shard)
         source.check_files(before)
-        stored = _read(source, before)
+        stored = read_committed(source.storage, before, _READ)
     with clock.stage("visibility"):
         made = _relabelled(run, stored)
         files = _made_files(run, made)
@@ -84,12 +84,6 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
     flips.to_good += int((made["label"] > stored["label"]).sum())
     flips.to_bad += int((made["label"] < stored["label"]).sum())
     return Product(won, before.samples, positives, cost)
-
-
-def _read(source: Run, commit: Commit) -> Columns:
-    folder = shard_folder(commit.shard, commit.attempt)
-    place = committed_place(source.storage, folder, commit, commit.scenes, commit.samples)
-    return place.read(read_metadata(source.storage, folder, _READ).values())
 
 
 def _relabelled(run: Run, stored: Columns) -> Columns:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from datagen.reports.agreement import ROWS, Labelled
-from schemas.keys import shard_folder
 from schemas.run import Run
-from schemas.shard_reading import Array, committed_place, read_metadata
+from schemas.shard_reading import Array, read_committed
 
 _COLUMNS = {
     "sample_scene_index": "scene",
@@ -57,7 +56,4 @@ def join_labelled(parts: list[Labelled]) -> Labelled:
 
 
 def _read(run: Run, shard: int, names: list[str]) -> dict[str, Array]:
-    commit = run.commit_of(shard)
-    folder = shard_folder(shard, commit.attempt)
-    place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)
-    return place.read(read_metadata(run.storage, folder, names).values())
+    return read_committed(run.storage, run.commit_of(shard), names)

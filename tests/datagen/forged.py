@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from schemas.keys import commit_copy_key, commit_key, shard_folder
+from schemas.keys import commit_copy_key, commit_key
 from schemas.record_files import encode_record
 from schemas.run import Run
+from schemas.scene_rows import read_shard
 from schemas.shard_files import encode_shard
-from schemas.shard_reading import committed_place, read_metadata
 
 Columns = dict[str, np.ndarray[Any, Any]]
 
@@ -37,8 +37,4 @@ def forge(source: Path, out: Path, shard: int, change: Callable[[Columns], None]
 
 def arrays_of_shard(run: Run, shard: int) -> Columns:
     """All arrays of a committed shard, writable."""
-    commit = run.commit_of(shard)
-    folder = shard_folder(shard, commit.attempt)
-    place = committed_place(run.storage, folder, commit, commit.scenes, commit.samples)
-    names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
-    return {k: v.copy() for k, v in place.read(read_metadata(run.storage, folder, names).values()).items()}
+    return {name: values.copy() for name, values in read_shard(run, shard).items()}

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datagen.reports.labelled import read_labelled
+from schemas import shard_reading
 from schemas.errors import InputError
 from schemas.run import Run
+from schemas.scene_rows import read_scene
 from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of, small_spec
+from tests.train.stream_runs import make_stream_run
+from train.dataset import SampleStream
 from train.reader import Columns, SampleReader
 
 ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
@@ -76,6 +84,7 @@ def test_every_bit_flip_of_a_chunk_is_noticed_and_named(tmp_path: Path):
     make_run(tmp_path, n=20)
     rng = np.random.default_rng(3)
     reader = SampleReader([tmp_path], ALL, SAMPLES)
+    assert len(list(reader.shards())) == 2  # from here on its own checksum alone guards a file
     for name in (*ALL, *SAMPLES):
         (victim,) = (tmp_path / "shards/000001/a-1" / name).glob("c.*")
         whole = victim.read_bytes()
@@ -96,13 +105,13 @@ def test_missing_and_cut_files_are_named(tmp_path: Path):
     data = victim.read_bytes()
     reader = SampleReader([tmp_path])
     victim.write_bytes(data[:-3])
-    with pytest.raises(InputError, match=r"label/c\.0: label: \d+ bytes, where the commit has"):
+    with pytest.raises(InputError, match=r"label/c\.0: label: \d+ bytes whose sha256 is not that"):
         next(reader.shards())
     victim.unlink()
     with pytest.raises(InputError, match=r"label/c\.0: label: no such file"):
         next(reader.shards())
     (tmp_path / "shards/000000/a-0/label/zarr.json").unlink()
-    with pytest.raises(InputError, match=r"label/zarr\.json: no such file"):
+    with pytest.raises(InputError, match=r"label/zarr\.json: label: no such file"):
         SampleReader([tmp_path])
 
 
@@ -110,9 +119,10 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     make_run(tmp_path / "run", n=20)
     make_run(tmp_path / "bare", n=20, shards=[])
     (tmp_path / "odd.zarr").mkdir()
-    cases: list[tuple[list[Path], dict[str, tuple[str, ...]], str]] = [
+    cases: list[tuple[list[Path], dict[str, Any], str]] = [
         ([], {}, "no run is named"),
-        ([tmp_path / "bare"], {}, "no shard is committed"),
+        ([tmp_path / "bare"], {}, "20 of the 20 planned samples are not committed"),
+        ([tmp_path / "bare"], {"allow_incomplete": True}, "no shard is committed"),
         ([tmp_path / "odd.zarr"], {}, "no such file"),
         ([tmp_path / "none"], {}, "no such folder"),
         ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: the run stores no such field"),
@@ -120,7 +130,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     ]
     for places, fields, problem in cases:
         with pytest.raises(InputError, match=problem):
-            SampleReader(places, **fields)  # type: ignore[arg-type]
+            SampleReader(places, **fields)
 
 
 @pytest.mark.parametrize(
@@ -182,3 +192,87 @@ def test_merged_shards_may_word_their_arrays_otherwise_but_not_be_others(tmp_pat
     assert run.commit(commit_of(run, 1, "y", run.write_shard(1, "y", files)))
     with pytest.raises(InputError, match=r"000001/y/distance_m/zarr\.json: distance_m: differs"):
         SampleReader([tmp_path])
+
+
+def swap_equal_sizes(run: Run) -> set[str]:
+    """Exchange the chunks of equal size, and other bytes, of the first two shards; their columns."""
+    swapped: set[str] = set()
+    ours, theirs = "shards/000000/a-0", "shards/000001/a-1"
+    for file in run.storage.list(ours):
+        path = file.key.removeprefix(f"{ours}/")
+        one, other = (run.storage.get(f"{folder}/{path}", 2**20) or b"" for folder in (ours, theirs))
+        if "/c." in path and len(one) == len(other) and one != other:
+            run.storage.put(f"{ours}/{path}", other)
+            run.storage.put(f"{theirs}/{path}", one)
+            swapped.add(path.partition("/")[0])
+    return swapped
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
+    tmp_path: Path, remote: bool, request: pytest.FixtureRequest
+):
+    """Each has the right size, and a crc32c of its own that is right."""
+    place = f"{request.getfixturevalue('bucket')}/run" if remote else str(tmp_path)
+    run = make_run(place, n=20)
+    swapped = swap_equal_sizes(run)
+    assert {"distance_m", "visibility"} <= swapped
+    for name in swapped & {*ALL, *SAMPLES}:
+        scenes, samples = ((name,), ()) if name in ALL else ((), (name,))
+        with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*sha256 is not that of the commit"):
+            list(SampleReader([place], scenes, samples).shards())
+    readers: list[Callable[[], object]] = [
+        lambda: read_labelled(run),
+        lambda: read_scene(run, 0),
+        lambda: list(SampleStream([place]).epoch(0)),
+    ]
+    for read in readers:
+        with pytest.raises(InputError, match="sha256 is not that of the commit"):
+            read()
+
+
+def test_swapped_metadata_are_refused(tmp_path: Path):
+    make_run(tmp_path, n=20)
+    folder = tmp_path / "shards/000000/a-0"
+    (folder / "distance_m/zarr.json").write_bytes((folder / "visibility/zarr.json").read_bytes())
+    with pytest.raises(InputError, match=r"distance_m/zarr\.json: distance_m: .*sha256"):
+        SampleReader([tmp_path])
+
+
+def test_a_file_is_held_against_its_commit_once_in_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    make_run(tmp_path, n=20)
+    hashed: list[int] = []
+
+    def counted(data: bytes) -> Any:
+        hashed.append(len(data))
+        return sha256(data)
+
+    monkeypatch.setattr(shard_reading, "sha256", counted)
+    reader = SampleReader([tmp_path], ("points_m",), ("label",))
+    opened = len(hashed)
+    first = list(reader.shards())
+    assert len(hashed) > opened
+    del hashed[:]
+    for again, before in zip(reader.shards(), first, strict=True):
+        np.testing.assert_array_equal(again["label"], before["label"])
+    assert not hashed
+
+
+def test_a_run_that_lacks_planned_samples_is_read_only_where_that_is_said(tmp_path: Path):
+    make_run(tmp_path, n=30)
+    (tmp_path / "commits/000001.json").unlink()
+    words = r"10 of the 30 planned samples are not committed\. .*resume.*--allow-incomplete"
+    for opened in (lambda: SampleReader([tmp_path]), lambda: SampleStream([tmp_path])):
+        with pytest.raises(InputError, match=words) as error:
+            opened()
+        assert error.value.place == str(tmp_path)
+    assert len(SampleReader([tmp_path], allow_incomplete=True)) == 20
+    assert SampleStream([tmp_path], allow_incomplete=True).n_samples == 20
+
+
+def test_numbers_that_no_run_stores_are_refused(tmp_path: Path):
+    for value in (np.nan, np.inf):
+        place = tmp_path / str(value)
+        make_stream_run(place, 36, distance_m=value)
+        with pytest.raises(InputError, match="distance_m: holds NaN or infinite numbers"):
+            list(SampleReader([place], ("house_id",), ("distance_m",)).shards())

@@ -127,7 +127,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         raise InputError(place, where, problem, _MEND) from None
     tensors = {name: value for name, value in stored.items() if isinstance(value, Tensor)}
     _refuse_not_finite(place, tensors, _MEND)
-    return Checkpoint(head, _below("weights/", tensors), _below("resume/", tensors), loop)
+    return Checkpoint(head, below("weights/", tensors), below("resume/", tensors), loop)
 
 
 def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
@@ -228,5 +228,6 @@ def _document(place: str, text: object) -> dict[str, Any]:
     return document
 
 
-def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors whose names begin with a prefix, by the rest of their names."""
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ from train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_
 from train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
+    below,
     only_writer,
     put_weights,
     read_checkpoint,
@@ -49,6 +50,7 @@ class Job:
     keep_every_s: float = 300.0
     tensorboard: str | None = None
     json_lines: bool = False  # also on a terminal
+    allow_incomplete: bool = False  # runs that lack samples of their plan
 
 
 def train_job(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
@@ -119,8 +121,8 @@ def keep(path: str, training: Training, head: CheckpointHead) -> None:
 
 def _go_on(place: str, there: Checkpoint, model: Model, optimiser: torch.optim.Optimizer) -> Position:
     resume = there.resume
-    put_weights(model, _below("model.", resume), place)
-    put_optimiser_tensors(optimiser, _below("optimiser.", resume), place)
+    put_weights(model, below("model.", resume), place)
+    put_optimiser_tensors(optimiser, below("optimiser.", resume), place)
     batch, sums = there.loop.get("batch"), there.loop.get("sums")
     best = there.head.best_epoch
     if type(batch) is not int or batch < 0 or not isinstance(sums, list) or len(sums) != 4:
@@ -140,16 +142,13 @@ def _go_on(place: str, there: Checkpoint, model: Model, optimiser: torch.optim.O
     )
 
 
-def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-
-
 def _streams(job: Job, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
     options = job.options
     if options.batch_scenes % ranks.world:
         problem = f"{options.batch_scenes} scenes cannot be shared out evenly among {ranks.world} processes"
         raise InputError("datagen train", "--batch-scenes", problem, f"Give a multiple of {ranks.world}")
     sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
+    sizes["allow_incomplete"] = job.allow_incomplete
     drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
     if job.val_runs:
         train, val = (
