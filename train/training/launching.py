@@ -148,7 +148,9 @@ def _child(work: Work, job: Any, ranks: Ranks, device: str, folder: str, there: 
         backend, init_method=f"file://{folder}/rendezvous", rank=ranks.rank, world_size=ranks.world
     )
     try:
-        there.send(work(job, ranks, lambda: stop.exists() or (parent is not None and not parent.is_alive())))
+        done = work(job, ranks, lambda: stop.exists() or (parent is not None and not parent.is_alive()))
+        with suppress(BrokenPipeError):  # the parent was killed
+            there.send(done)
     except InputError as error:
         there.send(error)
     finally:
