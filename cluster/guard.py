@@ -85,7 +85,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
                 return _failure(task, started, meter, error)
-    except OSError as error:  # of the note itself
+    except (OSError, JobCannotGoOn) as error:  # of the note itself
         return _failure(task, started, meter, error)
     return AttemptReport(
         attempt=task.attempt,
@@ -127,7 +127,8 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
     note, stack = _note_path(task.notes, task.attempt), _stack_path(task.notes, task.attempt)
     note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not is_private(note.parent.lstat()):
-        raise PermissionError(f"{note.parent}: another user's folder, or others can write to it")
+        problem = f"{note.parent}: another user's folder, or others can write to it"
+        raise JobCannotGoOn(f"{problem}. Name a folder of your own as TMPDIR")
     draft = note.with_suffix(".part")
     draft.write_text(json.dumps({"host": this_host().model_dump(), "started": started}))
     draft.rename(note)

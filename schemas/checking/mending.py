@@ -24,7 +24,7 @@ from schemas.sealing import SEALED, seal
 from schemas.sealing.contents import read_contents
 from schemas.sealing.metadata import ROOT
 from schemas.shard_files import chunk_key
-from schemas.shard_reading import read_metadata
+from schemas.shard_reading import ShardPlace
 from schemas.storage import Storage, StoredFile
 
 # Mending a record shows what rests on it: commits, then files, then the sealed store.
@@ -295,7 +295,8 @@ def _refuse_fewer_rows(place: Storage) -> None:
     contents = read_contents(place, check=False)
     names = [field.name for field in contents.schema.sample_fields]
     try:
-        held = min(array.shape[0] for array in read_metadata(place, SEALED, names).values())
+        sealed = ShardPlace(place, SEALED, 0, 0, 0, 0, 0).metadata(names)
+        held = min(array.shape[0] for array in sealed.values())
     except InputError:
         return  # what is damaged says nothing
     if (rows := contents.rows("sample")) < held:
