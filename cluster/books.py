@@ -7,12 +7,12 @@ import time
 from cluster.guard import utc_now
 from cluster.policy import Trouble
 from schemas.errors import InputError
-from schemas.index import refresh
 from schemas.keys import commit_key
 from schemas.ledger import end_from_commit, lost_end
 from schemas.run import Run
 from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from schemas.shard_ranges import ShardRanges
+from schemas.summaries import refresh
 
 # The index is brought up to date after so many attempts, and not before so many times the time that it
 # took last: a job of a million shards spends a small share of its driver on it.

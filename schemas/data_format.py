@@ -29,7 +29,7 @@ RUN/
   quarantine/<shard>.json        a shard given up: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  one that was given up, and then tried again
   jobs/<job>.json                a driver that began; .state.json says how it is, .stop.json asks it to stop
-  index/<k>.json.gz              heads of settled records: a cache, which may be removed at any time
+  index/<digest>.json.gz         summaries of settled records: a cache, which may be removed at any time
   lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
 ```

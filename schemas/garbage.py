@@ -27,12 +27,12 @@ from itertools import groupby
 from typing import Literal
 
 from schemas.errors import InputError
-from schemas.index import unreadable_files
 from schemas.jobs import Jobs
 from schemas.keys import REMOVING, commit_copy_key, commit_key
 from schemas.merged import open_runs
 from schemas.run import Run
 from schemas.storage import Storage, StoredFile
+from schemas.summaries import unreadable_files
 
 Seen = Callable[[int, int], None]
 Kind = Literal["attempts", "drafts", "probes", "index"]

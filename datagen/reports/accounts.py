@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import fsum
 
-from schemas.index import Heads
 from schemas.run import Run
 from schemas.run_records import Cost
+from schemas.summaries import Summaries
 
 
 @dataclass
@@ -79,8 +79,8 @@ def account_for(runs: Iterable[Run]) -> Books:
     """
     books = Books()
     for run in runs:
-        heads, committed = Heads(run), set[str]()
-        for commit in heads.commits():
+        summaries, committed = Summaries(run), set[str]()
+        for commit in summaries.commits():
             committed.add(commit.attempt)
             books.labels += commit.samples
             books.positives += commit.positives
@@ -88,8 +88,8 @@ def account_for(runs: Iterable[Run]) -> Books:
             books.redraws.update(commit.redraws)
             books.useful.add(commit.cost)
             books.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
-        for entry in heads.ends():
+        for entry in summaries.ends():
             if entry.attempt not in committed:
                 books.waste.setdefault(entry.outcome, Account()).add(entry.cost)
-        books.running += sum(start.attempt not in committed for start in heads.unfinished())
+        books.running += sum(start.attempt not in committed for start in summaries.unfinished())
     return books

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from datagen.console.printing import counted
-from schemas.index import Heads
 from schemas.jobs import Jobs
 from schemas.merged import open_runs
 from schemas.quarantine import lifted_records
 from schemas.run import Run
 from schemas.storage import Storage
+from schemas.summaries import Summaries
 
 _GOOD = ("committed", "superseded")
 
@@ -83,8 +83,8 @@ def _job_events(place: Storage) -> list[Event]:
 
 
 def _attempt_events(run: Run, part: str, shard: int | None, known: Known) -> list[Event]:
-    heads, failed = Heads(run), set[int]()
-    ends, shards = list(heads.ends()), {start.attempt: start.shard for start in heads.unfinished()}
+    summaries, failed = Summaries(run), set[int]()
+    ends, shards = list(summaries.ends()), {start.attempt: start.shard for start in summaries.unfinished()}
     for end in ends:
         shards[end.attempt] = end.shard
         if end.outcome not in _GOOD:

@@ -1,4 +1,4 @@
-"""How far runs are, as plain values: sums over commits and ledger, from their heads."""
+"""How far runs are, as plain values: sums over commits and ledger, from their summaries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections import Counter
 from typing import Any
 
 from cluster.policy import Policy
-from schemas.index import Heads
 from schemas.lineage import lineage_summary
 from schemas.merged import open_runs
 from schemas.quarantine import lifted_records
@@ -15,6 +14,7 @@ from schemas.run_records import Outcome
 from schemas.sealing import SealedPart, SealedRoot, sealed_root
 from schemas.shard_ranges import ShardRanges
 from schemas.storage import Storage
+from schemas.summaries import Summaries
 
 _SHOWN = 20  # causes and stacks
 _GOOD = ("committed", "superseded", "cancelled")
@@ -37,13 +37,13 @@ def place_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
 
 def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
     """The state of a run. `root` is of the store that holds it, by default the run's own."""
-    heads, n = Heads(run), run.n
-    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(heads.shards)
+    summaries, n = Summaries(run), run.n
+    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(summaries.shards)
     given_up = run.quarantine_records()
     quarantined = [record.shard for record in given_up]
     labels = labels_made = positives = 0
     winners: set[str] = set()
-    for commit in heads.commits():
+    for commit in summaries.commits():
         labels += run.layout.rows_wanted(commit.shard, n)[1]
         labels_made += commit.samples
         positives += commit.positives
@@ -52,7 +52,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
     causes: Counter[str] = Counter()
     examples: dict[str, str] = {}  # an attempt of each cause
     spent: dict[Outcome, Counter[int]] = {}  # attempts by shard
-    for entry in heads.ends():
+    for entry in summaries.ends():
         outcomes[entry.outcome] += 1
         if entry.outcome not in _GOOD:
             spent.setdefault(entry.outcome, Counter())[entry.shard] += 1
@@ -60,7 +60,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
             cause = f"{entry.outcome}: {entry.cause}"
             causes[cause] += 1
             examples.setdefault(cause, entry.attempt)
-    unfinished = {start.attempt for start in heads.unfinished()} - winners
+    unfinished = {start.attempt for start in summaries.unfinished()} - winners
     root = root or sealed_root(run.storage)
     absent, part = planned.without(committed), root.part(run.manifest.spec_hash) if root else None
     common = dict(causes.most_common(_SHOWN))

@@ -9,9 +9,9 @@ import pytest
 import cluster.books
 from cluster.books import RunBooks, close_lost_attempts
 from cluster.policy import Trouble
-from schemas.index import index_files, refresh
 from schemas.run import Run
 from schemas.run_records import Cost, LedgerEntry
+from schemas.summaries import index_files, refresh
 from tests.made_runs import make_run, write
 
 TROUBLE = Trouble(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))

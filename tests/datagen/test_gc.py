@@ -18,7 +18,6 @@ from datagen import cli
 from datagen.reports.accounts import account_for
 from schemas.errors import InputError
 from schemas.garbage import find_garbage, sweep
-from schemas.index import index_files, refresh
 from schemas.jobs import JobRecord, Jobs, new_job_id
 from schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
 from schemas.merged import open_runs
@@ -26,6 +25,7 @@ from schemas.record_files import now
 from schemas.run import Run
 from schemas.sealing import seal
 from schemas.storage import Storage, StoredFile, open_storage
+from schemas.summaries import index_files, refresh
 from tests.made_runs import attempt, files_of, make_run, small_spec, write
 from tests.refusals import refused
 from tests.small_runs import json_of

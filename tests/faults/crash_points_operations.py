@@ -17,7 +17,6 @@ from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError
 from schemas.fields import SCHEMAS, RecordSchema
 from schemas.garbage import find_garbage
-from schemas.index import closed_ends, committed_heads
 from schemas.keys import MERGED, part_folder
 from schemas.merged import open_runs
 from schemas.merging import carry_out, plan_merge
@@ -28,6 +27,7 @@ from schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from schemas.sealing import SEALED, seal, unseal
 from schemas.shard_files import encode_shard
 from schemas.storage import open_storage
+from schemas.summaries import Summaries
 from tests.made_runs import attempt, make_run, manifest_of, rows_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the
@@ -115,7 +115,8 @@ def _units(folder: Path, by_file: bool) -> Units:
 def _wrongly_listed(run: Run) -> str:
     """In what the index differs from the records."""
     try:
-        listed = [head.shard for head in committed_heads(run)], [end.attempt for end in closed_ends(run)]
+        summaries = Summaries(run)
+        listed = [found.shard for found in summaries.commits()], [end.attempt for end in summaries.ends()]
     except InputError as e:
         return f"refused: {e.problem}"
     told = sorted(run.committed()), [entry.attempt for entry in run.ledger.ends()]

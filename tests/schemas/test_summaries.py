@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import random
 import tempfile
+import threading
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import schemas.index
+import schemas.summaries
 from datagen.reports.accounts import Books, account_for
 from schemas.errors import InputError
-from schemas.heads import CommitHead, EndHead, head_of_commit, head_of_end
-from schemas.index import closed_ends, committed_heads, index_files, refresh
 from schemas.keys import commit_key
-from schemas.record_files import encode_record
+from schemas.record_files import encode_record, signed_json
 from schemas.run import Run
 from schemas.run_records import Commit, Cost, Host, LedgerEntry
+from schemas.summaries import CommitSummary, EndSummary, Summaries, index_files, refresh, unreadable_files
 from tests.made_runs import commit_of, make_run
 
 SHARDS = 12
@@ -57,10 +58,11 @@ def end(rng: random.Random, attempt: str, shard: int) -> LedgerEntry:
     )  # fmt: skip
 
 
-def from_records(run: Run) -> tuple[list[CommitHead], list[EndHead], Books]:
+def from_records(run: Run) -> tuple[list[CommitSummary], list[EndSummary], Books]:
     """What the records alone say, each read by itself."""
-    commits = [head_of_commit(Run.open(run.storage).commit_of(shard)) for shard in sorted(run.committed())]
-    ends = [head_of_end(entry) for entry in run.ledger.ends()]
+    records = [Run.open(run.storage).commit_of(shard) for shard in sorted(run.committed())]
+    commits = [CommitSummary(**{f: getattr(r, f) for f in CommitSummary.model_fields}) for r in records]
+    ends = [EndSummary(**{f: getattr(r, f) for f in EndSummary.model_fields}) for r in run.ledger.ends()]
     files = {key: run.storage.get(key, 2**30) for key in index_files(run)}
     run.storage.delete(files)
     books = account_for([run])
@@ -71,8 +73,8 @@ def from_records(run: Run) -> tuple[list[CommitHead], list[EndHead], Books]:
 
 def assert_equal(run: Run) -> None:
     commits, ends, books = from_records(run)
-    assert [replace(head, paid=head.cost) for head in committed_heads(run)] == commits
-    assert [replace(head, paid=head.cost) for head in closed_ends(run)] == ends
+    assert list(Summaries(run).commits()) == commits
+    assert list(Summaries(run).ends()) == ends
     said = account_for([run])
     assert said == books and said.useful.unnamed_wall_s == books.useful.unnamed_wall_s
 
@@ -139,7 +141,7 @@ HAPPENS = sorted(name for name, member in vars(History).items() if name[0] != "_
 @given(st.lists(st.sampled_from(HAPPENS), max_size=8), st.integers(0, 2**32), st.sampled_from([4, 16_384]))
 def test_answers_are_those_of_the_records(words: list[str], seed: int, rows: int) -> None:
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schemas.index, "ROWS_PER_FILE", rows)
+        patch.setattr(schemas.summaries, "ROWS_PER_FILE", rows)
         run = bare_run(Path(folder))
         history = History(run, seed)
         history.commits()
@@ -165,13 +167,14 @@ def indexed(folder: Path) -> Run:
 def test_what_the_index_holds_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = indexed(tmp_path)
     read: list[str] = []
-    many: Callable[..., object] = run.storage.get_many
-    monkeypatch.setattr(run.storage, "get_many", lambda keys, n: many(read.extend(k := list(keys)) or k, n))
-    assert len(list(committed_heads(run))) == 3
-    list(closed_ends(run))
+    get: Callable[..., object] = run.storage.get
+    monkeypatch.setattr(run.storage, "get", lambda key, limit: get(read.append(key) or key, limit))
+    assert len(list(Summaries(run).commits())) == 3
+    list(Summaries(run).ends())
+    monkeypatch.undo()
     long = [e.attempt for e in run.ledger.ends() if len(e.cause) > 1000]
     assert [key for key in read if "commits/" in key] == []
-    assert {key for key in read if "ledger/" in key} >= {f"ledger/{name}.json" for name in long}
+    assert long and {key for key in read if "ledger/" in key} == {f"ledger/{name}.json" for name in long}
 
 
 def test_a_damaged_record_is_refused_as_without_an_index(tmp_path: Path) -> None:
@@ -180,22 +183,88 @@ def test_a_damaged_record_is_refused_as_without_an_index(tmp_path: Path) -> None
     path = tmp_path / commit_key(shard)
     path.write_bytes(path.read_bytes().replace(b'"samples": 10', b'"samples": 11'))
     with pytest.raises(InputError, match="damaged or was edited"):
-        list(committed_heads(run))
+        list(Summaries(run).commits())
     refresh(run)  # leaves it out
     with pytest.raises(InputError, match="damaged or was edited"):
-        list(committed_heads(run))
+        list(Summaries(run).commits())
 
 
 def test_an_index_of_another_run_does_not_count(tmp_path: Path) -> None:
     ours, theirs = indexed(tmp_path / "a"), indexed(tmp_path / "b")
-    other = theirs.manifest.model_copy(update={"spec_hash": "7" * 64})
-    Run(theirs.storage, other)
     for key in index_files(ours):
-        forged = gzip.decompress(ours.storage.get(key, 2**30) or b"").replace(b'"shard"', b'"snark"')
-        theirs.storage.put(key, gzip.compress(forged))
+        whole = gzip.decompress(ours.storage.get(key, 2**30) or b"")
+        damaged = whole.replace(b"shard", b"snark")
+        foreign = json.loads(whole.replace(b'"positives\\":', b'"positives\\":1'))
+        del foreign["sha256"]
+        assert damaged != whole and "positives" in str(foreign)
+        theirs.storage.put("index/1.json.gz", gzip.compress(damaged))
+        theirs.storage.put("index/2.json.gz", gzip.compress(signed_json(foreign | {"spec_hash": "7" * 64})))
     assert_equal(theirs)
+    assert set(unreadable_files(theirs)) == {"index/1.json.gz", "index/2.json.gz"}
     refresh(theirs)
     assert_equal(theirs)
+    assert unreadable_files(theirs) == []
+
+
+@pytest.mark.parametrize(
+    "damage", ["swapped", "another shard", "of another size", "negative", "not JSON", ""]
+)
+def test_a_row_that_is_not_of_its_record_does_not_count(damage: str, tmp_path: Path) -> None:
+    run = indexed(tmp_path)
+    (key,) = index_files(run)
+    whole = json.loads(gzip.decompress(run.storage.get(key, 2**30) or b""))
+    rows: dict[str, list[str]] = whole["rows"]
+    first, second = [key for key in rows if key.startswith("commits/")][:2]
+    one = json.loads(rows[first][1])
+    texts = {
+        "swapped": rows[second][1],
+        "another shard": json.dumps(one | {"shard": 77}),
+        "of another size": json.dumps(one | {"samples": one["samples"] + 1}),
+        "negative": json.dumps(one | {"positives": -1}),
+        "not JSON": "[" * 1000,
+        "": "",
+    }
+    rows[first][1] = texts[damage]
+    end = next(key for key in rows if key.startswith("ledger/"))
+    rows[end][1] = json.dumps(json.loads(rows[end][1]) | {"attempt": "another"})
+    del whole["sha256"]
+    run.storage.put(key, gzip.compress(signed_json(whole)))
+    assert unreadable_files(run) == []
+    assert_equal(run)
+
+
+def test_an_index_of_the_former_format_is_replaced(tmp_path: Path) -> None:
+    run = indexed(tmp_path)
+    run.storage.delete(index_files(run))
+    former = {
+        "format_version": 2, "spec_hash": run.manifest.spec_hash, "kind": "ends", "names": ["a"],
+        "stamps": ["s"], "texts": {"attempt": {"words": ["a"], "rows": [0]}}, "numbers": {"shard": [0.0]},
+    }  # fmt: skip
+    run.storage.put("index/1.json.gz", gzip.compress(signed_json(former)))
+    assert_equal(run)
+    assert unreadable_files(run) == ["index/1.json.gz"] and refresh(run) > 0
+    assert len(index_files(run)) == 1 and unreadable_files(run) == []
+    assert_equal(run)
+
+
+def test_drivers_that_write_the_index_at_once_leave_a_whole_one(tmp_path: Path) -> None:
+    run = bare_run(tmp_path)
+    together = threading.Barrier(4)
+
+    def drive(seed: int) -> None:
+        own, history = Run.open(run.storage), History(run, seed)
+        for _ in range(3):
+            together.wait()
+            history.commits()
+            history.fails()
+            refresh(own)
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(drive, range(4)))
+    assert_equal(run)
+    refresh(run)
+    assert_equal(run)
+    assert len(index_files(run)) == 1 and refresh(run) == 0
 
 
 def test_an_index_that_unpacks_to_terabytes_is_not_unpacked(tmp_path: Path) -> None:

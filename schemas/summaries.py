@@ -1,0 +1,238 @@
+"""Summaries of a run's settled records, many in a file, so that few small files are read.
+
+`index/<digest>.json.gz` is a cache. A summary counts only while its record still has the change stamp under
+which the summary was made, as listed now; a record that is new, changed or came back is read itself, and one
+that vanished is gone. The answers are those of the records alone, whatever becomes of the index: it may be
+removed at any time. (`verify` does not use it: what changes bytes without changing the stamp is for digests.)
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property, partial
+from hashlib import sha256
+from itertools import chain, islice
+from typing import Literal
+
+from pydantic import Field, ValidationError
+
+from schemas.errors import InputError
+from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record
+from schemas.run import Run
+from schemas.run_records import (
+    AttemptName,
+    AttemptStart,
+    Cost,
+    Digest,
+    Host,
+    LedgerEntry,
+    Outcome,
+    StoredRecord,
+    other_value,
+)
+
+_FILE = re.compile(r"index/[0-9a-f]{1,16}\.json\.gz")
+# Rows of a full file. One below half of it is joined with others when the index grows.
+ROWS_PER_FILE = 16_384
+# A longer summary stays in its record alone, so that a file of our own unpacks to far less than the limit.
+_MAX_SUMMARY_BYTES = 1500
+_MAX_FILE_BYTES = 128 * 2**20
+
+
+class CommitSummary(StoredRecord):
+    """What a commit record says of its shard, without its files."""
+
+    shard: int = Field(ge=0)
+    attempt: AttemptName
+    scenes: int = Field(ge=0)
+    samples: int = Field(ge=0)
+    positives: int = Field(ge=0)
+    redraws: dict[str, int]
+    cost: Cost
+    host: Host
+
+
+class EndSummary(StoredRecord):
+    """How an attempt ended, without its stack."""
+
+    attempt: AttemptName
+    shard: int = Field(ge=0)
+    outcome: Outcome
+    cause: str
+    cost: Cost | None  # None where the attempt left no account of itself
+
+
+Summary = CommitSummary | EndSummary
+
+
+class _IndexFile(StoredRecord):
+    """A file of the index: change stamps of records and their summaries as JSON, by the records' keys."""
+
+    version: Literal[2] = 2
+    spec_hash: Digest
+    rows: dict[str, tuple[str, str]]
+
+
+class Summaries:
+    """The summaries of one run as listed when this is made: the ledger first, then the commits.
+
+    So whatever the ledger calls committed has its commit, also while a job goes on.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._ledger = run.ledger.stamps()
+        self._committed = run.commit_stamps()
+
+    @cached_property
+    def _indexed(self) -> dict[str, str]:
+        """Summaries as JSON of the records that have the stamp under which theirs was made, by keys."""
+        stamps = _stamps_by_key(self._ledger, self._committed)
+        return {
+            key: text
+            for _, rows in _read_files(self._run)
+            for key, (stamp, text) in rows.items()
+            if stamp and stamps.get(key) == stamp
+        }
+
+    @property
+    def shards(self) -> set[int]:
+        """Committed shards."""
+        return {int(name) for name in self._committed}
+
+    def commits(self) -> Iterator[CommitSummary]:
+        """Summaries of commits, in order of their shards. InputError as `Run.commit_of`."""
+        keys = [f"commits/{name}.json" for name in sorted(self._committed, key=int)]
+        return (found for found in self._in_order(keys) if isinstance(found, CommitSummary))
+
+    def ends(self) -> Iterator[EndSummary]:
+        """Summaries of closed attempts, in order of their names. InputError as `Ledger.end_of`."""
+        keys = [f"ledger/{name}.json" for name in sorted(self._ledger) if not name.endswith(".start")]
+        return (found for found in self._in_order(keys) if isinstance(found, EndSummary))
+
+    def unfinished(self) -> list[AttemptStart]:
+        """Attempts that began and left no end: running elsewhere, or lost."""
+        return self._run.ledger.unfinished(self._ledger)
+
+    def _in_order(self, keys: Sequence[str]) -> Iterator[Summary]:
+        run, indexed = self._run, self._indexed
+        absent = (key for key in keys if key not in indexed)
+        read = run.storage.in_order(partial(_read, run), absent)
+        for key in keys:
+            text = indexed.get(key)
+            # A row that cannot be of its record does not count: the record says what is true.
+            found = next(read) if text is None else _decode(run, key, text) or _read(run, key)
+            if isinstance(found, InputError):
+                raise found
+            if found is not None:  # else its record vanished since it was listed
+                yield found
+
+
+def refresh(run: Run) -> int:
+    """Bring the index up to date with the run's records; return how many were added.
+
+    Records that cannot be read are left out. Small files, and those most of whose rows are stale, are joined
+    to full ones, so that the index has few files and no more rows than the run has records. Several may do
+    this at once: each then adds a file, and the next one joins them.
+    """
+    stamps = _stamps_by_key(run.ledger.stamps(), run.commit_stamps())
+    known, kept, replaced = set[str](), dict[str, tuple[str, str]](), set(index_files(run))
+    for file, rows in _read_files(run):
+        valid = {k: row for k, row in rows.items() if stamps.get(k) == row[0] and k not in known}
+        known.update(valid)
+        if len(valid) < ROWS_PER_FILE // 2:
+            kept.update(valid)
+        else:
+            replaced.discard(file)
+    missing = [key for key in stamps if key not in known]
+    if not missing and len(replaced) <= bool(kept):
+        return 0  # what is there would only be written again
+    read = zip(missing, run.storage.in_order(partial(_read, run), missing), strict=True)
+    new = ((key, (stamps[key], text)) for key, found in read if (text := _encode(run, key, found)))
+    todo, written, count = chain(kept.items(), new), set[str](), -len(kept)
+    while rows := dict(islice(todo, ROWS_PER_FILE)):
+        written.add(_write(run, rows))
+        count += len(rows)
+    run.storage.delete(sorted(replaced - written))
+    return count
+
+
+def index_files(run: Run) -> list[str]:
+    """Keys of the index's files."""
+    return sorted(file.key for file in run.storage.list("index") if _FILE.fullmatch(file.key))
+
+
+def unreadable_files(run: Run) -> list[str]:
+    """Keys of files of the index that are damaged, of another run or of a former format."""
+    readable = {key for key, _ in _read_files(run)}
+    return [key for key in index_files(run) if key not in readable]
+
+
+def _stamps_by_key(ledger: dict[str, str], committed: dict[str, str]) -> dict[str, str]:
+    """Change stamps of settled records, by their keys."""
+    ends = {f"ledger/{name}.json": stamp for name, stamp in ledger.items() if not name.endswith(".start")}
+    return ends | {f"commits/{name}.json": stamp for name, stamp in committed.items()}
+
+
+def _write(run: Run, rows: dict[str, tuple[str, str]]) -> str:
+    """Write a file of the index; its key. Its name is of its bytes, so that no two drivers can be at odds."""
+    packer = zlib.compressobj(1, wbits=31)
+    record = encode_record(_IndexFile(spec_hash=run.manifest.spec_hash, rows=rows))
+    data = packer.compress(record) + packer.flush()
+    key = f"index/{sha256(data).hexdigest()[:16]}.json.gz"
+    run.storage.put(key, data)
+    run.storage.sync([key])
+    return key
+
+
+def _read_files(run: Run) -> Iterator[tuple[str, dict[str, tuple[str, str]]]]:
+    """(key, rows) of the index's readable files, one at a time."""
+    for key in index_files(run):
+        record = None
+        with suppress(InputError, zlib.error):  # damaged or foreign: its records are read themselves
+            data = run.storage.get(key, _MAX_FILE_BYTES // 2) or b""
+            text = zlib.decompressobj(wbits=31).decompress(data, _MAX_FILE_BYTES)
+            record = decode_record(key, text, _IndexFile)
+        if record is not None and record.spec_hash == run.manifest.spec_hash:
+            yield key, record.rows
+
+
+def _encode(run: Run, key: str, found: Summary | InputError | None) -> str | None:
+    """The summary as JSON; None where there is none, or it cannot be had from JSON again."""
+    if found is None or isinstance(found, InputError):
+        return None
+    text = found.model_dump_json(exclude_defaults=True)
+    return text if len(text.encode()) <= _MAX_SUMMARY_BYTES and _decode(run, key, text) == found else None
+
+
+def _decode(run: Run, key: str, text: str) -> Summary | None:
+    """The summary in a row of the index; None where it is not of the record of this key."""
+    folder, _, name = key.removesuffix(".json").partition("/")
+    try:
+        if folder == "ledger":
+            end = EndSummary.model_validate_json(text)
+            return end if end.attempt == name else None
+        commit, sizes = CommitSummary.model_validate_json(text), run.layout
+    except ValidationError:
+        return None
+    scenes, samples = sizes.scenes_per_shard, sizes.samples_per_shard
+    return None if other_value(commit, shard=int(name), scenes=scenes, samples=samples) else commit
+
+
+def _read(run: Run, key: str) -> Summary | InputError | None:
+    """The summary from the record itself: None where it vanished, the error where it is damaged."""
+    data = run.storage.get(key, MAX_RECORD_BYTES)
+    folder, _, name = key.removesuffix(".json").partition("/")
+    try:
+        if data is None:
+            return None
+        if folder == "ledger":
+            entry = decode_record(f"{run.storage.url}/{key}", data, LedgerEntry)
+            return EndSummary.model_validate(entry, from_attributes=True)
+        commit = run.decode_commit(int(name), data)
+        return CommitSummary.model_validate(commit, from_attributes=True)
+    except InputError as e:
+        return e
