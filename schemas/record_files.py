@@ -39,15 +39,7 @@ def signed_json(fields: Mapping[str, Any]) -> bytes:
     if "\\ud" in text:  # half characters, of a file's name in an error or of a host, which no reader takes
         text = json.dumps(fields, indent=1, ensure_ascii=False).encode(errors="replace").decode()
         text = json.dumps(json.loads(text), indent=1)
-    return _signed(text.encode().removesuffix(b"\n}"))
-
-
-def compact_record(record: BaseModel) -> bytes:
-    """A record's file without indentation, for those of many rows. `decode_record` reads it too."""
-    return _signed(record.model_dump_json().encode().removesuffix(b"}"))
-
-
-def _signed(body: bytes) -> bytes:
+    body = text.encode().removesuffix(b"\n}")
     return body + b',\n "sha256": "' + sha256(body).hexdigest().encode() + b'"\n}\n'
 
 

@@ -15,18 +15,16 @@ from contextlib import suppress
 from functools import cached_property, partial
 from hashlib import sha256
 from itertools import chain, islice
-from typing import Literal
 
 from pydantic import Field, ValidationError
 
 from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record
+from schemas.record_files import MAX_RECORD_BYTES, decode_record
 from schemas.run import Run
 from schemas.run_records import (
     AttemptName,
     AttemptStart,
     Cost,
-    Digest,
     Host,
     LedgerEntry,
     Outcome,
@@ -39,7 +37,7 @@ _FILE = re.compile(r"index/[0-9a-f]{1,16}\.json\.gz")
 ROWS_PER_FILE = 16_384
 # A longer summary stays in its record alone, so that a file of our own unpacks to far less than the limit.
 _MAX_SUMMARY_BYTES = 1500
-_MAX_FILE_BYTES = 128 * 2**20
+_MAX_FILE_BYTES = 64 * 2**20
 
 
 class CommitSummary(StoredRecord):
@@ -66,14 +64,8 @@ class EndSummary(StoredRecord):
 
 
 Summary = CommitSummary | EndSummary
-
-
-class _IndexFile(StoredRecord):
-    """A file of the index: change stamps of records and their summaries as JSON, by the records' keys."""
-
-    version: Literal[2] = 2
-    spec_hash: Digest
-    rows: dict[str, tuple[str, str]]
+# By a record's key: its change stamp, and its summary as JSON.
+Rows = dict[str, tuple[str, str]]
 
 
 class Summaries:
@@ -139,7 +131,7 @@ def refresh(run: Run) -> int:
     this at once: each then adds a file, and the next one joins them.
     """
     stamps = _stamps_by_key(run.ledger.stamps(), run.commit_stamps())
-    known, kept, replaced = set[str](), dict[str, tuple[str, str]](), set(index_files(run))
+    known, kept, replaced = set[str](), Rows(), set(index_files(run))
     for file, rows in _read_files(run):
         valid = {k: row for k, row in rows.items() if stamps.get(k) == row[0] and k not in known}
         known.update(valid)
@@ -177,27 +169,38 @@ def _stamps_by_key(ledger: dict[str, str], committed: dict[str, str]) -> dict[st
     return ends | {f"commits/{name}.json": stamp for name, stamp in committed.items()}
 
 
-def _write(run: Run, rows: dict[str, tuple[str, str]]) -> str:
-    """Write a file of the index; its key. Its name is of its bytes, so that no two drivers can be at odds."""
+def _write(run: Run, rows: Rows) -> str:
+    """Write a file of the index; its key. Its name is of its bytes, so that no two drivers can be at odds.
+
+    Lines: the sha256 of all that follows, format and run, and the rows, whose parts are between tabs.
+    """
+    lines = (f"{key}\t{stamp}\t{text}" for key, (stamp, text) in rows.items())
+    body = "\n".join([_first_line(run), *lines]).encode()
     packer = zlib.compressobj(1, wbits=31)
-    record = encode_record(_IndexFile(spec_hash=run.manifest.spec_hash, rows=rows))
-    data = packer.compress(record) + packer.flush()
+    data = packer.compress(sha256(body).hexdigest().encode() + b"\n" + body) + packer.flush()
     key = f"index/{sha256(data).hexdigest()[:16]}.json.gz"
     run.storage.put(key, data)
     run.storage.sync([key])
     return key
 
 
-def _read_files(run: Run) -> Iterator[tuple[str, dict[str, tuple[str, str]]]]:
+def _read_files(run: Run) -> Iterator[tuple[str, Rows]]:
     """(key, rows) of the index's readable files, one at a time."""
     for key in index_files(run):
-        record = None
-        with suppress(InputError, zlib.error):  # damaged or foreign: its records are read themselves
-            data = run.storage.get(key, _MAX_FILE_BYTES // 2) or b""
-            text = zlib.decompressobj(wbits=31).decompress(data, _MAX_FILE_BYTES)
-            record = decode_record(key, text, _IndexFile)
-        if record is not None and record.spec_hash == run.manifest.spec_hash:
-            yield key, record.rows
+        with suppress(
+            InputError, ValueError, zlib.error
+        ):  # what holds nothing: its records are read themselves
+            packed = run.storage.get(key, _MAX_FILE_BYTES) or b""
+            data = zlib.decompressobj(wbits=31).decompress(packed, _MAX_FILE_BYTES)
+            digest, _, body = data.partition(b"\n")
+            first, *lines = body.decode().split("\n", ROWS_PER_FILE)
+            if digest == sha256(body).hexdigest().encode() and first == _first_line(run):
+                parts = (line.split("\t") for line in lines)
+                yield key, {name: (stamp, text) for name, stamp, text in parts}
+
+
+def _first_line(run: Run) -> str:
+    return f"summaries 2 of {run.manifest.spec_hash}"
 
 
 def _encode(run: Run, key: str, found: Summary | InputError | None) -> str | None:

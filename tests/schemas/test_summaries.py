@@ -10,6 +10,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -189,16 +190,23 @@ def test_a_damaged_record_is_refused_as_without_an_index(tmp_path: Path) -> None
         list(Summaries(run).commits())
 
 
+def put_signed(run: Run, key: str, body: bytes) -> None:
+    """A file of the index with this body under a sha256 that is right."""
+    run.storage.put(key, gzip.compress(sha256(body).hexdigest().encode() + b"\n" + body))
+
+
+def body_of(run: Run) -> bytes:
+    (key,) = index_files(run)
+    return gzip.decompress(run.storage.get(key, 2**30) or b"").partition(b"\n")[2]
+
+
 def test_an_index_of_another_run_does_not_count(tmp_path: Path) -> None:
     ours, theirs = indexed(tmp_path / "a"), indexed(tmp_path / "b")
-    for key in index_files(ours):
-        whole = gzip.decompress(ours.storage.get(key, 2**30) or b"")
-        damaged = whole.replace(b"shard", b"snark")
-        foreign = json.loads(whole.replace(b'"positives\\":', b'"positives\\":1'))
-        del foreign["sha256"]
-        assert damaged != whole and "positives" in str(foreign)
-        theirs.storage.put("index/1.json.gz", gzip.compress(damaged))
-        theirs.storage.put("index/2.json.gz", gzip.compress(signed_json(foreign | {"spec_hash": "7" * 64})))
+    whole, other = body_of(ours).replace(b'"positives":', b'"positives":1'), b"7" * 64
+    foreign = whole.replace(ours.manifest.spec_hash.encode(), other)
+    assert b'"positives":1' in whole and other in foreign
+    theirs.storage.put("index/1.json.gz", gzip.compress(b"7" * 64 + b"\n" + whole))
+    put_signed(theirs, "index/2.json.gz", foreign)
     assert_equal(theirs)
     assert set(unreadable_files(theirs)) == {"index/1.json.gz", "index/2.json.gz"}
     refresh(theirs)
@@ -212,24 +220,29 @@ def test_an_index_of_another_run_does_not_count(tmp_path: Path) -> None:
 def test_a_row_that_is_not_of_its_record_does_not_count(damage: str, tmp_path: Path) -> None:
     run = indexed(tmp_path)
     (key,) = index_files(run)
-    whole = json.loads(gzip.decompress(run.storage.get(key, 2**30) or b""))
-    rows: dict[str, list[str]] = whole["rows"]
-    first, second = [key for key in rows if key.startswith("commits/")][:2]
-    one = json.loads(rows[first][1])
+    rows = [line.split("\t") for line in body_of(run).decode().split("\n")]
+    first, second = [row for row in rows if row[0].startswith("commits/")][:2]
+    end = next(row for row in rows if row[0].startswith("ledger/"))
+    one = json.loads(first[2])
     texts = {
-        "swapped": rows[second][1],
+        "swapped": second[2],
         "another shard": json.dumps(one | {"shard": 77}),
         "of another size": json.dumps(one | {"samples": one["samples"] + 1}),
         "negative": json.dumps(one | {"positives": -1}),
         "not JSON": "[" * 1000,
         "": "",
     }
-    rows[first][1] = texts[damage]
-    end = next(key for key in rows if key.startswith("ledger/"))
-    rows[end][1] = json.dumps(json.loads(rows[end][1]) | {"attempt": "another"})
-    del whole["sha256"]
-    run.storage.put(key, gzip.compress(signed_json(whole)))
+    first[2], end[2] = texts[damage], json.dumps(json.loads(end[2]) | {"attempt": "another"})
+    put_signed(run, key, "\n".join("\t".join(row) for row in rows).encode())
     assert unreadable_files(run) == []
+    assert_equal(run)
+
+
+@pytest.mark.parametrize("rest", [b"\n" * 10**6, b"\na\tb", b"\n\xff\t\t", b"\t\t\t\n"])
+def test_a_signed_file_without_rows_holds_nothing(rest: bytes, tmp_path: Path) -> None:
+    run = indexed(tmp_path)
+    put_signed(run, "index/1.json.gz", body_of(run).partition(b"\n")[0] + rest)
+    assert unreadable_files(run) == ["index/1.json.gz"]
     assert_equal(run)
 
 
