@@ -32,6 +32,7 @@ from schemas.run_records import (
     other_value,
 )
 
+# Files of the former format have names of this form too: `refresh` and `gc` remove them.
 _FILE = re.compile(r"index/[0-9a-f]{1,16}\.json\.gz")
 # Rows of a full file. One below half of it is joined with others when the index grows.
 ROWS_PER_FILE = 16_384
@@ -195,7 +196,7 @@ def _read_files(run: Run) -> Iterator[tuple[str, Rows]]:
             digest, _, body = data.partition(b"\n")
             first, *lines = body.decode().split("\n", ROWS_PER_FILE)
             if digest == sha256(body).hexdigest().encode() and first == _first_line(run):
-                parts = (line.split("\t") for line in lines)
+                parts = (line.split("\t", 2) for line in lines)
                 yield key, {name: (stamp, text) for name, stamp, text in parts}
 
 

@@ -194,7 +194,7 @@ def test_a_place_without_a_run_is_refused(tmp_path: Path, capsys: pytest.Capture
 def test_an_index_is_mended_on_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path, n=50)
     assert json_of(capsys, ["gc", str(tmp_path)])["found"]["index"]["pieces"] == 0
-    assert len(index_files(run)) == 2
+    assert len(index_files(run)) == 1
 
 
 def test_a_run_in_a_bucket_is_swept_as_on_a_disk(bucket: str, capsys: pytest.CaptureFixture[str]) -> None:
