@@ -11,10 +11,10 @@ from cyclopts import Parameter
 
 from cluster.ray_head import running_head, stop_head
 from cluster.ray_jobs import open_ray_jobs
+from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
-from datagen.jobs.options import command_line
 from datagen.jobs.report import health_line, job_report
 from schemas.errors import InputError
 from schemas.jobs import Job, Jobs

@@ -8,24 +8,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import resumable
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import (
-    DEFAULT_SHARE,
-    Address,
-    Detach,
-    JsonLines,
-    MaxQuarantined,
-    Placing,
-    Workers,
-    absolute_place,
-    refuse_odd_n,
-    resumable,
-    words_of,
-)
-from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
+from datagen.jobs.options import HERE, Placing, absolute_place, refuse_odd_n
+from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 from schemas.errors import InputError
 from schemas.merged import open_runs
@@ -37,30 +26,22 @@ def extend(
     run: RunPlace,
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
-    houses: HousesAgain = None,
-    objects: ObjectsAgain = None,
-    scenes_from: ScenesFromAgain = None,
-    workers: Workers = None,
-    address: Address = "local",
-    max_quarantined: MaxQuarantined = DEFAULT_SHARE,
-    detach: Detach = False,
-    json: JsonLines = False,
+    given: Sources = AS_FOUND,
+    placing: Placing = HERE,
 ) -> int:
     """Want n labels of a run and make those that are missing; shards that exist keep their bytes.
 
     Merged runs share the further labels evenly, in whole shards.
     """
-    placing = Placing(workers, address, json, max_quarantined, detach)
-    given = Sources(houses, objects, scenes_from)
     placing.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
-    if detach and address != "local":
+    if placing.detach and placing.address != "local":
         return detach_job(words, run, placing)
-    with resumable([*words, *words_of({"--address": None if address == "local" else address})]):
+    with resumable([*words, *placing.address_words()]):
         place = open_storage(run, create=False)
         runs = open_runs(place)
-        works = [open_work(part, given, address) for part in runs]
+        works = [open_work(part, given, placing.address) for part in runs]
         wanted = longer(runs, n, run)
         for part, work, more in zip(runs, works, wanted, strict=True):
             if work.scenes_from:
@@ -68,7 +49,7 @@ def extend(
                 refuse_too_few(stored, part.layout, more)
         for part, more in zip(runs, wanted, strict=True):
             part.grow(more)
-    if detach:
+    if placing.detach:
         return detach_job(words, run, placing)
     return go_on(place, run, works, placing, given)
 

@@ -7,10 +7,11 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.steps import steps
-from datagen.jobs.options import absolute_place, resumable, words_of
+from datagen.jobs.options import absolute_place
 from datagen.reports.accounts import account_for
 from schemas.lineage import lineage_summary
 from schemas.merged import open_runs, wanted

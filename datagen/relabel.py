@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
@@ -77,7 +78,6 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
         "shards_to_come": done.absent,
         "seconds": round(elapsed_s, 3),
     }
-    again = f"datagen {shlex.join(sys.argv[1:])}"
     if json:
         print_json(report)
     else:
@@ -92,10 +92,11 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
             rows.append(("to come", f"{absent} that {run} has not: then relabel again"))
         print_rows(f"{summary.end}: {out}", rows)
     if summary.end == "aborted":
-        raise InputError(out, "", f"cannot go on: {summary.cause}", f"Then again: {again}")
+        raise InputError(
+            out, "", f"cannot go on: {summary.cause}", f"Then again: {command_line(sys.argv[1:])}"
+        )
     if summary.end == "failed":
         sys.stderr.write(f"error: {out}: too many shards failed. See: datagen status {shlex.quote(out)}\n")
     if summary.end == "interrupted":
-        left = counted(summary.remaining, "shard")
-        sys.stderr.write(f"interrupted with {left} to go. Go on with:\n  {again}\n")
+        say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", sys.argv[1:])
     return summary.exit_code

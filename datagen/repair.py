@@ -16,7 +16,7 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
+from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.verify import finding_row, print_findings
 from schemas.checking.mending import Mended, RemakeShard, mend_place
 from schemas.errors import InputError
@@ -33,9 +33,7 @@ def repair(
     workers: Annotated[
         int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0 works in this one.")
     ] = 0,
-    houses: HousesAgain = None,
-    objects: ObjectsAgain = None,
-    scenes_from: ScenesFromAgain = None,
+    given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Check a run as verify does, mend what can be mended, and check again.
@@ -49,7 +47,7 @@ def repair(
     place = open_storage(run, probe=False, create=False)
     with (
         counting("shards checked", as_json=True if json else None) as seen,
-        _remaking(Sources(houses, objects, scenes_from), workers) as remake,
+        _remaking(given, workers) as remake,
     ):
         mended = mend_place(place, remake, max(1, workers), seen)
     left = [finding for finding in mended.left if finding.is_damage]

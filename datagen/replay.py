@@ -17,7 +17,7 @@ from datagen.drawing.replay_picture import draw_replay
 from datagen.remaking.alone import replay_shard
 from datagen.remaking.scenes import chosen_rows, open_replayer, what_differs_here
 from datagen.remaking.shards import Origin, open_origin
-from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
+from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
 from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
@@ -49,9 +49,7 @@ def replay(
     out: Annotated[
         Path | None, Parameter(help="A .png file: the stored scene beside the replayed one.")
     ] = None,
-    houses: HousesAgain = None,
-    objects: ObjectsAgain = None,
-    scenes_from: ScenesFromAgain = None,
+    given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Draw a sample's scene again from its seeds, as a worker does, and compare it with what is stored.
@@ -68,7 +66,7 @@ def replay(
     if out is not None and (out.suffix.lower() != ".png" or not out.parent.is_dir()):
         problem = "is not a .png file in a folder that exists"
         raise InputError(out, "--out", problem, "Give such a name")
-    runs, given = open_runs(run), Sources(houses, objects, scenes_from)
+    runs = open_runs(run)
     if sample is not None:
         shards = sum(len(found.committed()) for found in runs)
         with steps("shards searched", shards, True if json else None) as step:

@@ -12,7 +12,7 @@ from datagen.console.options import RunPlace
 from datagen.console.printing import print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
-from datagen.remaking.sources import HousesAgain, ObjectsAgain
+from datagen.remaking.sources import AS_FOUND, AssetSources
 from datagen.specifying.arms import refuse_missing_packages
 from schemas.errors import InputError
 from schemas.merged import find_scene, open_runs
@@ -31,8 +31,7 @@ def show(
     trial: Annotated[
         str | None, Parameter(help="A candidate's index, or best: show how its trial went (plan, sim).")
     ] = None,
-    houses: HousesAgain = None,
-    objects: ObjectsAgain = None,
+    given: AssetSources = AS_FOUND,
 ) -> int:
     """A picture of one scene: the RGB-D frame, floor plans with the candidates, numbers.
 
@@ -51,9 +50,8 @@ def show(
         raise InputError(run, "--trial" if trial is not None else "--out", problem, mend)
     refuse_missing_packages(spec.label_source)
     rows = read_scene(opened, of_run)
-    world = open_world(
-        spec, houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
-    )
+    houses = given.houses or sources.get("houses", "builtin")
+    world = open_world(spec, houses, given.objects or sources.get("objects", "builtin"))
     shown = Shown(run, spec, rows, recall_scene(world, rows.record))
     if of_trial:
         # Imported here, so that scenes can be seen without what plans and executes.

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.jobs.options import command_line
 from datagen.jobs.report import health_line, jobs_report
 from datagen.reports.standing import place_report
 from schemas.jobs import Jobs

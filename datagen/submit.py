@@ -7,24 +7,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import resumable, words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, refuse_unusable_engines
 from datagen.jobs.job import Work
-from datagen.jobs.options import (
-    DEFAULT_SHARE,
-    Address,
-    Detach,
-    JsonLines,
-    MaxQuarantined,
-    Placing,
-    Workers,
-    absolute_place,
-    absolute_source,
-    refuse_odd_n,
-    resumable,
-    words_of,
-)
+from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, refuse_odd_n
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
@@ -95,11 +83,7 @@ def submit(
     ] = None,
     noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
-    workers: Workers = None,
-    address: Address = "local",
-    max_quarantined: MaxQuarantined = DEFAULT_SHARE,
-    detach: Detach = False,
-    json: JsonLines = False,
+    placing: Placing = HERE,
 ) -> int:
     """Make labels: start a run, or go on with the one that is in the folder.
 
@@ -110,7 +94,6 @@ def submit(
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # refuses an unknown one
     refuse_odd_n(n)
-    placing = Placing(workers, address, json, max_quarantined, detach)
     placing.refuse_bad()
     said = {
         "--n": n,
@@ -131,7 +114,7 @@ def submit(
         "--config": config and config.expanduser().absolute(),
     }
     words = ["submit", label_source, *words_of(said), *placing.words()]
-    if detach and address != "local":
+    if placing.detach and placing.address != "local":
         return detach_job(words, out, placing)  # sources lie where the cluster is
     decide_scenes = {
         "--seed": seed,
@@ -152,13 +135,13 @@ def submit(
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
     }
-    with resumable([*words, *words_of({"--address": None if address == "local" else address})]):
+    with resumable([*words, *placing.address_words()]):
         if scenes_from is None:
             houses, objects = houses or "builtin", objects or "builtin"
             house_source, object_source = open_houses(houses), open_objects(objects)
             spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
             world = assemble_world(spec, house_source, object_source, houses, objects)
-            refuse_unusable_engines(spec, address)
+            refuse_unusable_engines(spec, placing.address)
             if _layout_there(out) is None:
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
@@ -167,7 +150,7 @@ def submit(
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
             open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
-            refuse_unusable_engines(spec, address)
+            refuse_unusable_engines(spec, placing.address)
             source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
             schema_version = stored.run.manifest.schema_version
             refuse_too_few(stored, layout, n)
@@ -176,7 +159,7 @@ def submit(
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
         run = Run.create_or_open(open_storage(out), manifest, n)
-    if detach:
+    if placing.detach:
         return detach_job(words, out, placing)
     work = Work(run, sources["houses"], sources["objects"], source_url)
     return go_on(run.storage, out, [work], placing)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from datagen.console.command_lines import say_interrupted
 from datagen.console.options import AllowIncomplete, AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.whole_number import WHOLE_NUMBER
@@ -164,8 +164,7 @@ def _report(out: Path, finished: bool, json: bool) -> int:
         print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
     if finished:
         return 0
-    again = f"datagen {shlex.join(sys.argv[1:])}"
-    sys.stderr.write(f"interrupted, and nothing is lost. Go on with:\n  {again}\n")
+    say_interrupted(", and nothing is lost", sys.argv[1:])
     return 130
 
 

@@ -15,7 +15,7 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import HousesAgain, ObjectsAgain, ScenesFromAgain, Sources
+from datagen.remaking.sources import AS_FOUND, Sources
 from schemas.checking.finding import Finding
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError, printable
@@ -37,9 +37,7 @@ def verify(
     seed: Annotated[
         int | None, WHOLE_NUMBER, Parameter(help="Which samples and scenes --deep takes [others each time].")
     ] = None,
-    houses: HousesAgain = None,
-    objects: ObjectsAgain = None,
-    scenes_from: ScenesFromAgain = None,
+    given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
@@ -56,7 +54,6 @@ def verify(
     chosen = secrets.randbits(32) if seed is None else seed
     recomputed = deep > 0 and not found.damage
     if recomputed:
-        given = Sources(houses, objects, scenes_from)
         found.take(_deep(place, checked.runs, deep, chosen, given))
     report = _report(run, checked, found)
     report["deep"] = {"asked": deep, "done": recomputed, "seed": chosen} if deep else None

@@ -14,9 +14,10 @@ from cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
 from cluster.private_folder import write_private
 from cluster.ray_head import ensure_head, head_token
 from cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
+from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
 from datagen.jobs.job import JOBS_API, SUBMISSION
-from datagen.jobs.options import Placing, command_line
+from datagen.jobs.options import Placing
 from schemas.errors import InputError
 from schemas.jobs import new_job_id
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError
 
+from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detached_words
 from datagen.jobs.job import JobPlan, Work, carry_out
-from datagen.jobs.options import Placing, absolute_place, absolute_source, resumable, words_of
+from datagen.jobs.options import Placing, absolute_place, absolute_source
 from datagen.remaking.shards import open_origin
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.specifying.arms import refuse_missing_packages
@@ -62,9 +63,7 @@ def go_on(
 ) -> int:
     """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
     words = ["resume", absolute_place(name), *source_words(given), *placing.words()]
-    words += detached_words() or words_of(
-        {"--address": None if placing.address == "local" else placing.address}
-    )
+    words += detached_words() or placing.address_words()
     with resumable(words):
         return carry_out(JobPlan(place, name, works, placing, words))
 

@@ -25,9 +25,10 @@ from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally, no_work
 from cluster.task import ShardTask
 from cluster.watch import Together, Watch
+from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
-from datagen.jobs.options import Placing, command_line
+from datagen.jobs.options import Placing
 from schemas.errors import InputError, one_line
 from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from schemas.record_files import now
@@ -233,8 +234,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         see = command_line(["status", name])
         sys.stderr.write(one_line(f"error: {name}: too many shards failed{most}. See: {see}") + "\n")
     if summary.end == "interrupted":
-        left = counted(summary.remaining, "shard")
-        sys.stderr.write(f"interrupted with {left} to go. Go on with:\n  {resume}\n")
+        say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", plan.resume)
     return summary.exit_code
 
 

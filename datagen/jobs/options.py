@@ -1,58 +1,43 @@
-"""Options of the verbs that run jobs, and the command line that they make together."""
+"""Options of the verbs that run jobs, and the words that say them again."""
 
 from __future__ import annotations
 
-import shlex
-import sys
-from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from cluster.ray_cluster import refuse_unusable
+from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError, refuse_not_utf8
 
-if TYPE_CHECKING:
-    from collections.abc import Generator
-
-Workers = Annotated[
-    int | None,
-    WHOLE_NUMBER,
-    Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
-]
-Address = Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")]
-JsonLines = Annotated[bool, Parameter(negative=(), help="Report progress as JSON lines, also on a terminal.")]
-MaxQuarantined = Annotated[
-    float, Parameter(help="Share of the run's shards that may be given up before the job has failed.")
-]
-Detach = Annotated[
-    bool,
-    Parameter(
-        negative=(),
-        help="Hand the job to Ray and come back: it goes on when this shell ends. With --address, to that "
-        "cluster (its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine.",
-    ),
-]
-Quarantined = Annotated[
-    bool, Parameter(negative=(), help="Try the shards in quarantine again; their records stay as history.")
-]
-
 DEFAULT_SHARE = 0.01
+_DETACH = (
+    "Hand the job to Ray and come back: it goes on when this shell ends. With --address, to that cluster "
+    "(its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine."
+)
 
 
+@Parameter(name="*")
 @dataclass(frozen=True)
 class Placing:
     """Where and how a job runs; nothing of this changes a sample."""
 
-    workers: int | None = None
-    address: str = "local"
-    json: bool = False
-    max_quarantined: float = DEFAULT_SHARE
-    detach: bool = False
+    workers: Annotated[
+        int | None,
+        WHOLE_NUMBER,
+        Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
+    ] = None
+    address: Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")] = "local"
+    max_quarantined: Annotated[
+        float, Parameter(help="Share of the run's shards that may be given up before the job has failed.")
+    ] = DEFAULT_SHARE
+    detach: Annotated[bool, Parameter(negative=(), help=_DETACH)] = False
+    json: Annotated[
+        bool, Parameter(negative=(), help="Report progress as JSON lines, also on a terminal.")
+    ] = False
 
     def refuse_bad(self) -> None:
         """Raise InputError for values out of range and, unless detached, for a cluster that is not there."""
@@ -70,39 +55,18 @@ class Placing:
         share = None if self.max_quarantined == DEFAULT_SHARE else self.max_quarantined
         return words_of({"--workers": self.workers, "--max-quarantined": share, "--json": self.json})
 
+    def address_words(self) -> list[str]:
+        """--address, where it is not `local`."""
+        return words_of({"--address": None if self.address == "local" else self.address})
+
+
+HERE = Placing()
+
 
 def refuse_odd_n(n: int) -> None:
     """Raise InputError for a number of labels that no run has."""
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
-
-
-def words_of(options: Mapping[str, object]) -> list[str]:
-    """Options as words of a command line; None and False say nothing."""
-    words: list[str] = []
-    for name, value in options.items():
-        if value is True:
-            words.append(name)
-        elif value is not None and value is not False:
-            words += [name, str(value)]
-    return words
-
-
-def command_line(words: Sequence[str]) -> str:
-    """The command that a user can paste."""
-    return shlex.join(["datagen", *words])
-
-
-@contextmanager
-def resumable(words: Sequence[str]) -> Generator[None]:
-    """Tell whoever interrupts the block how to go on."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        sys.stderr.write(
-            f"interrupted early; what is committed stays. Go on with:\n  {command_line(words)}\n"
-        )
-        raise
 
 
 def absolute_source(ref: str) -> str:

@@ -1,4 +1,4 @@
-"""Where the sources of an existing run lie now, if they have moved: three options, and what they say."""
+"""Where the sources of an existing run lie now, if they have moved: options of several verbs."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-HousesAgain = Annotated[
-    str | None, Parameter(help="Where the houses lie now [where the run found them].", name="--houses")
-]
-ObjectsAgain = Annotated[
-    str | None, Parameter(help="Where the objects lie now [where the run found them].", name="--objects")
-]
-ScenesFromAgain = Annotated[
-    str | None,
-    Parameter(
-        help="Where the run lies whose scenes are labelled again [where it was found].", name="--scenes-from"
-    ),
-]
 
-
+@Parameter(name="*")
 @dataclass(frozen=True)
-class Sources:
-    """Source references and a place as the user gives them; None is where the run found them."""
+class AssetSources:
+    """References of houses and objects as the user gives them; None is where the run found them."""
 
-    houses: str | None = None
-    objects: str | None = None
-    scenes_from: str | None = None
+    houses: Annotated[str | None, Parameter(help="Where the houses lie now [where the run found them].")] = (
+        None
+    )
+    objects: Annotated[
+        str | None, Parameter(help="Where the objects lie now [where the run found them].")
+    ] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Sources(AssetSources):
+    """The same, and the place whose scenes a run labelled again."""
+
+    scenes_from: Annotated[
+        str | None,
+        Parameter(help="Where the run lies whose scenes are labelled again [where it was found]."),
+    ] = None
 
 
 AS_FOUND = Sources()
