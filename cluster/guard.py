@@ -29,11 +29,12 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
-from cluster.private_folder import is_private
 from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from schemas.cost import StageClock
+from schemas.private_folders import is_private
 from schemas.run_records import Cost, Host, Outcome
 from schemas.storage.errors import FULL, StoreFailure, machine_error
+from schemas.whole_files import whole_file
 
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.
@@ -129,9 +130,8 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
     if not is_private(note.parent.lstat()):
         problem = f"{note.parent}: another user's folder, or others can write to it"
         raise JobCannotGoOn(f"{problem}. Name a folder of your own as TMPDIR")
-    draft = note.with_suffix(".part")
-    draft.write_text(json.dumps({"host": this_host().model_dump(), "started": started}))
-    draft.rename(note)
+    with whole_file(note, alone=True) as file:
+        file.write(json.dumps({"host": this_host().model_dump(), "started": started}).encode())
     if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
         try:
             yield

@@ -5,7 +5,6 @@ Ray opens its own folders to everybody, so each cluster of this machine has its 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import signal
@@ -15,6 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
+
+from schemas.private_folders import locked_folder
+from schemas.whole_files import whole_file
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"
@@ -29,19 +31,11 @@ RAY = "ray"  # the part that Ray writes to, and opens to everybody who can reach
 def private_folder() -> Generator[Path]:
     """Give a new folder of mode 0700; when the block ends, its processes are ended and it is removed.
 
-    First removes what killed programs of this user left. A lock that the kernel releases when its owner
-    dies tells those from living ones.
+    First removes what killed programs of this user left.
     """
-    _remove_abandoned()
-    folder = new_folder(_KIND)
-    lock = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        (folder / RAY).mkdir()  # from here on another program may ask whether it is abandoned
+    with locked_folder(_KIND, _PARENT, remove_folder) as folder:
+        (folder / RAY).mkdir()
         yield folder
-    finally:
-        remove_folder(folder)
-        os.close(lock)
 
 
 def new_folder(kind: str) -> Path:
@@ -51,15 +45,8 @@ def new_folder(kind: str) -> Path:
 
 def write_private(path: Path, text: str) -> None:
     """Write a file of mode 0600 that appears whole."""
-    draft = path.with_suffix(f".{os.getpid()}.part")
-    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(text)
-    draft.replace(path)
-
-
-def is_private(status: os.stat_result) -> bool:
-    """Whether a file or folder is this user's, and nobody else can write to it."""
-    return status.st_uid == os.getuid() and not status.st_mode & 0o022
+    with whole_file(path, mode=0o600) as file:
+        file.write(text.encode())
 
 
 def remove_folder(folder: Path) -> None:
@@ -77,23 +64,6 @@ def end_processes(processes: list[psutil.Process]) -> None:
             except psutil.Error:
                 continue
         _, processes = psutil.wait_procs(processes, timeout=_STOP_WITHIN_S)
-
-
-def _remove_abandoned() -> None:
-    """Remove the private folders of this user whose owners are dead."""
-    for folder in _PARENT.glob(f"{_KIND}*"):
-        try:
-            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError:
-            continue  # another user's, or no folder
-        try:
-            if is_private(os.fstat(lock)) and (folder / RAY).is_dir():
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                remove_folder(folder)
-        except BlockingIOError:
-            continue  # its owner lives
-        finally:
-            os.close(lock)
 
 
 def _belongs(process: psutil.Process, folder: str) -> bool:

@@ -20,9 +20,10 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationError
 
 from cluster.environment import is_of_the_shell
-from cluster.private_folder import RAY, is_private, new_folder, remove_folder, write_private
+from cluster.private_folder import RAY, new_folder, remove_folder, write_private
 from cluster.ray_settings import head_arguments, head_environment, new_token
 from schemas.errors import InputError
+from schemas.private_folders import is_private
 from schemas.run_records import StoredRecord
 
 _START_WITHIN_S = 300.0

@@ -12,6 +12,7 @@ from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
+from schemas.whole_files import whole_file
 
 
 def evaluate(
@@ -112,7 +113,8 @@ def evaluate(
     if html is not None:
         from datagen.evaluating.page import page_of
 
-        write_page(html, page_of(report, gathered))
+        with whole_file(html, alone=True) as file:
+            file.write(page_of(report, gathered).encode())
     if json:
         print_json(report)
         return 0
@@ -120,16 +122,6 @@ def evaluate(
     if html is not None:
         print_rows("written", [("page", str(html))])
     return 0
-
-
-def write_page(path: Path, text: str) -> None:
-    """Replace the file as a whole."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        new.write_text(text, encoding="utf-8")
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
 
 
 def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
+from schemas.whole_files import whole_file
 from workers.geometry.mesh import F64
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
+_MOST_ENTRIES = 10_000
 
 
 def predict(
@@ -106,11 +109,13 @@ def predict(
     if out is not None:
         from train.prediction.pictures import draw_prediction
 
-        _replace(out, lambda file: draw_prediction(answer, file))
+        with whole_file(out, alone=True) as file:
+            draw_prediction(answer, file)
     if html is not None:
-        from train.prediction.page import write_page
+        from train.prediction.page import page_of
 
-        _replace(html, lambda file: write_page(answer, file))
+        with whole_file(html, alone=True) as file:
+            file.write(page_of(answer).encode())
     if as_json:
         print_json(document(answer))
     else:
@@ -137,7 +142,12 @@ def _frames(
     if folder is not None:
         if not folder.is_dir():
             raise InputError(folder, "--frame-dir", "no such folder", "Name a folder of frames")
-        named += sorted(p for p in folder.iterdir() if p.is_dir() or p.suffix.lower() in (".npz", ".ply"))
+        with os.scandir(folder) as entries:
+            listed = [Path(entry) for entry in islice(entries, _MOST_ENTRIES + 1)]
+        if len(listed) > _MOST_ENTRIES:
+            problem = f"holds more than {_MOST_ENTRIES:,} files"
+            raise InputError(folder, "--frame-dir", problem, "Name a folder of frames")
+        named += sorted(p for p in listed if p.is_dir() or p.suffix.lower() in (".npz", ".ply"))
     parts = {"--rgb": rgb, "--depth": depth, "--intrinsics": intrinsics}
     missing = [name for name, value in parts.items() if value is None]
     pictures = rgb is not None or depth is not None or intrinsics is not None or mask is not None
@@ -202,13 +212,3 @@ def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path |
         if file.is_dir() or file.resolve() in read:
             problem = "a folder stands there" if file.is_dir() else "one of the files that are read"
             raise InputError(file, option, problem, "Give another name")
-
-
-def _replace(file: Path, write: Callable[[Path], None]) -> None:
-    """Write a file whole or not at all."""
-    new = file.with_name(f".{file.name}.new{file.suffix}")
-    try:
-        write(new)
-        os.replace(new, file)
-    finally:
-        new.unlink(missing_ok=True)

@@ -16,13 +16,13 @@ import zipfile
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
-from uuid import uuid4
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP
+from schemas.whole_files import whole_file
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 # Type and shape of every array; lengths with one name are equal.
@@ -115,23 +115,6 @@ def write_arrays(path: Path, arrays: Arrays) -> bool:
     except OSError:
         return False
     return True
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Generator[IO[bytes]]:
-    """A file that appears under its name when the block ends, or not at all; folders are made.
-
-    Several processes may write one name at once: each sees nothing or a whole file. Raises OSError.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            yield file
-        temporary.replace(path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def refresh(path: Path) -> bool:

@@ -12,6 +12,7 @@ from datagen.assets.download import Policy, Progress, download
 from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
 from schemas.errors import InputError
+from schemas.whole_files import whole_file
 
 
 @dataclass(frozen=True)
@@ -100,10 +101,8 @@ def _install(asset: Asset, kept: Path, folder: Path) -> list[str]:
     if asset.archive:
         unpacked = unpack(kept, home, Limits(asset.max_unpacked_bytes))
         return [(PurePosixPath(asset.into) / path).as_posix() for path in unpacked]
-    home.mkdir(parents=True, exist_ok=True)
-    temporary = home / f".{asset.file}.new"
-    shutil.copyfile(kept, temporary)
-    temporary.replace(home / asset.file)
+    with kept.open("rb") as source, whole_file(home / asset.file, alone=True) as file:
+        shutil.copyfileobj(source, file)
     return [(PurePosixPath(asset.into) / asset.file).as_posix()]
 
 

@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError
 from schemas.errors import InputError
 from schemas.foreign_files import open_regular, read_regular
 from schemas.run_records import Digest, StoredRecord
+from schemas.whole_files import whole_file
 
 LOCK_NAME = "assets.lock.json"
 _MAX_LOCK_BYTES = 64 * 2**20
@@ -105,16 +106,8 @@ def read_lock(folder: Path) -> Lock | None:
 def write_lock(folder: Path, lock: Lock) -> Path:
     """Replaces the folder's lock file atomically."""
     path = folder / LOCK_NAME
-    temporary = folder / f".{LOCK_NAME}.{os.getpid()}"
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump(lock.model_dump(), file, indent=1, sort_keys=True)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path, durable=True) as file:
+        file.write(json.dumps(lock.model_dump(), indent=1, sort_keys=True).encode() + b"\n")
     return path
 
 

@@ -199,6 +199,9 @@ def bad_files(folder: Path) -> None:
         os.mkfifo(folder / name)
     for name in ("zero.npz", "zero.png"):
         (folder / name).symlink_to("/dev/zero")
+    (folder / "crowd").mkdir()
+    for number in range(10_001):
+        (folder / "crowd" / str(number)).touch()
     (folder / "frame").mkdir()
     os.mkfifo(folder / "frame" / "color.png")
 
@@ -213,7 +216,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--depth", "{bad}/huge.png", "pixels"),
     ("--depth", "{bad}/cut.png", "not a readable"),
     ("--depth", "{bad}/text.png", "not a readable"),
-    ("--depth", "{bad}/missing.png", "no such file"),
+    ("--depth", "{bad}/missing.png", "No such file"),
     ("--depth", "{bad}", "not a file"),
     ("--depth", "-", "--depth"),
     ("--intrinsics", "-", "--intrinsics"),
@@ -257,7 +260,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--frame", "{bad}/junk.npz", "not an array"),
     ("--frame", "{bad}/noarchive.npz", "not a .npz"),
     ("--frame", "{bad}/records.npz", "not a .npz"),
-    ("--frame", "{bad}/sparse.npz", "more than 268,435,456 bytes"),
+    ("--frame", "{bad}/sparse.npz", "more than the 268,435,456 allowed"),
     ("--frame", "{bad}/fifo", "no frame"),
     ("--frame", "{bad}/fifo.npz", "not a file"),
     ("--frame", "{bad}/zero.npz", "not a file"),
@@ -268,6 +271,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--camera-pose", "{bad}/fifo.json", "not a file"),
     ("--frame", "{made}/frame", "pose"),  # one more, where the first has none
     ("--frame-dir", "{bad}/missing", "no such folder"),
+    ("--frame-dir", "{bad}/crowd", "more than 10,000 files"),
     ("--out", "{bad}/a.jpg", ".png"),
     ("--out", "{bad}/missing/a.png", "folder"),
     ("--out", "{made}/frame/color.png", "read"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import warnings
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
 from workers.geometry.mesh import F32, F64, U8
 from workers.geometry.transforms import is_pose
 from workers.houses.reading import Node, parse_json
@@ -19,6 +19,7 @@ from workers.houses.reading import Node, parse_json
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096
 MAX_FILE_BYTES = 256 * 2**20
+FILE_MEND = "Name a file that exists and is not larger"
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses travel as text of four or five digits.
 _POSE_ROUNDING = 1e-3
@@ -27,19 +28,6 @@ _EXTENT_M = 1000.0
 MAX_DEPTH_M = 20.0
 
 Bools = npt.NDArray[np.bool_]
-
-
-def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
-    """A regular file of at most `most` bytes. InputError for what is missing, larger or no file."""
-    mend = "Give the path of a file that exists"
-    if "\0" in str(path):
-        raise InputError(repr(str(path)), "", "not the name of a file", mend)
-    if not path.is_file():
-        raise InputError(path, "", "not a file" if path.exists() else "no such file", mend)
-    with open(path, "rb") as file:
-        if os.fstat(file.fileno()).st_size > most or len(data := file.read(most + 1)) > most:
-            raise InputError(path, "", f"more than {most:,} bytes", "Give a smaller file")
-    return data
 
 
 def read_rgb(path: Path) -> U8:
@@ -120,13 +108,13 @@ def _of(node: Node | None) -> Node:
 
 
 def _document(path: Path) -> Node:
-    return parse_json(read_bytes(path, _MAX_JSON_BYTES), str(path))
+    return parse_json(read_regular(path, _MAX_JSON_BYTES, FILE_MEND), str(path))
 
 
 def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
     """A decoded picture. Its size is checked before its pixels are decoded."""
     kinds = " or ".join(formats)
-    data = io.BytesIO(read_bytes(path))
+    data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_MEND))
     try:
         with warnings.catch_warnings():
             # Our own limit, checked below, is stricter than the one that warns.

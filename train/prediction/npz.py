@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from schemas.errors import InputError
-from train.prediction.files import MAX_FILE_BYTES, MAX_PIXELS, read_bytes
+from schemas.foreign_files import read_regular
+from train.prediction.files import FILE_MEND, MAX_FILE_BYTES, MAX_PIXELS
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS
@@ -25,7 +26,7 @@ _MEND = (
 
 def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """Those of `NAMES` that the archive holds. InputError for objects, bombs and what is no archive."""
-    data = read_bytes(path, MAX_FILE_BYTES)
+    data = read_regular(path, MAX_FILE_BYTES, FILE_MEND)
     found: dict[str, npt.NDArray[Any]] = {}
     try:
         # Every record of the zip's directory begins with these bytes; counted before a list is made of them.

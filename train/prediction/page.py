@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects as go
@@ -19,7 +18,7 @@ _MOST_POINTS = 20_000
 _SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open"}
 
 
-def write_page(prediction: Prediction, out: Path) -> None:
+def page_of(prediction: Prediction) -> str:
     """The cloud, every place with its score under the pointer, and the best pose in gold."""
     half_m = float(np.abs(prediction.places.offset_m).max()) + 0.5
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
@@ -31,8 +30,7 @@ def write_page(prediction: Prediction, out: Path) -> None:
         scene={"aspectmode": "data", "xaxis_title": "x [m]", "yaxis_title": "y [m]", "zaxis_title": "z [m]"},
         legend={"x": 0.0, "y": 0.95},
     )
-    # pyright knows plotly's writer in part only; the file is written whole by it.
-    figure.write_html(str(out), include_plotlyjs=True, full_html=True, div_id="prediction")
+    return figure.to_html(include_plotlyjs=True, full_html=True, div_id="prediction")
 
 
 def _cloud(prediction: Prediction, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> go.Scatter3d:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -28,7 +27,7 @@ _BASE_RADIUS_M = CandidateParams().base_radius_m
 _MOST_POINTS = 15_000
 
 
-def draw_prediction(prediction: Prediction, out: Path) -> None:
+def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     """Write the picture as PNG."""
     figure = Figure(figsize=(19, 8.2), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)

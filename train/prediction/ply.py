@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.errors import InputError
-from train.prediction.files import Bools, read_bytes
+from schemas.foreign_files import read_regular
+from train.prediction.files import FILE_MEND, MAX_FILE_BYTES, Bools
 from workers.geometry.mesh import F32, U8
 
 MAX_POINTS = 20_000_000
@@ -38,7 +39,7 @@ def read_ply(path: Path) -> PlyCloud:
 
     InputError for a header that is not one, or that promises other vertices than the file holds.
     """
-    data = read_bytes(path)
+    data = read_regular(path, MAX_FILE_BYTES, FILE_MEND)
     form, count, properties, start = _header(path, data)
     if not count:
         raise InputError(path, "element vertex", "no vertices", _MEND)

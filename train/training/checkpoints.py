@@ -23,6 +23,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
 from schemas.errors import InputError
+from schemas.foreign_files import read_regular
+from schemas.whole_files import whole_file
 from train.dataset import Origin
 from train.models import Model, build_model
 from train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
@@ -109,7 +111,7 @@ def put_weights(model: Model, weights: Mapping[str, Tensor], place: str) -> None
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """All of a checkpoint, on the CPU. InputError as `load_model`; memory is bounded by the file's size."""
-    place, data = str(path), _read(Path(path))
+    place, data = str(path), read_regular(Path(path), MAX_BYTES, _MEND)
     refuse_foreign(place, data)
     try:
         stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
@@ -147,22 +149,8 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     stored |= {f"resume/{k}": _own(v) for k, v in checkpoint.resume.items()}
     mend = "Nothing was overwritten. Train again with a smaller --lr and a new --out"
     _refuse_not_finite(str(path), {k: v for k, v in stored.items() if k != "head"}, mend)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f".{path.name}.new")
-    try:
-        with open(new, "wb") as file:
-            torch.save(stored, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(new, path)
-    except OSError:
-        new.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with whole_file(path, durable=True, alone=True) as file:
+        torch.save(stored, file)
 
 
 @contextmanager
@@ -195,22 +183,6 @@ def _refuse_not_finite(place: str, tensors: Mapping[str, Tensor], mend: str) -> 
 def _own(tensor: Tensor) -> Tensor:
     """A dense copy on the CPU: a view would be saved with all of what it is a view of."""
     return tensor.detach().cpu().contiguous().clone()
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if not path.is_file() and path.exists():
-            raise IsADirectoryError
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > MAX_BYTES:
-                problem = f"{size} bytes, and a checkpoint has at most {MAX_BYTES}"
-                raise InputError(path, "", problem, _MEND)
-            return file.read(MAX_BYTES)
-    except FileNotFoundError:
-        raise InputError(path, "", "no such file", "Name a checkpoint that `datagen train` wrote") from None
-    except (IsADirectoryError, NotADirectoryError):
-        raise InputError(path, "", "not a file", "Name a checkpoint that `datagen train` wrote") from None
 
 
 def _document(place: str, text: object) -> dict[str, Any]:

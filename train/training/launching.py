@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import multiprocessing
 import os
-import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Generator, Sequence
@@ -19,6 +17,7 @@ import torch
 import torch.distributed as dist
 
 from schemas.errors import InputError
+from schemas.private_folders import locked_folder
 from train.training.ranks import Ranks
 
 Stopping = Callable[[], bool]
@@ -52,55 +51,22 @@ def train_in_processes(work: Work, job: Any, processes: int, device: str, stoppi
     process. Returns whether they came to their end.
     """
     context = multiprocessing.get_context("spawn")
-    with _meeting_folder() as folder:
+    with locked_folder(_PREFIX, Path(tempfile.gettempdir())) as folder:
         children: list[tuple[Any, Connection]] = []
         try:
             for rank in range(processes):
                 here, there = context.Pipe(duplex=False)
-                arguments = (work, job, Ranks(rank, processes), device, folder, there)
+                arguments = (work, job, Ranks(rank, processes), device, str(folder), there)
                 child = context.Process(target=_child, args=arguments, daemon=True)
                 child.start()
                 there.close()
                 children.append((child, here))
-            return _ends(children, Path(folder), stopping)
+            return _ends(children, folder, stopping)
         finally:
             for child, here in children:
                 child.kill()
                 child.join()
                 here.close()
-
-
-@contextmanager
-def _meeting_folder() -> Generator[str]:
-    """A folder of this user alone, locked while this process lives; those of dead ones are removed first."""
-    for left in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        if (held := _lock(left, fcntl.LOCK_EX)) is not None:
-            shutil.rmtree(left, ignore_errors=True)
-            os.close(held)
-    folder, held = "", None
-    while held is None:  # unless another process took it for a dead one's before it was locked
-        folder = tempfile.mkdtemp(prefix=_PREFIX)
-        held = _lock(Path(folder), fcntl.LOCK_SH)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(held)
-
-
-def _lock(folder: Path, kind: int) -> int | None:
-    """A descriptor that holds the lock of this user's folder until the process ends; None where it cannot."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    with suppress(OSError):
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-        about = os.fstat(descriptor)
-        if about.st_uid == os.geteuid() and os.path.samestat(about, folder.lstat()):
-            return descriptor
-    os.close(descriptor)
-    return None
 
 
 def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: Stopping) -> bool:

@@ -27,7 +27,8 @@ import numpy.typing as npt
 from schemas.errors import InputError
 from schemas.foreign_files import open_regular, read_regular
 from schemas.identity import canonical_json
-from workers.content_cache import cache_folder, drop_unused, read_arrays, refresh, whole_file, write_arrays
+from schemas.whole_files import whole_file
+from workers.content_cache import cache_folder, drop_unused, read_arrays, refresh, write_arrays
 from workers.houses.reading import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.identity import digest_of
-from workers.content_cache import alone_in, cache_folder, drop_unused, refresh, whole_file
+from schemas.whole_files import whole_file
+from workers.content_cache import alone_in, cache_folder, drop_unused, refresh
 from workers.geometry.mesh import F32, F64
 from workers.robots.assembly import Assembly, Body
 from workers.robots.hulls import hull_faces
