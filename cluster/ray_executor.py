@@ -14,16 +14,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from cluster.guard import Meter, Remains, collect_remains, guarded, obituary, resident_bytes
+from cluster.guard import Meter, Remains, clear_notes, collect_remains, guarded, obituary, resident_bytes
 from cluster.ray_cluster import RaySettings, first_line, ray_cluster
-from cluster.ray_nodes import (
-    OtherNodes,
-    Question,
-    attempts_begun,
-    end_attempts,
-    forget_job,
-    remains_of,
-)
+from cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, remains_of
 from cluster.task import AttemptReport, Product, Task
 from schemas.errors import InputError
 from schemas.run_records import Outcome
@@ -174,7 +167,7 @@ class RayExecutor(Generic[T]):
     def close(self) -> None:
         """Remove what the job's workers left on other machines."""
         for notes in self._jobs - {""}:
-            self.others.ask(forget_job, notes, patience_s=_FORGOTTEN_WITHIN_S)
+            self.others.ask(clear_notes, notes, patience_s=_FORGOTTEN_WITHIN_S)
         self._jobs.clear()
 
     def _end_stubborn(self) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cluster.guard import Remains, clear_notes, collect_remains, read_note
+from cluster.guard import Remains, collect_remains, read_note
 
 _MUTE_S = 30.0  # a machine that did not answer is left alone for so long
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
@@ -155,11 +155,6 @@ def end_attempts(notes: str, attempts: Sequence[str]) -> None:
         note = read_note(notes, attempt)  # exists only while a process is at it
         if note is not None and note.host.name == platform.node():
             _kill_worker(note.host.pid)
-
-
-def forget_job(notes: str) -> None:
-    """Remove this machine's notes of a job."""
-    clear_notes(notes)
 
 
 def _kill_worker(pid: int) -> None:

@@ -19,13 +19,7 @@ from schemas.errors import InputError
 from schemas.fields import RecordSchema, sized_schema
 from schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from schemas.ledger import MAX_STACK_CHARS, Ledger
-from schemas.record_files import (
-    MAX_RECORD_BYTES,
-    decode_record,
-    encode_record,
-    now,
-    read_record,
-)
+from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
 from schemas.root_records import publish, refuse_foreign, refuse_other
 from schemas.run_records import (
     FORMAT_VERSION,
@@ -323,21 +317,6 @@ class Run:
                     mend,
                 )
         return None
-
-    def check_digests(self, commit: Commit) -> None:
-        """Refuse a commit one of whose files has other bytes than were committed."""
-        self.check_files(commit)
-        folder = shard_folder(commit.shard, commit.attempt)
-        keys = (f"{folder}/{entry.path}" for entry in commit.files)
-        largest = max((entry.size for entry in commit.files), default=0)
-        for entry, (key, data) in zip(commit.files, self.storage.get_many(keys, largest), strict=True):
-            if data is None or sha256(data).hexdigest() != entry.sha256:
-                raise InputError(
-                    f"{self.storage.url}/{key}",
-                    "sha256",
-                    "the file is damaged",
-                    "Restore the file from a copy, or mend the run with `datagen repair`",
-                )
 
     # Quarantine.
 

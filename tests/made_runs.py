@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from schemas.errors import InputError
 from schemas.fields import Field, RecordSchema, sized_schema
 from schemas.identity import sample_ids
+from schemas.keys import shard_folder
 from schemas.outcomes import REDRAW_CAUSES
 from schemas.record_files import now
 from schemas.run import Run
@@ -159,3 +162,12 @@ def values_of(schema: RecordSchema, f: Field, rows: int, rng: np.random.Generato
 def files_of(folder: Path) -> Mapping[str, bytes]:
     """Every file below a folder, by relative path."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def check_digests(run: Run, commit: Commit) -> None:
+    """Raise InputError for a commit one of whose files is missing or has other bytes than were committed."""
+    run.check_files(commit)
+    folder = shard_folder(commit.shard, commit.attempt)
+    for entry in commit.files:
+        if sha256(run.storage.get(f"{folder}/{entry.path}", entry.size) or b"").hexdigest() != entry.sha256:
+            raise InputError(f"{run.storage.url}/{folder}/{entry.path}", "sha256", "other bytes", "")

@@ -71,10 +71,6 @@ class SampleReader:
         """Scenes of all shards."""
         return sum(place.scenes for place, _ in self._shards)
 
-    def units(self) -> dict[str, str]:
-        """Unit of every field, "" for names."""
-        return {name: str(array.attributes.get("units", "")) for name, array in self._fields.items()}
-
     def shards(self) -> Iterator[Columns]:
         """Every shard's columns; `scene_row` has its samples' rows among its scenes."""
         for place, arrays in self._shards:

@@ -19,7 +19,7 @@ from schemas.keys import commit_copy_key, commit_key, shard_folder
 from schemas.run import Run
 from schemas.run_records import Layout
 from schemas.specification import CandidateParams, ObservationParams, SceneParams, Source, Specification
-from tests.made_runs import make_run, small_spec
+from tests.made_runs import check_digests, make_run, small_spec
 from workers.houses import open_houses
 from workers.objects import open_objects
 
@@ -63,7 +63,7 @@ def test_an_attempt_commits_and_a_second_one_is_superseded(spec: Specification, 
     assert commit.attempt == "first" and commit.cost == first.cost and commit.positives == first.positives
     assert commit.samples == first.labels == 10 and commit.cost.stage_wall_s["write"] > 0
     assert commit.cost.written_bytes == sum(f.size for f in commit.files) > 0
-    run.check_digests(commit)
+    check_digests(run, commit)
     assert run.storage.get(commit_copy_key(0, "first"), 10**8) == run.storage.get(commit_key(0), 10**8)
     # One that comes too late makes nothing.
     assert list(run.storage.list(shard_folder(0, "second"))) == []

@@ -15,6 +15,7 @@ import pytest
 from datagen import cli
 from schemas.record_files import signed_json
 from schemas.run import Run
+from tests.made_runs import check_digests
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments
 
@@ -168,7 +169,7 @@ def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(told) == 1 and "No space left on device" in told[0] and "resume" in told[0].lower()
     assert not (run / "data.zarr").exists()
     for commit in Run.open(run).commits():  # what counts is whole
-        Run.open(run).check_digests(commit)
+        check_digests(Run.open(run), commit)
 
 
 def test_a_place_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ from schemas.run import Run
 from schemas.sealing import seal
 from schemas.storage import Storage, StoredFile, open_storage
 from schemas.summaries import index_files, refresh
-from tests.made_runs import attempt, files_of, make_run, small_spec, write
+from tests.made_runs import attempt, check_digests, files_of, make_run, small_spec, write
 from tests.refusals import refused
 from tests.small_runs import json_of
 
@@ -86,7 +86,7 @@ def test_garbage_goes_and_everything_else_keeps_its_bytes(
     assert kept_of(tmp_path / "run", set()) == before
     assert not (tmp_path / "run" / shard_folder(1, "late")).exists()
     assert not list((tmp_path / "run").glob("data.zarr.*"))
-    run.check_digests(run.commit_of(0))
+    check_digests(run, run.commit_of(0))
     assert len(list(run.ledger.ends())) == 4  # the ledger keeps them all
     again = json_of(capsys, ["gc", run.storage.url])
     assert again["removed"] == {"files": 0, "bytes": 0}
@@ -218,7 +218,7 @@ def test_a_run_in_a_bucket_is_swept_as_on_a_disk(bucket: str, capsys: pytest.Cap
     run.storage.delete(index_files(run))
     assert account_for([run]) == books and books.useful.attempts == 3
     for shard in range(3):
-        run.check_digests(run.commit_of(shard))
+        check_digests(run, run.commit_of(shard))
 
 
 def test_a_merged_place_is_swept_with_its_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

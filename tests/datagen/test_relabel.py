@@ -15,6 +15,7 @@ from schemas.record_files import encode_record
 from schemas.run import Run
 from schemas.run_records import Commit
 from tests.datagen.forged import forge
+from tests.made_runs import check_digests
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
@@ -355,7 +356,7 @@ def test_runs_on_s3_are_relabelled_and_replayed_there(
     assert there.manifest.spec == here.manifest.spec
     for mine, other in zip(there.commits(), here.commits(), strict=True):
         assert mine.files == other.files
-        there.check_digests(mine)
+        check_digests(there, mine)
     told = json_of(capsys, ["replay", second, arrays_of(tmp_path / "here")["sample_id"][11].tobytes().hex()])
     assert told["equal"] and told["drawn_again"] and told["sample"]["candidate"] == 3
 

@@ -31,7 +31,7 @@ from schemas.sealing import seal
 from schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard
 from tests.faults.processes import ProcessExecutor
-from tests.made_runs import commit_of, make_run, rows_of
+from tests.made_runs import check_digests, commit_of, make_run, rows_of
 from tests.small_runs import arrays_of, assert_equal_runs
 
 # Whoever is killed again and again must not give a shard up.
@@ -201,7 +201,7 @@ def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
     winners: set[str] = set()
     wall_s: list[float] = []
     for shard in range(shards):
-        run.check_digests(run.commit_of(shard))
+        check_digests(run, run.commit_of(shard))
         commit = json.loads((folder / commit_key(shard)).read_bytes())
         winners.add(commit["attempt"])
         wall_s.append(commit["cost"]["wall_s"])

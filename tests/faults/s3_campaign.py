@@ -25,7 +25,7 @@ from schemas.run_records import Layout
 from schemas.sealing import seal
 from schemas.storage import open_storage
 from tests.cluster.simulated import Heard
-from tests.made_runs import make_run, manifest_of, small_spec, write
+from tests.made_runs import check_digests, make_run, manifest_of, small_spec, write
 from tests.s3_servers import Faults
 
 _COUNTS = ("requests", "pass", "commits", "creates")
@@ -130,7 +130,7 @@ def _hold_to_an_undisturbed_run(run: Run, shards: int, folder: Path) -> None:
     other = make_run(folder, shards * LAYOUT.samples_per_shard, 2, 5)
     for ours, theirs in zip(run.commits(), other.commits(), strict=True):
         assert [(e.path, e.sha256) for e in ours.files] == [(e.path, e.sha256) for e in theirs.files]
-        run.check_digests(ours)
+        check_digests(run, ours)
         key = commit_copy_key(ours.shard, ours.attempt)
         copy = run.storage.get(key, 2**24)
         assert copy == run.storage.get(f"commits/{ours.shard:06d}.json", 2**24)

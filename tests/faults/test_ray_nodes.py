@@ -25,7 +25,7 @@ from schemas.run import Run
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.job import RandomRows, make_rows
 from tests.faults.scripted import ScriptedTask, perform
-from tests.made_runs import make_run
+from tests.made_runs import check_digests, make_run
 from tests.small_runs import make_small_run
 
 POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
@@ -159,5 +159,5 @@ def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path:
 def files_of_shards(run: Run) -> dict[int, list[tuple[str, str]]]:
     """Names and digests of every committed file, checked against the disk."""
     for shard in run.committed():
-        run.check_digests(run.commit_of(shard))
+        check_digests(run, run.commit_of(shard))
     return {s: sorted((f.path, f.sha256) for f in run.commit_of(s).files) for s in run.committed()}

@@ -19,7 +19,7 @@ import pytest
 from cluster.ray_cluster import refuse_unusable
 from cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
 from schemas.errors import InputError
-from tests.made_runs import make_run
+from tests.made_runs import check_digests, make_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SHARDS = 12
@@ -142,5 +142,5 @@ def test_a_job_outlives_a_machine_whose_power_goes(cluster: Cluster, tmp_path: P
     assert run.ledger.unfinished() == [] and run.quarantined() == set()
     for shard in range(SHARDS):
         made, same = run.commit_of(shard), undisturbed.commit_of(shard)
-        run.check_digests(made)
+        check_digests(run, made)
         assert {f.path: f.sha256 for f in made.files} == {f.path: f.sha256 for f in same.files}

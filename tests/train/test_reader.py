@@ -67,12 +67,6 @@ def test_a_copied_sealed_store_reads_like_its_run(tmp_path: Path):
     )
 
 
-def test_fields_have_their_units(tmp_path: Path):
-    make_run(tmp_path, n=20)
-    units = SampleReader([tmp_path], ("house_id",), ("distance_m",)).units()
-    assert units == {"house_id": "", "distance_m": "m"}
-
-
 def test_runs_with_other_clouds_are_not_mixed(tmp_path: Path):
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", spec=small_spec(n_points=65))

@@ -54,14 +54,7 @@ def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> G
     elif not reason and share < MIN_HELD_SHARE:
         reason = "most grasps above the table slip"
     return Graspability(
-        model.name,
-        scored.n_tried,
-        scored.n_free,
-        scored.n_clear,
-        len(scored),
-        n_clear_held,
-        share,
-        reason,
+        model.name, scored.n_tried, scored.n_free, scored.n_clear, len(scored), n_clear_held, share, reason
     )
 
 
@@ -73,11 +66,7 @@ class Targets:
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        load: Callable[[str], ObjectModel],
-        gripper: Gripper,
-        params: GraspParams,
+        self, names: Sequence[str], load: Callable[[str], ObjectModel], gripper: Gripper, params: GraspParams
     ) -> None:
         self._load, self._gripper, self._params = load, gripper, params
         self._families: dict[str, list[str]] = {}
@@ -118,13 +107,6 @@ class Targets:
             if len(found) < PER_FAMILY and graspability(model, self._gripper, self._params).is_target:
                 found.append(model.name)
         return found
-
-
-def targets_of(
-    names: Sequence[str], load: Callable[[str], ObjectModel], gripper: Gripper, params: GraspParams
-) -> list[str]:
-    """The names, sorted, of the objects that can be targets of this gripper (`Targets`)."""
-    return Targets(names, load, gripper, params).names()
 
 
 def _family(name: str) -> str:

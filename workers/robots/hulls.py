@@ -120,15 +120,6 @@ def outer_hull(points: F64) -> F64:
     return middle + (corners - middle) * max(1.0, float(rest))
 
 
-def excess_m(corners: F64, points: F64) -> float:
-    """How far the furthest of the corners (V, 3) stands out of the hull of the points (N, 3), at least.
-
-    The distance to the face it violates most: a lower bound of the distance, equal to it over faces.
-    """
-    faces = ConvexHull(points).equations
-    return float((corners @ faces[:, :3].T + faces[:, 3]).max())
-
-
 def hull_faces(corners_m: F32) -> tuple[I32, F64]:
     """Triangles (F, 3) of the hull of its corners (V, 3), wound outwards, and their unit normals (F, 3)."""
     hull = ConvexHull(corners_m)

@@ -11,7 +11,7 @@ import pytest
 from schemas.specification import GraspParams
 from tests.workers.grasps.shapes import box_gripper
 from tests.workers.worlds import box_model, cylinder_model
-from workers.grasps.targets import Targets, graspability, targets_of
+from workers.grasps.targets import Targets, graspability
 from workers.objects import open_objects
 from workers.objects.model import ObjectModel
 from workers.robots import gripper_of
@@ -43,7 +43,7 @@ def test_the_table_says_why_not() -> None:
 
 
 def test_two_of_each_family_of_sizes_and_those_far_apart() -> None:
-    assert targets_of(list(MODELS), MODELS.__getitem__, GRIPPER, FEW) == [
+    assert Targets(list(MODELS), MODELS.__getitem__, GRIPPER, FEW).names() == [
         "065-a_cups",
         "065-e_cups",
         "065_other",
@@ -56,7 +56,7 @@ def test_a_family_whose_largest_does_not_fit_goes_on_inwards() -> None:
         f"7-{k}_pots": cylinder_model(f"7-{k}_pots", r, 0.06)
         for k, r in zip("abc", (0.02, 0.03, 0.06), strict=True)
     }
-    assert targets_of(list(sizes), sizes.__getitem__, GRIPPER, FEW) == ["7-a_pots", "7-b_pots"]
+    assert Targets(list(sizes), sizes.__getitem__, GRIPPER, FEW).names() == ["7-a_pots", "7-b_pots"]
 
 
 def test_drawing_gives_each_target_the_same_chance_and_asks_for_few() -> None:
@@ -99,6 +99,6 @@ def test_real_things_that_lie_flat_are_targets(assets: Path) -> None:
 @pytest.mark.slow
 def test_thirty_varied_targets_among_real_objects(assets: Path) -> None:
     source = open_objects(f"ycb:{assets / 'ycb'}")
-    targets = targets_of(source.names(), source.load, franka_hand(), GraspParams())
+    targets = Targets(source.names(), source.load, franka_hand(), GraspParams()).names()
     assert len(targets) >= 30
     assert sum("cups" in name for name in targets) == 2
