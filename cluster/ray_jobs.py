@@ -42,11 +42,7 @@ class RayJobs:
         until_s = time.monotonic() + _AGENT_WITHIN_S
         while True:
             try:
-                self._client.submit_job(
-                    entrypoint=entrypoint,
-                    submission_id=submission,
-                    runtime_env=runtime,
-                )
+                self._client.submit_job(entrypoint=entrypoint, submission_id=submission, runtime_env=runtime)
                 return
             except RuntimeError as error:
                 if "No available agent" not in str(error) or time.monotonic() >= until_s:

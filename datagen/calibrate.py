@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws
+from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import steps
 from datagen.console.whole_number import WHOLE_NUMBER
@@ -119,10 +119,7 @@ def calibrate(
 
 def _refuse_odd(out: Path, bootstrap: int, seed: int) -> None:
     refuse_odd_draws(bootstrap, seed)
-    if out.suffix.lower() != ".toml":
-        raise InputError(out, "--out", "is not a .toml file", "Give a name that ends in .toml")
-    if not out.parent.is_dir():
-        raise InputError(out, "--out", "its folder does not exist", "Make the folder first")
+    refuse_output(out, "--out", ".toml")
     if out.exists() or out.is_symlink():
         raise InputError(out, "--out", "is there already", "Choose another name, or remove it first")
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws
+from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
@@ -128,7 +128,5 @@ def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | Non
     refuse_odd_draws(bootstrap, seed)
     if threads is not None and not 1 <= threads <= 1024:
         raise InputError("--threads", str(threads), "not a usable number of threads", "Give 1 or more")
-    if html is not None and html.suffix.lower() not in (".html", ".htm"):
-        raise InputError(html, "--html", "is not an .html file", "Give a name that ends in .html")
-    if html is not None and not html.parent.is_dir():
-        raise InputError(html, "--html", "its folder does not exist", "Make the folder first")
+    if html is not None:
+        refuse_output(html, "--html", ".html", ".htm")

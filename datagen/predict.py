@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.console.options import AsJson
+from datagen.console.options import AsJson, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
@@ -205,10 +205,7 @@ def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path |
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:
             continue
-        if file.suffix.lower() != suffix:
-            raise InputError(file, option, f"not a {suffix} file", f"Give a name that ends in {suffix}")
-        if not file.parent.is_dir():
-            raise InputError(file, option, "its folder does not exist", "Make the folder first")
+        refuse_output(file, option, suffix)
         if file.is_dir() or file.resolve() in read:
             problem = "a folder stands there" if file.is_dir() else "one of the files that are read"
             raise InputError(file, option, problem, "Give another name")

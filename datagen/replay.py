@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AsJson, RunPlace, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.steps import Step, steps
 from datagen.console.whole_number import WHOLE_NUMBER
@@ -63,9 +63,8 @@ def replay(
     if sum(given is not None for given in (sample, scene, shard)) != 1:
         problem = "name one thing to replay"
         raise InputError("datagen replay", "SAMPLE_ID", problem, "Give a sample's id, or --scene, or --shard")
-    if out is not None and (out.suffix.lower() != ".png" or not out.parent.is_dir()):
-        problem = "is not a .png file in a folder that exists"
-        raise InputError(out, "--out", problem, "Give such a name")
+    if out is not None:
+        refuse_output(out, "--out", ".png")
     runs = open_runs(run)
     if sample is not None:
         shards = sum(len(found.committed()) for found in runs)

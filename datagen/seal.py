@@ -11,9 +11,7 @@ from schemas.sealing import unseal as unseal_place
 from schemas.storage import open_storage
 
 
-def seal(
-    run: RunPlace,
-) -> int:
+def seal(run: RunPlace) -> int:
     """Lay one flat Zarr store, data.zarr, over the committed shards, also of an unfinished run.
 
     Chunks are hard links, or copies by the S3 server. An older store stays whole until the new one is.
@@ -28,9 +26,7 @@ def seal(
     return 0
 
 
-def unseal(
-    run: RunPlace,
-) -> int:
+def unseal(run: RunPlace) -> int:
     """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again."""
     storage = open_storage(run, probe=False, create=False)
     open_runs(storage)  # a folder that is no run is not touched

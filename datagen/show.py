@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.console.options import RunPlace
+from datagen.console.options import RunPlace, refuse_output
 from datagen.console.printing import print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
@@ -39,7 +39,8 @@ def show(
     that of scores, and with the grasps that succeeded. With --trial the candidate is tried again and
     shown as a filmstrip, or in motion as a .gif. Scenes are rendered again from the stored poses.
     """
-    moving = _is_motion(out)
+    refuse_output(out, "--out", ".png", ".gif")
+    moving = out.suffix.lower() == ".gif"
     candidate = _candidate(trial)
     opened, of_run = find_scene(open_runs(run), scene)
     spec, sources = opened.manifest.spec, opened.manifest.sources
@@ -62,16 +63,6 @@ def show(
         lines = (draw_heuristic if spec.arm is None else draw_arm)(shown, out)
     print_rows(f"scene {scene} of {run}", [("target", shown.target), *lines, ("picture", str(out))])
     return 0
-
-
-def _is_motion(out: Path) -> bool:
-    suffix = out.suffix.lower()
-    if suffix not in (".png", ".gif"):
-        mend = "Give a name that ends in .png, or in .gif for a trial in motion"
-        raise InputError(out, "--out", "is neither a .png nor a .gif file", mend)
-    if not out.parent.is_dir():
-        raise InputError(out, "--out", "its folder does not exist", "Make the folder first")
-    return suffix == ".gif"
 
 
 def _candidate(trial: str | None) -> int | None:

@@ -29,6 +29,12 @@ from workers.objects import open_objects
 from workers.scenes.draw import draw_scene
 from workers.world import World, assemble_world, open_world
 
+# Options that stored scenes have decided.
+_OF_SCENES = (
+    *("--seed", "--split", "--candidates", "--candidates-per-scene", "--robots-per-scene"),
+    *("--settler", "--renderer", "--noise"),
+)
+
 
 def submit(
     label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic, plan or sim.")],
@@ -116,16 +122,6 @@ def submit(
     words = ["submit", label_source, *words_of(said), *placing.words()]
     if placing.detach and placing.address != "local":
         return detach_job(words, out, placing)  # sources lie where the cluster is
-    decide_scenes = {
-        "--seed": seed,
-        "--split": split,
-        "--candidates": candidates,
-        "--candidates-per-scene": candidates_per_scene,
-        "--robots-per-scene": robots_per_scene,
-        "--settler": settler,
-        "--renderer": renderer,
-        "--noise": noise,
-    }
     options = {
         "seed": seed,
         "split": split,
@@ -146,7 +142,9 @@ def submit(
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
         else:
-            stored = open_stored_scenes(scenes_from, houses, objects, decide_scenes)
+            stored = open_stored_scenes(
+                scenes_from, houses, objects, {name: said[name] for name in _OF_SCENES}
+            )
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
             open_world(spec, houses, objects)  # refuses other ones than the scenes were made from

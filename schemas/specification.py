@@ -179,17 +179,8 @@ class TrialParams(_Frozen):
         return self
 
 
-class Interval(_Frozen):
-    """A closed interval from which a number is drawn uniformly."""
-
-    low: float = Field(ge=0, le=100)
-    high: float = Field(ge=0, le=100)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Interval:
-        if self.high < self.low:
-            raise ValueError(f"high {self.high} is below low {self.low}")
-        return self
+class Interval(Range):
+    """A closed interval from which a number without a unit is drawn uniformly."""
 
 
 class DisturbanceParams(_Frozen):

@@ -259,8 +259,7 @@ def _best_cut(needed: F64, gains: I64, otherwise: float) -> tuple[int, float]:
 
 
 def _beam_search(
-    at: Callable[[Sequence[float]], tuple[int, HeuristicParams]],
-    axes: Sequence[F64],
+    at: Callable[[Sequence[float]], tuple[int, HeuristicParams]], axes: Sequence[F64]
 ) -> HeuristicParams:
     """The best of a grid, then of ever finer neighbourhoods of its best points."""
     lows, highs = [axis[0] for axis in axes], [axis[-1] for axis in axes]

@@ -21,11 +21,11 @@ from rich.progress import (
 from datagen.assets import lock as locks
 from datagen.assets.catalogue import CATALOGUE, Asset, select
 from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
+from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
 from schemas.errors import InputError, choices
 from workers.content_cache import cache_folder
 
-Json = Annotated[bool, Parameter(negative=(), help="Print one JSON document.")]
 Folder = Annotated[Path, Parameter(help="The folder of assets.")]
 
 app = App(name="assets", help="List, fetch, lock and verify houses and objects.")
@@ -35,7 +35,7 @@ app = App(name="assets", help="List, fetch, lock and verify houses and objects."
 def list_assets(
     folder: Annotated[Path | None, Parameter(help="List what this folder's lock file holds.")] = None,
     *,
-    json: Json = False,
+    json: AsJson = False,
 ) -> int:
     """What can be fetched, or, with a folder, what its lock file lists."""
     if folder is None:
@@ -74,7 +74,7 @@ def lock(
         str | None, Parameter(help="Licence of all files; kept as it was if not given.")
     ] = None,
     source: Annotated[str | None, Parameter(help="Where all files come from; kept if not given.")] = None,
-    json: Json = False,
+    json: AsJson = False,
 ) -> int:
     """Record every file's sha256, size, licence and source in assets.lock.json."""
     written = locks.lock(folder, licence, source)
@@ -87,7 +87,7 @@ def lock(
 
 
 @app.command
-def verify(folder: Folder, *, json: Json = False) -> int:
+def verify(folder: Folder, *, json: AsJson = False) -> int:
     """Compare every file with assets.lock.json; exits with 2 if any is missing or changed."""
     result = locks.verify(folder)
     if json:
@@ -115,7 +115,7 @@ def fetch_assets(
     ] = None,
     offline: Annotated[bool, Parameter(negative=(), help="Use the cache only.")] = False,
     cache: Annotated[Path | None, Parameter(help="Folder that keeps downloads.")] = None,
-    json: Json = False,
+    json: AsJson = False,
 ) -> int:
     """Download, check and unpack assets, and record them in the folder's lock file.
 

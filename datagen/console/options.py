@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -24,3 +25,12 @@ def refuse_odd_draws(bootstrap: int, seed: int) -> None:
         raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
     if seed < 0:
         raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+
+
+def refuse_output(file: Path, option: str, *endings: str) -> None:
+    """InputError for a file to be written that has another ending, or whose folder is not there."""
+    if file.suffix.lower() not in endings:
+        valid = " or ".join(endings)
+        raise InputError(file, option, f"is not a {valid} file", f"Give a name that ends in {valid}")
+    if not file.parent.is_dir():
+        raise InputError(file, option, "its folder does not exist", "Make the folder first")

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from datagen.console.options import AsJson
 from datagen.console.printing import print_json
 from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check
@@ -78,7 +79,7 @@ def as_table(checks: list[Check]) -> Table:
 
 def doctor(
     *,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON document.")] = False,
+    json: AsJson = False,
     houses: Annotated[
         str | None, Parameter(help="Houses to look for: builtin, procthor:DIR or ai2thor:DIR.")
     ] = None,

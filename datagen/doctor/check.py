@@ -31,6 +31,10 @@ class Probe:
     succeeded: bool
     text: str
 
+    def check(self, name: str, failed: Status, mend: str) -> Check:
+        """The check of that name: ok, or `failed` with how to mend it."""
+        return Check(name, "ok", self.text) if self.succeeded else Check(name, failed, self.text, mend)
+
 
 def _last_line(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]

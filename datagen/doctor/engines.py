@@ -70,29 +70,13 @@ def engine_checks() -> list[Check]:
     lost = "warn" if sapien.succeeded or pybullet.succeeded else "fail"
     embree, ray = probe(_EMBREE), probe(_RAY)
     checks = [
-        Check("sapien physics", "ok", sapien.text)
-        if sapien.succeeded
-        else Check(
-            "sapien physics", lost, sapien.text, "See the libraries above, or use --settler pybullet."
-        ),
-        Check("pybullet", "ok", pybullet.text)
-        if pybullet.succeeded
-        else Check(
-            "pybullet", lost, pybullet.text, "Install again: make clean venv; or use --settler sapien."
-        ),
-        Check("embree", "ok", embree.text)
-        if embree.succeeded
-        else Check("embree", "fail", embree.text, "Install again: make clean venv."),
-        Check("ray", "ok", ray.text)
-        if ray.succeeded
-        else Check("ray", "warn", ray.text, "Install again: make clean venv; or use --workers 0."),
+        sapien.check("sapien physics", lost, "See the libraries above, or use --settler pybullet."),
+        pybullet.check("pybullet", lost, "Install again: make clean venv; or use --settler sapien."),
+        embree.check("embree", "fail", "Install again: make clean venv."),
+        ray.check("ray", "warn", "Install again: make clean venv; or use --workers 0."),
     ]
     if sapien.succeeded:
-        device = probe_render_device()
-        if device.succeeded:
-            checks.append(Check("sapien render device", "ok", device.text))
-        else:
-            checks.append(Check("sapien render device", "warn", device.text, _MESA_MEND))
+        checks.append(probe_render_device().check("sapien render device", "warn", _MESA_MEND))
     return checks
 
 

@@ -12,12 +12,7 @@ from schemas.specification import Specification
 from workers.bases.candidates import Candidates
 from workers.geometry.mesh import F64
 from workers.geometry.transforms import inverse
-from workers.labels.trials import (
-    ArmInScene,
-    CandidateTrial,
-    arm_in_scene,
-    try_candidate,
-)
+from workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
 from workers.motion.plan import MotionPlan
 from workers.motion.rrt_connect import dense
 from workers.motion.surroundings import surroundings

@@ -112,10 +112,7 @@ def relabel_all(
 def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
     known = source.manifest.sources
     manifest = manifest_of(
-        spec,
-        source.layout,
-        {**known, "scenes_from": source.storage.url},
-        source.manifest.schema_version,
+        spec, source.layout, {**known, "scenes_from": source.storage.url}, source.manifest.schema_version
     )
     run = Run.create_or_open(place, manifest, source.n)
     if run.layout != source.layout:

@@ -105,11 +105,7 @@ def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator
 
 
 def _of_stages(
-    run: Run,
-    shard: int,
-    scene: int,
-    stages: list[StageComparison],
-    how: str = "recomputed from stored poses",
+    run: Run, shard: int, scene: int, stages: list[StageComparison], how: str = "recomputed from stored poses"
 ) -> Iterator[Finding]:
     apart = [stage for stage in stages if not stage.equal]
     if apart:

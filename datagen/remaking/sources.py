@@ -27,8 +27,7 @@ class Sources(AssetSources):
     """The same, and the place whose scenes a run labelled again."""
 
     scenes_from: Annotated[
-        str | None,
-        Parameter(help="Where the run lies whose scenes are labelled again [where it was found]."),
+        str | None, Parameter(help="Where the run lies whose scenes are labelled again [where it was found].")
     ] = None
 
 

@@ -58,10 +58,7 @@ class Mended:
 
 
 def mend_place(
-    place: Storage,
-    remake: RemakeShard,
-    workers: int = 1,
-    seen: Seen = lambda done, total: None,
+    place: Storage, remake: RemakeShard, workers: int = 1, seen: Seen = lambda done, total: None
 ) -> Mended:
     """Check the place, mend what can be mended, and check again until nothing more can be.
 

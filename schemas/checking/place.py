@@ -11,14 +11,7 @@ from schemas.checking.accounts import Books, check_quarantine, check_rest
 from schemas.checking.commits import check_account, check_commit
 from schemas.checking.finding import Finding
 from schemas.checking.roots import below, check_notes, check_plans, open_roots
-from schemas.checking.sealed import (
-    SealedSlice,
-    SealedTally,
-    check_chunks,
-    check_store,
-    read_root,
-    slices_of,
-)
+from schemas.checking.sealed import SealedSlice, SealedTally, check_chunks, check_store, read_root, slices_of
 from schemas.checking.shards import ShardForm, check_shard, form_of
 from schemas.errors import InputError
 from schemas.run import Run

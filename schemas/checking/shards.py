@@ -19,14 +19,7 @@ from schemas.keys import commit_key, shard_folder
 from schemas.outcomes import REDRAW_CAUSES
 from schemas.run import Run
 from schemas.run_records import Commit, FileEntry
-from schemas.shard_files import (
-    MAX_TEXT_BYTES,
-    TABLES,
-    chunk_key,
-    chunk_rows,
-    group_metadata,
-    rows_per_shard,
-)
+from schemas.shard_files import MAX_TEXT_BYTES, TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
 from schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from schemas.storage import StoredFile
 

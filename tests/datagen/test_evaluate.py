@@ -256,7 +256,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),
         ([file, run, "--heuristic", str(odd), *QUICK], ["odd.toml: heuristic.mu", "given: far"]),
         ([file, run, "--threads", "0"], ["--threads"]),
-        ([file, run, "--html", "page.pdf"], ["--html", "not an .html file"]),
+        ([file, run, "--html", "page.pdf"], ["--html", "not a .html or .htm file"]),
         ([file, run, "--html", str(tmp_path / "no" / "page.html")], ["--html", "folder does not exist"]),
     ]
     for words, expected in cases:

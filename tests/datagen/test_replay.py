@@ -166,7 +166,7 @@ def test_scenes_of_another_run_are_drawn_by_it_or_recalled(
         (("abcdef", "--scene", "0"), ("name one thing to replay",)),
         (("--scene", "4"), ("--scene", "4 is not in this run")),
         (("--shard", "9"), ("--shard", "9 is not in this run", "0 to 3")),
-        (("--scene", "0", "--out", "missing/scene.png"), ("--out", "folder that exists")),
+        (("--scene", "0", "--out", "missing/scene.png"), ("--out", "folder does not exist")),
         (("--scene", "0", "--out", "scene.gif"), ("--out", ".png")),
         (("--shard", "0", "--out", "scene.png"), ("--out", "no picture")),
         (("--scene", "0", "--houses", "builtin:7"), ("--houses",)),

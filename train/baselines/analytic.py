@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from schemas.specification import HeuristicParams
-from train.baselines.baseline import F64, mount_m, observed_rho, planar_distance_m, reach_m
+from train.baselines.baseline import F64, Unfitted, mount_m, observed_rho, planar_distance_m, reach_m
 from train.inputs import Array, Batch, is_clear
 from workers.labels.heuristic import heuristic
 
@@ -17,11 +16,11 @@ _PAPER = HeuristicParams()
 
 
 @dataclass(frozen=True)
-class Analytic:
+class Analytic(Unfitted):
     """Score H (workers/labels/heuristic.py), good from tau on.
 
     `params` are those of a specification, by default the paper's with ours where it states none;
-    `datagen calibrate` writes better ones. Where the base does not fit the score is H - 10.
+    `datagen calibrate` fits better ones. Where the base does not fit the score is H - 10.
     With `only_clear` off every place is judged by H alone, as the label source `heuristic` does.
     """
 
@@ -29,7 +28,6 @@ class Analytic:
     only_clear: bool = True
 
     name: str = field(default="analytic", init=False)
-    needs_fit: bool = field(default=False, init=False)
 
     @property
     def threshold(self) -> float:
@@ -42,10 +40,6 @@ class Analytic:
         score, _ = heuristic(planar, mount, reach, rho, self.params)
         ruled_out = ~is_clear(batch) if self.only_clear else np.zeros(len(batch), np.bool_)
         return score.astype(np.float64) - np.where(ruled_out, 10.0, 0.0)
-
-    def fit(self, batches: Sequence[Batch[Array]]) -> Analytic:
-        """Itself: its parameters come from a specification, where `datagen calibrate` puts fitted ones."""
-        return self
 
     def state(self) -> dict[str, Any]:
         return {"params": self.params.model_dump(mode="json"), "only_clear": self.only_clear}

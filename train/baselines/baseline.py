@@ -43,6 +43,18 @@ class Baseline(Scorer, Protocol):
         ...
 
 
+class Unfitted:
+    """What a method has that has nothing to fit, and no numbers."""
+
+    needs_fit = False
+
+    def fit(self, batches: Sequence[Batch[Array]]) -> Self:
+        return self
+
+    def state(self) -> dict[str, Any]:
+        return {}
+
+
 def planar_distance_m(batch: Batch[Array]) -> F64:
     """Distance (N,) on the floor from each base to the target's centre."""
     return np.linalg.norm(batch.candidates.base_xy_m.astype(np.float64), axis=1)

@@ -9,14 +9,7 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import InputError
-from train.baselines.baseline import (
-    F64,
-    labels,
-    mount_m,
-    observed_rho,
-    planar_distance_m,
-    reach_m,
-)
+from train.baselines.baseline import F64, labels, mount_m, observed_rho, planar_distance_m, reach_m
 from train.inputs import Array, Batch, column, is_clear
 
 FEATURES = (

@@ -13,13 +13,7 @@ import numpy as np
 
 from schemas.errors import InputError
 from train.evaluation import metrics
-from train.evaluation.bootstrap import (
-    Estimate,
-    Weights,
-    resample_weights,
-    resampled_area_under_roc,
-    summed,
-)
+from train.evaluation.bootstrap import Estimate, Weights, resample_weights, resampled_area_under_roc, summed
 from train.evaluation.breakdown import breakdown, groups_of
 from train.evaluation.columns import Columns
 from train.evaluation.comparisons import NO_TRAINING, TrainedBy, comparisons, differences, finite, said_of

@@ -10,10 +10,7 @@ from train.models.model import Model, fast
 from train.models.paper import PaperModel
 from train.models.shared import SharedModel
 
-MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
-    "paper": PaperModel,
-    "shared": SharedModel,
-}
+MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, "shared": SharedModel}
 
 
 def build_model(name: str, config: Mapping[str, Any]) -> Model:

@@ -50,11 +50,7 @@ class PaperConfig(ModelConfig):
     centroids: tuple[Count, Count] = (512, 128)
     neighbours: tuple[Width, Width] = (32, 64)
     radii_m: tuple[Radius, Radius] = (0.2, 0.4)
-    widths: tuple[Widths, Widths, Widths] = (
-        (64, 64, 128),
-        (128, 128, 256),
-        (256, 512, 1024),
-    )
+    widths: tuple[Widths, Widths, Widths] = ((64, 64, 128), (128, 128, 256), (256, 512, 1024))
     head: Widths = (512, 256)
     dropout: float = Field(default=0.5, ge=0, lt=1)
 
@@ -127,11 +123,7 @@ class PaperModel(Model):
             near.append(ball_query(points, valid, centres, self.sizes.radii_m[0], k_near))
             wide.append(
                 ball_query(
-                    centres,
-                    first_valid[robot],
-                    centres[:, : count_wide - 1],
-                    self.sizes.radii_m[1],
-                    k_wide,
+                    centres, first_valid[robot], centres[:, : count_wide - 1], self.sizes.radii_m[1], k_wide
                 )[0]
             )
         return _Groups(

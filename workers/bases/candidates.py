@@ -10,7 +10,7 @@ import numpy.typing as npt
 from schemas.specification import CandidateParams, Range
 from workers.bases.clearance import Obstacles, base_clearance_m
 from workers.geometry.mesh import F32, F64
-from workers.scenes.scene import Redraw
+from workers.redraw import Redraw
 
 Bools = npt.NDArray[np.bool_]
 

@@ -24,10 +24,7 @@ Bools = npt.NDArray[np.bool_]
 
 _GRAVITY_MPS2 = 9.81
 # A finger's joint: its x axis, along which it moves, is the hand's y for finger 0 and -y for finger 1.
-_JOINT_AXES = (
-    np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-    np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
-)
+_JOINT_AXES = (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
 _FINGER_MASS_KG = 0.05
 _FINGER_INERTIA_KGM2 = 1e-4
 

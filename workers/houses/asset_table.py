@@ -31,6 +31,11 @@ class Asset:
     rest_height_m: float | None = None
     levels_m: tuple[float, ...] = ()
 
+    @property
+    def halves_m(self) -> tuple[float, float, float]:
+        """Half the width, half the depth, and the height."""
+        return self.size_m[0] / 2, self.size_m[1] / 2, self.size_m[2]
+
 
 def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     """The folder's size table by asset id, and its bytes (for the digest).

@@ -10,13 +10,9 @@ _STEEL: Rgb = (176, 178, 182)
 _DARK: Rgb = (44, 44, 48)
 
 
-def _halves(asset: Asset) -> tuple[float, float, float]:
-    return asset.size_m[0] / 2, asset.size_m[1] / 2, asset.size_m[2]
-
-
 def fridge(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Two doors with handles in front of a body."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     split = 0.35 * height
     door = (y - 0.06, y - 0.03)
     bar = (y - 0.03, y)
@@ -32,7 +28,7 @@ def fridge(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def toilet(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Bowl, seat and cistern."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     seat = min(0.42, 0.45 * height)
     tank = min(0.2, 0.25 * 2 * y)
     centre = (0.0, tank / 2)
@@ -47,7 +43,7 @@ def toilet(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def sink(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A basin with a rim, on a pedestal where it stands on the floor."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     rim = min(height, 0.86) if height > 0.5 else height
     deep = min(0.16, rim) if rim < 0.3 else 0.16
     wall = min(0.06, 0.2 * min(x, y))
@@ -68,7 +64,7 @@ def sink(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def washing_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A box with a panel and a round door."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     radius = min(0.7 * x, 0.32 * height)
     return [
         box((-x, x), (-y, y - 0.03), (0.0, height), rgb),
@@ -79,7 +75,7 @@ def washing_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def stove(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An oven with a glass door below four plates."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     radii = (0.28 * x, 0.28 * y)
     plates = [
         frustum((sx * 0.45 * x, sy * 0.4 * y), (height - 0.012, height), radii, radii, _DARK)
@@ -96,7 +92,7 @@ def stove(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def wall_cabinet(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A hanging cupboard with two doors."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     doors = [
         box((side, side + x - 0.01), (y - 0.02, y - 0.004), (0.01, height - 0.01), shade(rgb, 1.06))
         for side in (-x + 0.005, 0.005)

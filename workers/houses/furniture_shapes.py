@@ -14,10 +14,6 @@ _WHITE: Rgb = (236, 236, 234)
 SOFA_SEAT_SHARE = 0.46
 
 
-def _halves(asset: Asset) -> tuple[float, float, float]:
-    return asset.size_m[0] / 2, asset.size_m[1] / 2, asset.size_m[2]
-
-
 def _legs(x: float, y: float, z: tuple[float, float], side: float, rgb: Rgb) -> list[Solid]:
     """Four square legs whose outer faces are at +-x and +-y."""
     across = ((-x, side - x), (x - side, x))
@@ -27,7 +23,7 @@ def _legs(x: float, y: float, z: tuple[float, float], side: float, rgb: Rgb) -> 
 
 def table(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A top on four legs."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     slab = min(0.04, 0.12 * top)
     leg = min(0.07, 0.16 * min(x, y))
@@ -38,7 +34,7 @@ def table(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def side_table(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A small table with a lower board, or a bedside cabinet, by the hash of the asset."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     if hash_bytes(asset.asset_id)[2] % 2:
         return dresser(asset, rgb)
@@ -90,7 +86,7 @@ def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[Solid]:
 
 def desk(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A top on a side panel, a back panel and drawers, open at the front; a hutch where it is higher."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     top = top_height_m(asset)
     board = (top - 0.035, top)
     below = (0.0, top - 0.035)
@@ -119,7 +115,7 @@ def desk(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def dresser(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A chest with drawer fronts on a plinth."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     plinth = min(0.06, 0.1 * top)
     dark = shade(rgb, 0.8)
@@ -141,7 +137,7 @@ def dresser(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def tv_stand(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A low board with open compartments."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     dark = shade(rgb, 0.85)
     inner = (0.08, top - 0.03)
@@ -158,7 +154,7 @@ def tv_stand(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def shelf(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Sides, a back and boards: where things were seen to stand, else evenly spaced."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     seen = sorted({z for z in (*asset.levels_m, asset.rest_height_m or 0.0) if 0.08 < z < top - 0.1})
     boards: list[float] = []
@@ -184,7 +180,7 @@ def shelf(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def cart(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Three trays between four posts."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     top = top_height_m(asset)
     trays = [box((-x, x), (-y, y), (z - 0.025, z), rgb) for z in (0.2 * height, 0.6 * height, top)]
     return [*trays, *_legs(x, y, (0.0, top - 0.025), 0.03, shade(rgb, 0.7))]
@@ -198,7 +194,7 @@ def seat_height_m(asset: Asset, share: float) -> float:
 
 def sofa(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Seat, back and arms; also for armchairs."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     seat = seat_height_m(asset, SOFA_SEAT_SHARE)
     arm = min(0.2, 0.22 * x)
     back = min(0.24, 0.3 * 2 * y)
@@ -220,7 +216,7 @@ def sofa(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def chair(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Four legs, a seat and a back at the rear."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     seat = seat_height_m(asset, 0.5)
     back = box((-x, x), (-y, -y + 0.035), (seat + 0.3 * (height - seat), height), rgb)
     posts = [
@@ -233,7 +229,7 @@ def chair(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def stool(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A seat on four legs."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     seat = frustum((0.0, 0.0), (top - 0.05, top), (x, y), (x, y), rgb, 12)
     return [seat, *_legs(0.75 * x, 0.75 * y, (0.0, top - 0.05), 0.035, shade(rgb, 0.8))]
@@ -241,7 +237,7 @@ def stool(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def ottoman(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An upholstered block on a base."""
-    x, y, _ = _halves(asset)
+    x, y, _ = asset.halves_m
     top = top_height_m(asset)
     base = box((-x + 0.03, x - 0.03), (-y + 0.03, y - 0.03), (0.0, 0.06), _DARK)
     return [base, box((-x, x), (-y, y), (0.06, top), rgb)]
@@ -249,7 +245,7 @@ def ottoman(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def bed(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A mattress on a frame with a headboard and pillows; on posts where it is a loft or bunk bed."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     top = seat_height_m(asset, 0.6)
     frame: Rgb = shade((140, 104, 72), 0.8 + 0.4 * hash_bytes(asset.asset_id)[4] / 255)
     mattress = 0.2 if top > 0.35 else 0.5 * top

@@ -159,7 +159,4 @@ def _text_or_empty(node: Node | None) -> str:
 
 
 def _ground(node: Node) -> tuple[float, float]:
-    return (
-        node.get("x").number(-EXTENT_M, EXTENT_M),
-        node.get("z").number(-EXTENT_M, EXTENT_M),
-    )
+    return (node.get("x").number(-EXTENT_M, EXTENT_M), node.get("z").number(-EXTENT_M, EXTENT_M))

@@ -12,31 +12,27 @@ _LEAF: tuple[Rgb, ...] = ((74, 112, 58), (96, 132, 70), (60, 96, 60))
 _LINEN: Rgb = (236, 226, 200)
 
 
-def _halves(asset: Asset) -> tuple[float, float, float]:
-    return asset.size_m[0] / 2, asset.size_m[1] / 2, asset.size_m[2]
-
-
 def block(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A box of the asset's size."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [box((-x, x), (-y, y), (0.0, height), rgb)]
 
 
 def column(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An elliptic cylinder: rolls, tins, candles."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [frustum((0.0, 0.0), (0.0, height), (x, y), (x, y), rgb, 12)]
 
 
 def pebble(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An ellipsoid: fruit, balls, pillows."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [ball((0.0, 0.0, height / 2), (x, y, height / 2), rgb)]
 
 
 def plant(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A pot and a crown of three tufts."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     pot = 0.3 * height
     leaf = pick(_LEAF, asset.asset_id)
     crown = height - pot
@@ -53,7 +49,7 @@ def plant(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def lamp(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Foot, pole and shade."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     pole = max(0.008, 0.03 * min(x, y))
     low = 0.74 * height
     return [
@@ -65,7 +61,7 @@ def lamp(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def screen(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A flat screen that looks to +y, on a foot where it is deep."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     if y < 0.07:
         return [
             box((-x, x), (-y, 0.5 * y), (0.0, height), _DARK),
@@ -82,7 +78,7 @@ def screen(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def painting(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A frame with a picture of three fields, facing +y."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     h = hash_bytes(asset.asset_id)
     edge = min(0.04, 0.1 * min(x, height))
     level = edge + (0.3 + 0.3 * h[5] / 255) * (height - 2 * edge)
@@ -98,7 +94,7 @@ def painting(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def laptop(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An open laptop: keyboard in front, lid leaning back."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     hinge = -y + 0.35 * 2 * y
     lid = [(hinge, 0.01), (hinge + 0.012, 0.015), (-y + 0.012, height), (-y, height - 0.005)]
     base = box((-x, x), (hinge, y), (0.0, 0.018), rgb)
@@ -108,7 +104,7 @@ def laptop(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def container(asset: Asset, rgb: Rgb) -> list[Solid]:
     """An open box: bottom and four sides."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     t = min(0.012, 0.1 * min(x, y))
     z = (t, height)
     dark = shade(rgb, 0.9)
@@ -123,7 +119,7 @@ def container(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def bin_(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A tapered bucket with a dark mouth."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     mouth = max(0.9 * height, height - 0.02)
     return [
         frustum((0.0, 0.0), (0.0, mouth), (0.78 * x, 0.78 * y), (0.98 * x, 0.98 * y), rgb, 12),
@@ -133,7 +129,7 @@ def bin_(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def bowl(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A vessel that opens upwards: bowls and plates."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     low = 0.75 * height
     return [
         frustum((0.0, 0.0), (0.0, low), (0.5 * x, 0.5 * y), (0.92 * x, 0.92 * y), rgb, 12),
@@ -143,7 +139,7 @@ def bowl(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def cup(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A cup; with a handle where it is longer in one direction."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     radius = min(x, y)
     shift = (-(x - radius), -(y - radius))
     solids = [frustum(shift, (0.0, height), (0.8 * radius, 0.8 * radius), (radius, radius), rgb)]
@@ -158,7 +154,7 @@ def cup(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def bottle(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Body, shoulder and neck."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     neck = max(0.004, 0.32 * min(x, y))
     return [
         frustum((0.0, 0.0), (0.0, 0.6 * height), (x, y), (x, y), rgb),
@@ -169,7 +165,7 @@ def bottle(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def vase(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A belly that narrows to a mouth."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         frustum((0.0, 0.0), (0.0, 0.45 * height), (0.5 * x, 0.5 * y), (x, y), rgb),
         frustum((0.0, 0.0), (0.45 * height, 0.85 * height), (x, y), (0.4 * x, 0.4 * y), rgb),
@@ -179,7 +175,7 @@ def vase(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def pan(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A round pan with a handle along the longer side; two grips where it is nearly round."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     radius = min(x, y)
     if max(x, y) < 1.2 * radius:
         grip = box((-x, x), (-0.02, 0.02), (0.7 * height, 0.85 * height), shade(rgb, 0.6))
@@ -198,7 +194,7 @@ def pan(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def dispenser(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A bottle with a pump or trigger on top."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         frustum((0.0, 0.0), (0.0, 0.68 * height), (x, 0.75 * y), (0.9 * x, 0.7 * y), rgb),
         frustum(
@@ -215,7 +211,7 @@ def dispenser(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def appliance(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A box with a dark front window and a panel: microwaves, safes, computers."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         box((-x, x), (-y, y - 0.012), (0.0, height), rgb),
         box((-0.94 * x, 0.5 * x), (y - 0.012, y), (0.1 * height, 0.92 * height), _DARK),
@@ -225,7 +221,7 @@ def appliance(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def toaster(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A rounded block with two slots."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     slots = [
         box((k * 0.4 * x - 0.012, k * 0.4 * x + 0.012), (-0.7 * y, 0.7 * y), (0.96 * height, height), _DARK)
         for k in (-1, 1)
@@ -235,7 +231,7 @@ def toaster(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def coffee_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A foot and a head that stands out from a column at the back."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         box((-x, x), (-y, y), (0.0, 0.12 * height), _DARK),
         box((-x, x), (-y, -0.1 * y), (0.12 * height, height), rgb),
@@ -245,7 +241,7 @@ def coffee_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def kettle(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Body, spout and handle."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         frustum((0.0, 0.0), (0.0, 0.75 * height), (0.9 * x, 0.8 * y), (0.55 * x, 0.5 * y), rgb),
         box((-0.015, 0.015), (0.45 * y, y), (0.5 * height, 0.68 * height), _STEEL),
@@ -256,7 +252,7 @@ def kettle(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def book(asset: Asset, rgb: Rgb) -> list[Solid]:
     """Covers around pages."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     t = 0.2 * height
     return [
         box((-x, x), (-y, y), (0.0, t), rgb),
@@ -267,7 +263,7 @@ def book(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def statue(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A figure on a plinth."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     return [
         box((-0.8 * x, 0.8 * x), (-0.8 * y, 0.8 * y), (0.0, 0.1 * height), shade(rgb, 0.6)),
         ball((0.0, 0.0, 0.42 * height), (x, y, 0.33 * height), rgb),
@@ -277,7 +273,7 @@ def statue(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def teddy(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A sitting bear: body, head, ears, legs."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     dark = shade(rgb, 0.85)
     return [
         ball((0.0, -0.2 * y, 0.3 * height), (0.6 * x, 0.7 * y, 0.3 * height), rgb),
@@ -291,7 +287,7 @@ def teddy(asset: Asset, rgb: Rgb) -> list[Solid]:
 
 def basket_bed(asset: Asset, rgb: Rgb) -> list[Solid]:
     """A cushion with a raised border on three sides."""
-    x, y, height = _halves(asset)
+    x, y, height = asset.halves_m
     t = 0.14 * min(x, y)
     return [
         box((-x, x), (-y, y), (0.0, 0.45 * height), rgb),

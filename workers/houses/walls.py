@@ -77,9 +77,7 @@ def wall_bodies(walls: Sequence[WallSegment], holes: Sequence[Hole]) -> list[Bod
 
 
 def _sort_into(
-    wall: WallSegment,
-    lines: list[tuple[_Line, list[WallSegment]]],
-    buckets: dict[tuple[int, int], list[int]],
+    wall: WallSegment, lines: list[tuple[_Line, list[WallSegment]]], buckets: dict[tuple[int, int], list[int]]
 ) -> None:
     start, end = np.array(wall.start_m), np.array(wall.end_m)
     direction = (end - start) / np.linalg.norm(end - start)

@@ -48,10 +48,7 @@ class _Reachable:
 
 
 def plan_candidate(
-    prepared: PlanningScene,
-    T_world_base: F64,
-    rng: np.random.Generator,
-    skip: frozenset[int] = frozenset(),
+    prepared: PlanningScene, T_world_base: F64, rng: np.random.Generator, skip: frozenset[int] = frozenset()
 ) -> PlanReport:
     """Look for a whole plan from the base pose (4, 4) to any kept grasp but those in `skip`.
 

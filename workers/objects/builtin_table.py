@@ -27,37 +27,16 @@ from workers.objects.builtin_pieces import (
     vessel,
 )
 
-WHITE, BLACK, GREY, STEEL = (238, 236, 230), (28, 28, 30), (128, 128, 130), (176, 178, 184)
+WHITE, BLACK, STEEL = (238, 236, 230), (28, 28, 30), (176, 178, 184)
 RED, BLUE, GREEN, YELLOW, ORANGE = (200, 32, 36), (28, 60, 150), (40, 130, 60), (236, 196, 40), (238, 128, 24)
-WOOD, CREAM, BROWN, PINK = (196, 154, 98), (236, 222, 180), (96, 56, 30), (222, 120, 140)
-
-_CUP_SIZES = [
-    (55, 60),
-    (60, 62),
-    (65, 64),
-    (70, 66),
-    (75, 68),
-    (80, 70),
-    (85, 72),
-    (90, 74),
-    (95, 76),
-    (100, 78),
-]
-_CUP_COLOURS = [RED, ORANGE, YELLOW, GREEN, BLUE]
-_TRUNCATED_PEAR: Points = [
-    (6, 0),
-    (22, 4),
-    (31, 16),
-    (33.1, 31),
-    (30, 47),
-    (22.5, 63),
-    (17, 78),
-    (13, 90),
-    (6, 98.5),
-    (0, 100),
-]
+WOOD, BROWN, PINK = (196, 154, 98), (96, 56, 30), (222, 120, 140)
 
 # fmt: off
+_CUP_SIZES = [(55, 60), (60, 62), (65, 64), (70, 66), (75, 68), (80, 70), (85, 72), (90, 74), (95, 76), (100, 78)]
+_CUP_COLOURS = [RED, ORANGE, YELLOW, GREEN, BLUE]
+_TRUNCATED_PEAR: Points = [
+    (6, 0), (22, 4), (31, 16), (33.1, 31), (30, 47), (22.5, 63), (17, 78), (13, 90), (6, 98.5), (0, 100),
+]
 RECIPES: dict[str, list[Piece]] = {
     "001_chips_can": [lathe(cylinder(75, 250, 12), label(RED, YELLOW, 90, 170, WHITE))],
     "002_master_chef_can": [lathe(cylinder(102, 139, 10), label(BLUE, WHITE, 30, 110, RED))],

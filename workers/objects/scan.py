@@ -132,11 +132,7 @@ def _split_seams(mesh: ObjMesh) -> tuple[np.ndarray, F32, np.ndarray]:
     keys = mesh.faces * len(mesh.uv) + mesh.uv_faces
     pairs, faces = np.unique(keys, return_inverse=True)
     vertex, uv = np.divmod(pairs, len(mesh.uv))
-    return (
-        mesh.vertices[vertex],
-        mesh.uv[uv].astype(np.float32),
-        faces.reshape(-1, 3).astype(np.int32),
-    )
+    return (mesh.vertices[vertex], mesh.uv[uv].astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
 
 def _stored(scan: Scan) -> Arrays:

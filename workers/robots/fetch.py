@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from workers.geometry.transforms import translation
-from workers.robots.description import (
-    HandDescription,
-    RobotDescription,
-    RobotLimits,
-    TorsoLift,
-)
+from workers.robots.description import HandDescription, RobotDescription, RobotLimits, TorsoLift
 
 FETCH_HAND = HandDescription(
     name="fetch-gripper",

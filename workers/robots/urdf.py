@@ -252,9 +252,7 @@ def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
     few iterations, would sag under it by degrees.
     """
     return replace(
-        inertial,
-        centre_m=inertial.centre_m * scale,
-        inertia_kgm2=inertial.inertia_kgm2 * scale**2,
+        inertial, centre_m=inertial.centre_m * scale, inertia_kgm2=inertial.inertia_kgm2 * scale**2
     )
 
 

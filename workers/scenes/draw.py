@@ -14,6 +14,7 @@ from workers.bases.candidates import Candidates, draw_candidates
 from workers.geometry.mesh import F64
 from workers.houses.house import Surface
 from workers.objects.model import ObjectModel
+from workers.redraw import Redraw
 from workers.rendering import load_renderer
 from workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
 from workers.rendering.embree_renderer import cast_pixels
@@ -21,7 +22,7 @@ from workers.rendering.frame import Camera, Frame, Stage
 from workers.rendering.noise import add_noise
 from workers.rendering.rays import RayStage
 from workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
-from workers.scenes.scene import Redraw, Scene
+from workers.scenes.scene import Scene
 from workers.scenes.viewpoint import draw_viewpoint
 from workers.settling import load_settler
 from workers.settling.settler import SettleResult

@@ -13,7 +13,7 @@ from workers.geometry.planar import convex_hull
 from workers.geometry.transforms import yaw_pose
 from workers.houses.house import House, Surface
 from workers.objects.model import ObjectModel
-from workers.scenes.scene import Redraw
+from workers.redraw import Redraw
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40

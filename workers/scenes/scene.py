@@ -1,11 +1,10 @@
-"""A finished scene, and why a try at one was given up."""
+"""A finished scene."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
 
-from schemas.outcomes import REDRAW_CAUSES
 from workers.geometry.mesh import F64
 from workers.houses.house import Surface
 from workers.objects.model import ObjectModel
@@ -14,17 +13,6 @@ from workers.rendering.frame import Camera
 from workers.rendering.rays import RayStage
 from workers.settling.settler import SettleResult
 from workers.world import PreparedHouse
-
-
-class Redraw(Exception):
-    """This try gives no scene; `cause` is one of REDRAW_CAUSES, `detail` says more where there is more."""
-
-    def __init__(self, cause: str, detail: str = "") -> None:
-        if cause not in REDRAW_CAUSES:
-            raise KeyError(f"unknown redraw cause {cause!r}; causes are {', '.join(REDRAW_CAUSES)}")
-        super().__init__(cause)
-        self.cause = cause
-        self.detail = detail
 
 
 class SettledScene(Protocol):

@@ -10,10 +10,10 @@ from workers.geometry.mesh import F64
 from workers.geometry.planar import inside_polygon
 from workers.geometry.transforms import look_at
 from workers.houses.house import Room
+from workers.redraw import Redraw
 from workers.rendering.frame import Camera
 from workers.rendering.rays import RayStage
 from workers.rendering.visibility import visible_pixels
-from workers.scenes.scene import Redraw
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
 _BLOCK = 8

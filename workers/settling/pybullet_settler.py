@@ -26,10 +26,7 @@ _MARGIN_M = 0.0
 
 
 def settle_pybullet(
-    static_parts_m: Sequence[F32],
-    objects: Sequence[ObjectModel],
-    T_world_object: F64,
-    params: SettleParams,
+    static_parts_m: Sequence[F32], objects: Sequence[ObjectModel], T_world_object: F64, params: SettleParams
 ) -> SettleResult:
     """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
 

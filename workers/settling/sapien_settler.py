@@ -23,10 +23,7 @@ _LOOK_EVERY = 5  # steps between looks at the speeds: reading them costs as much
 
 
 def settle_sapien(
-    static_parts_m: Sequence[F32],
-    objects: Sequence[ObjectModel],
-    T_world_object: F64,
-    params: SettleParams,
+    static_parts_m: Sequence[F32], objects: Sequence[ObjectModel], T_world_object: F64, params: SettleParams
 ) -> SettleResult:
     """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
 

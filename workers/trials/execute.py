@@ -39,11 +39,7 @@ _LARGEST_M = 100.0
 
 
 def run_trial(
-    prepared: TrialScene,
-    T_world_base: F64,
-    plan: MotionPlan,
-    disturbance: Disturbance,
-    record: bool = False,
+    prepared: TrialScene, T_world_base: F64, plan: MotionPlan, disturbance: Disturbance, record: bool = False
 ) -> TrialResult:
     """Executes a plan in a fresh physics scene.
 

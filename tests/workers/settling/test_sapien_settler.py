@@ -12,8 +12,8 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 from schemas.specification import SettleParams
 from tests.workers.worlds import TABLE_TOP_M, ball_model, box_model, cylinder_model, on_table, table_house
 from workers.objects.model import ObjectModel
+from workers.redraw import Redraw
 from workers.scenes.draw import check_settled
-from workers.scenes.scene import Redraw
 from workers.settling.sapien_settler import settle_sapien
 from workers.settling.settler import SettleResult
 
