@@ -78,6 +78,7 @@ class JobSummary:
     cause: str
     tally: Tally
     elapsed_s: float
+    start_s: float = 0.0  # before the driver began
 
     @property
     def remaining(self) -> int:

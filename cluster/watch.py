@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from cluster.driver import Events
-from cluster.progress import Pace
+from cluster.progress import left_of
 from cluster.stop import StopRequest
 from cluster.tally import Tally
 from cluster.task import AttemptReport
+from schemas.progress import Pace
 
 Wish = Literal["drain", "force"]
 
@@ -53,7 +54,7 @@ class Watch:
     _reason: str = ""
 
     def __post_init__(self) -> None:
-        self._pace = Pace(self.labels_per_shard, self.clock)
+        self._pace = Pace(self.clock)
         self._next_beat_s = self._next_look_s = self.clock()
 
     def ended(self, report: AttemptReport, action: str) -> None:
@@ -65,15 +66,15 @@ class Watch:
 
     def tick(self, tally: Tally) -> None:
         """Look and tell when it is time."""
-        self._pace.see(tally)
+        self._pace.see(tally.labels)
         now_s = self.clock()
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + self.look_s
             self._heed(self.board.wish())
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self.beat_s
-            rate, left_s = self._pace.labels_per_s(tally), self._pace.left_s(tally)
-            self.board.tell(Standing(tally, rate, left_s, self._reason))
+            left_s = left_of(tally, self._pace, self.labels_per_shard)
+            self.board.tell(Standing(tally, self._pace.per_s(), left_s, self._reason))
 
     def _heed(self, wish: Wish | None) -> None:
         if wish is None or wish in self._heard:

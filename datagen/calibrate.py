@@ -13,11 +13,11 @@ from cyclopts import Parameter
 
 from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.steps import steps
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.reports.specified import specification_record
 from schemas.errors import InputError, one_line, printable
 from schemas.merged import open_runs
+from schemas.progress import steps
 from schemas.specification import HeuristicParams, Specification
 from workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 
@@ -85,7 +85,7 @@ def calibrate(
     forms = FORMS if distance == "any" else (distance,)
     for warning in warnings:
         sys.stderr.write(f"warning: {one_line(warning)}\n")
-    with steps("fits", 1 + min(FOLDS, len(set(trials.house))), True if json else None) as step:
+    with steps("fits", 1 + min(FOLDS, len(set(trials.house))), json) as step:
         made = _calibrate(trials, specs[0].heuristic, forms, objective, fit_alpha, bootstrap, seed, step)
     report = {
         "out": str(out),

@@ -9,9 +9,9 @@ from cyclopts import Parameter
 
 from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError
+from schemas.progress import counting
 from schemas.whole_files import whole_file
 
 
@@ -82,12 +82,14 @@ def evaluate(
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    lineup = line_up(baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete)
+    lineup = line_up(
+        baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
+    )
     contestants = [*lineup.baselines, *models]
     if not contestants:
         mend = "Name a checkpoint, or leave --baselines out"
         raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
-    with counting("scenes") as seen:
+    with counting("scenes", json) as seen:
         total, done = sum(place.stream.n_scenes for place in opened), 0
 
         def step(scenes: int) -> None:

@@ -13,7 +13,7 @@ from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place, refuse_odd_n
+from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 from schemas.errors import InputError
@@ -38,7 +38,7 @@ def extend(
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
     if placing.detach and placing.address != "local":
         return detach_job(words, run, placing)
-    with resumable([*words, *placing.address_words()]):
+    with opening(words, placing) as began_s:
         place = open_storage(run, create=False)
         runs = open_runs(place)
         works = [open_work(part, given, placing.address) for part in runs]
@@ -51,7 +51,7 @@ def extend(
             part.grow(more)
     if placing.detach:
         return detach_job(words, run, placing)
-    return go_on(place, run, works, placing, given)
+    return go_on(place, run, works, placing, began_s, given)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

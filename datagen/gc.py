@@ -13,10 +13,10 @@ from cyclopts import Parameter
 from cluster.books import refresh_index
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import print_json, print_rows, size
-from datagen.console.steps import counting
 from schemas.errors import InputError
 from schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
 from schemas.merged import open_runs
+from schemas.progress import counting
 from schemas.storage import Storage, open_storage
 
 _AGE = re.compile(r"([0-9]{1,9})(s|m|h|d)")
@@ -45,11 +45,11 @@ def gc(
     """
     place = open_storage(run, probe=False, create=False)
     age_s = age_of(older_than)
-    with counting("shards looked at", as_json=True if json else None) as seen:
+    with counting("shards looked at", as_json=json) as seen:
         garbage = find_garbage(place, age_s, time.time(), seen)
     swept = Swept()
     if not dry_run:
-        with counting("pieces removed", as_json=True if json else None) as seen:
+        with counting("pieces removed", as_json=json) as seen:
             swept = remove(place, garbage, seen)
     report = gc_report(place, garbage, swept, dry_run)
     if json:

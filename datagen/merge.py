@@ -10,13 +10,13 @@ from cyclopts import Parameter
 from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
-from datagen.console.steps import steps
 from datagen.jobs.options import absolute_place
 from datagen.reports.accounts import account_for
 from schemas.lineage import lineage_summary
 from schemas.merged import open_runs, wanted
 from schemas.merging import Merge, Result, carry_out, plan_merge
 from schemas.merging.writing import Written
+from schemas.progress import steps
 from schemas.run import Run
 
 
@@ -35,9 +35,9 @@ def merge(
     words = ["merge", *map(absolute_place, runs), *words_of({"--out": absolute_place(out), "--json": json})]
     with resumable(words):
         commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
-        with steps("commits read", commits, True if json else None) as step:
+        with steps("commits read", commits, json) as step:
             planned = plan_merge(runs, out, step)
-        with steps("records written", planned.records, True if json else None) as step:
+        with steps("records written", planned.records, json) as step:
             result = carry_out(planned, step)
     report = merge_report(planned, result)
     if json:

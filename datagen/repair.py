@@ -14,12 +14,12 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.verify import finding_row, print_findings
 from schemas.checking.mending import Mended, RemakeShard, mend_place
 from schemas.errors import InputError
+from schemas.progress import counting
 from schemas.run import Run
 from schemas.storage import open_storage
 
@@ -46,7 +46,7 @@ def repair(
         raise InputError("--workers", str(workers), "is not between 0 and 256", "Leave it out for none")
     place = open_storage(run, probe=False, create=False)
     with (
-        counting("shards checked", as_json=True if json else None) as seen,
+        counting("shards checked", as_json=json) as seen,
         _remaking(given, workers) as remake,
     ):
         mended = mend_place(place, remake, max(1, workers), seen)

@@ -11,7 +11,6 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson, RunPlace, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.steps import Step, steps
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
 from datagen.remaking.alone import replay_shard
@@ -24,6 +23,7 @@ from schemas.errors import InputError
 from schemas.fields import SceneRows
 from schemas.identity import sample_ids
 from schemas.merged import open_runs
+from schemas.progress import Step, steps
 from schemas.run import Run
 from schemas.scene_rows import read_scene
 from workers.scenes.recall import recall_scene
@@ -68,7 +68,7 @@ def replay(
     runs = open_runs(run)
     if sample is not None:
         shards = sum(len(found.committed()) for found in runs)
-        with steps("shards searched", shards, True if json else None) as step:
+        with steps("shards searched", shards, json) as step:
             found, index, row = find_sample(runs, sample, step)
     else:
         found, index, row = _only(run, runs, "--scene" if shard is None else "--shard"), scene, None

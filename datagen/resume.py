@@ -7,12 +7,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import resumable, words_of
+from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place
+from datagen.jobs.options import HERE, Placing, absolute_place, opening
 from datagen.remaking.sources import AS_FOUND, Sources
 from schemas.merged import open_runs
 from schemas.quarantine import lift_quarantine
@@ -38,7 +38,7 @@ def resume(
     words += placing.words()
     if placing.detach and placing.address != "local":
         return detach_job(words, run, placing)
-    with resumable([*words, *placing.address_words()]):
+    with opening(words, placing) as began_s:
         place = open_storage(run, create=False)
         runs = open_runs(place)
         works = [open_work(part, given, placing.address) for part in runs]
@@ -47,4 +47,4 @@ def resume(
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
             sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return go_on(place, run, works, placing, given)
+    return go_on(place, run, works, placing, began_s, given)

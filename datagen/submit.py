@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import resumable, words_of
+from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, refuse_unusable_engines
 from datagen.jobs.job import Work
-from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, refuse_odd_n
+from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
@@ -131,7 +131,7 @@ def submit(
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
     }
-    with resumable([*words, *placing.address_words()]):
+    with opening(words, placing) as began_s:
         if scenes_from is None:
             houses, objects = houses or "builtin", objects or "builtin"
             house_source, object_source = open_houses(houses), open_objects(objects)
@@ -160,7 +160,7 @@ def submit(
     if placing.detach:
         return detach_job(words, out, placing)
     work = Work(run, sources["houses"], sources["objects"], source_url)
-    return go_on(run.storage, out, [work], placing)
+    return go_on(run.storage, out, [work], placing, began_s)
 
 
 def _layout_there(out: str) -> Layout | None:

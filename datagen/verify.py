@@ -13,12 +13,12 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
-from datagen.console.steps import counting
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.remaking.sources import AS_FOUND, Sources
 from schemas.checking.finding import Finding
 from schemas.checking.place import Checked, check_place
 from schemas.errors import InputError, printable
+from schemas.progress import counting
 from schemas.run import Run
 from schemas.storage import Storage, open_storage
 
@@ -49,7 +49,7 @@ def verify(
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
     place = open_storage(run, probe=False, create=False)
     checked, found = Checked(), Found()
-    with counting("shards checked", as_json=True if json else None) as seen:
+    with counting("shards checked", as_json=json) as seen:
         found.take(check_place(place, checked, seen))
     chosen = secrets.randbits(32) if seed is None else seed
     recomputed = deep > 0 and not found.damage

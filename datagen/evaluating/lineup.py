@@ -9,11 +9,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from datagen.console.steps import steps
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import SCENES_PER_BATCH, Place, refuse_no_trials
 from datagen.specifying.specify import first_of, read_toml
 from schemas.errors import InputError
+from schemas.progress import steps
 from schemas.specification import HeuristicParams
 from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
 from train.dataset import SampleStream
@@ -60,6 +60,7 @@ def line_up(
     places: Sequence[Place],
     allow_seen_houses: bool,
     allow_incomplete: bool = False,
+    json: bool = False,
 ) -> Lineup:
     """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
 
@@ -89,7 +90,7 @@ def line_up(
         houses = frozenset(stream.house_ids())
         batches = list(stream.epoch(0))
         fitted: list[Baseline] = []
-        with steps("baselines fitted", len(made)) as step:
+        with steps("baselines fitted", len(made), json) as step:
             for baseline in made:
                 fitted += fit_baselines([baseline], batches)
                 step()

@@ -59,13 +59,18 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
 
 
 def go_on(
-    place: Storage, name: str, works: Sequence[Work], placing: Placing, given: Sources = AS_FOUND
+    place: Storage,
+    name: str,
+    works: Sequence[Work],
+    placing: Placing,
+    began_s: float,
+    given: Sources = AS_FOUND,
 ) -> int:
     """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
     words = ["resume", absolute_place(name), *source_words(given), *placing.words()]
     words += detached_words() or placing.address_words()
     with resumable(words):
-        return carry_out(JobPlan(place, name, works, placing, words))
+        return carry_out(JobPlan(place, name, works, placing, began_s, words))
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:

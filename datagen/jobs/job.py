@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -18,7 +19,7 @@ from cluster.fitness import refuse_unfit_machines
 from cluster.guard import notes_of_a_job
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy, too_many_quarantined
-from cluster.progress import progress
+from cluster.progress import JobProgress
 from cluster.ray_cluster import RaySettings
 from cluster.ray_executor import RayExecutor, ray_executor
 from cluster.stop import StopRequest, stop_on_signals
@@ -31,6 +32,7 @@ from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing
 from schemas.errors import InputError, one_line
 from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
+from schemas.progress import Progress
 from schemas.record_files import now
 from schemas.run import Run
 from schemas.sealing import seal
@@ -58,6 +60,7 @@ class JobPlan:
     name: str  # the place as the user wrote it
     works: Sequence[Work]
     placing: Placing
+    began_s: float  # by the monotonic clock, when the command began to open them
     resume: Sequence[str]  # the words of the command that goes on with it
 
 
@@ -120,14 +123,16 @@ def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
     whole = no_work()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
-        executor = _executor(placing, sum(map(len, missing)), stack)
+        shown = stack.enter_context(Progress(placing.json))
+        executor = _executor(placing, sum(map(len, missing)), stack, shown)
         stack.enter_context(stop_on_signals(stop, interrupt=placing.workers == 0))
         for work, shards in zip(plan.works, missing, strict=True):
             if whole.end in ("interrupted", "aborted"):
                 whole = replace(whole, tally=whole.tally.plus(Tally(len(shards))))
             elif shards:
-                whole = whole.plus(_drive(work, shards, executor, policy, board, stop, placing, notes))
+                whole = whole.plus(_drive(work, shards, executor, policy, board, stop, shown, notes))
                 board.add(whole.tally)
+        whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
     for work in plan.works:
         # What a killed driver left open is closed last: its workers may outlive it and still commit.
         close_lost_attempts(work.run)
@@ -141,7 +146,7 @@ def _drive(
     policy: Policy,
     board: JobBoard,
     stop: StopRequest,
-    placing: Placing,
+    shown: Progress,
     notes: str,
 ) -> JobSummary:
     run = work.run
@@ -162,12 +167,13 @@ def _drive(
         )
 
     if isinstance(executor, RayExecutor):
+        shown.phase("checking the machines")
         probe = make_task(Order(shards[0], "probe", deadline_s=0.0))
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
-    with progress(per_shard, len(shards), done, True if placing.json else None) as display:
-        events = Together([display, Watch(board, stop, per_shard)])
-        return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
+    shown.phase("making labels")
+    events = Together([JobProgress(shown, per_shard, done), Watch(board, stop, per_shard)])
+    return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
 
 
 def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
@@ -187,9 +193,10 @@ def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
     return replace(summary, end="failed" if failed else "complete")
 
 
-def _executor(placing: Placing, shards: int, stack: ExitStack) -> Executor[ShardTask]:
+def _executor(placing: Placing, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
     if placing.workers == 0:
         return InProcessExecutor(run_attempt)
+    shown.phase("starting Ray")
     cores = len(os.sched_getaffinity(0))
     workers = min(placing.workers or cores, shards)  # Ray starts them all at once
     ray_settings = RaySettings(address=placing.address, workers=workers)
@@ -214,7 +221,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
     rows = [
         ("labels", labels),
         ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
-        ("time", f"{seconds(summary.elapsed_s)}" + _rate(summary)),
+        ("time", _time(summary)),
         ("retries", str(tally.retries)),
     ]
     if given_up:
@@ -238,7 +245,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
     return summary.exit_code
 
 
-def _rate(summary: JobSummary) -> str:
-    if not summary.tally.labels or summary.elapsed_s <= 0:
-        return ""
-    return f", {summary.tally.labels / summary.elapsed_s:,.0f} labels/s"
+def _time(summary: JobSummary) -> str:
+    rate = summary.tally.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
+    parts = f"start {seconds(summary.start_s)}, labels {seconds(summary.elapsed_s)}"
+    return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts}" + (f" at {rate:,.0f}/s" if rate else "")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +12,10 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from cluster.ray_cluster import refuse_unusable
-from datagen.console.command_lines import words_of
+from datagen.console.command_lines import resumable, words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from schemas.errors import InputError, refuse_not_utf8
+from schemas.progress import Progress
 
 DEFAULT_SHARE = 0.01
 _DETACH = (
@@ -36,7 +40,7 @@ class Placing:
     ] = DEFAULT_SHARE
     detach: Annotated[bool, Parameter(negative=(), help=_DETACH)] = False
     json: Annotated[
-        bool, Parameter(negative=(), help="Report progress as JSON lines, also on a terminal.")
+        bool, Parameter(negative=(), help="Report progress as JSON lines on standard error.")
     ] = False
 
     def refuse_bad(self) -> None:
@@ -67,6 +71,15 @@ def refuse_odd_n(n: int) -> None:
     """Raise InputError for a number of labels that no run has."""
     if not 1 <= n <= 10**12:
         raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+
+
+@contextmanager
+def opening(words: Sequence[str], placing: Placing) -> Generator[float]:
+    """Show that sources are being opened, and tell whoever interrupts that how to go on; gives when it began."""
+    began_s = time.monotonic()
+    with resumable([*words, *placing.address_words()]), Progress(placing.json) as shown:
+        shown.phase("opening houses and objects")
+        yield began_s
 
 
 def absolute_source(ref: str) -> str:

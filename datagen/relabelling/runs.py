@@ -12,7 +12,7 @@ from cluster.driver import Order, drive
 from cluster.guard import Meter
 from cluster.inprocess import InProcessExecutor
 from cluster.policy import Policy
-from cluster.progress import progress
+from cluster.progress import JobProgress
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, no_work
 from cluster.task import Product
@@ -21,6 +21,7 @@ from datagen.specifying.manifest import manifest_of
 from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from schemas.errors import InputError
 from schemas.keys import MERGED, part_folder
+from schemas.progress import Progress
 from schemas.record_files import MAX_RECORD_BYTES, encode_record
 from schemas.root_records import publish, refuse_foreign
 from schemas.run import Run
@@ -98,12 +99,12 @@ def relabel_all(
     if len(pairs) > 1:
         _write_merged(place, sorted(longest))
     stop = StopRequest()
-    with stop_on_signals(stop, interrupt=True):
+    with stop_on_signals(stop, interrupt=True), Progress(json) as shown:
         for run, (source, _) in zip(done.runs, pairs, strict=True):
             planned = run.missing()
             missing = planned.within(ShardRanges.of(source.committed()))
             done.absent += len(planned) - len(missing)
-            done.summary = done.summary.plus(_relabel_run(run, source, missing, stop, done.flips, json))
+            done.summary = done.summary.plus(_relabel_run(run, source, missing, stop, done.flips, shown))
     if done.summary.end in ("complete", "failed") and any(run.committed() for run in done.runs):
         seal(place)
     return done
@@ -152,7 +153,7 @@ def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
 
 
 def _relabel_run(
-    run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, json: bool
+    run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, shown: Progress
 ) -> JobSummary:
     """The shards of one run, one after the other in this process: files are linked, not computed."""
 
@@ -163,8 +164,8 @@ def _relabel_run(
         return RelabelTask(order.shard, order.attempt, order.deadline_s)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard
-    with progress(per_shard, len(missing), done, True if json else None) as display:
-        books, executor = RunBooks(run), InProcessExecutor(work)
-        summary = drive(missing, make_task, executor, books, Policy(), display, stop)
+    shown.phase("relabelling")
+    books, executor, events = RunBooks(run), InProcessExecutor(work), JobProgress(shown, per_shard, done)
+    summary = drive(missing, make_task, executor, books, Policy(), events, stop)
     close_lost_attempts(run)
     return summary

@@ -14,11 +14,12 @@ from cluster.books import RunBooks, close_lost_attempts
 from cluster.driver import Order, drive
 from cluster.guard import Meter, notes_of_a_job
 from cluster.policy import Policy
-from cluster.progress import progress
+from cluster.progress import JobProgress
 from cluster.ray_cluster import RaySettings
 from cluster.ray_executor import ray_executor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.task import Product
+from schemas.progress import Progress
 from schemas.run import Run
 from tests.made_runs import write
 
@@ -53,13 +54,14 @@ def main() -> int:
         notes_of_a_job() as notes,
         ray_executor(make_rows, settings) as executor,
         stop_on_signals(StopRequest()) as stop,
-        progress(run.layout.samples_per_shard, len(missing)) as display,
+        Progress(as_json=True) as shown,
     ):
 
         def make_task(order: Order) -> RandomRows:
             return RandomRows(place, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
-        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), display, stop)
+        events = JobProgress(shown, run.layout.samples_per_shard)
+        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), events, stop)
     said = {
         "end": summary.end,
         "cause": summary.cause,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import InputError
+from schemas.progress import Progress
 from train.augment import Augmentation
 from train.dataset import SampleStream
 from train.models import Model, build_model
@@ -27,12 +28,12 @@ from train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from train.training.display import display
+from train.training.display import TrainingProgress
 from train.training.loop import Position, Training, run
 from train.training.optimising import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from train.training.options import STAGES, Options
 from train.training.ranks import Ranks
-from train.training.watching import TensorBoard, Watchers
+from train.training.watching import TensorBoard, Watcher, Watchers
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Job:
     threads: int = 1
     keep_every_s: float = 300.0
     tensorboard: str | None = None
-    json_lines: bool = False  # also on a terminal
+    json_lines: bool = False  # as progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
 
 
@@ -59,22 +60,19 @@ def train_job(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
     InputError for data, checkpoints or options that do not go together, before anything is written.
     """
     torch.set_num_threads(job.threads)
-    with only_writer(job.out) if ranks.leads else nullcontext():
+    with ExitStack() as stack:
+        watchers: list[Watcher] = []
+        if ranks.leads:
+            stack.enter_context(only_writer(job.out))
+            shown = stack.enter_context(Progress(job.json_lines))
+            shown.phase("opening runs")
+            watchers.append(TrainingProgress(shown, job.out))
         training, head = prepare(job, ranks)
-        watcher = _watchers(job, training)
-        try:
-            return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
-        finally:
-            watcher.close()
-
-
-def _watchers(job: Job, training: Training) -> Watchers:
-    at = training.position
-    if not training.ranks.leads or at.finished:
-        return Watchers([])
-    curves = [TensorBoard(job.tensorboard, at.step)] if job.tensorboard else []
-    steps = job.options.epochs * training.train.batches_per_epoch
-    return Watchers([*curves, display(job.out, steps, at.step, job.json_lines)])
+        at = training.position
+        if ranks.leads and job.tensorboard and not at.finished:
+            watchers.append(stack.enter_context(closing(TensorBoard(job.tensorboard, at.step))))
+        watcher = Watchers(watchers)
+        return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
 
 
 def prepare(job: Job, ranks: Ranks) -> tuple[Training, CheckpointHead]:

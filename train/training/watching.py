@@ -33,8 +33,6 @@ class Watcher(Protocol):
         """A row of the history: epoch, loss, val_loss, val_accuracy, val_balanced_accuracy, val_auc, best."""
         ...
 
-    def close(self) -> None: ...
-
 
 class Watchers:
     """Several as one."""
@@ -49,10 +47,6 @@ class Watchers:
     def epoch(self, record: dict[str, Any]) -> None:
         for watcher in self._watchers:
             watcher.epoch(record)
-
-    def close(self) -> None:
-        for watcher in self._watchers:
-            watcher.close()
 
 
 class TensorBoard:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from schemas.errors import InputError
-from train.training.display import JsonLines, Pace, TerminalBar, clock_text, display
+from schemas.progress import Progress
+from tests.cluster.simulated import FakeClock
+from train.training.display import TrainingProgress
 from train.training.watching import Step, TensorBoard
 
 RECORD: dict[str, Any] = {
@@ -23,40 +27,42 @@ def step(k: int, step_s: float = 2.0) -> Step:
     return Step(k, 100, 1, 0.5, 1e-3, samples=60, wait_s=0.1 * step_s, step_s=step_s)
 
 
-def test_pace_is_that_of_the_last_minute():
-    pace = Pace()
+def test_the_speed_is_that_of_the_last_minute():
+    out = io.StringIO()
+    shown = Progress(as_json=True, console=Console(file=out))
+    lines = TrainingProgress(shown, "a.ckpt")
     for k in range(1, 6):
-        pace.see(step(k, 100.0))
+        lines.step(step(k, 100.0))
     for k in range(6, 41):
-        pace.see(step(k))
-    assert pace.samples_per_s == pytest.approx(30)
-    assert pace.loader_share == pytest.approx(0.1)
-    assert pace.left_s() == pytest.approx(120)
-    assert clock_text(3725.4) == "1:02:05"
+        lines.step(step(k))
+    lines.epoch(RECORD)
+    shown.close()
+    epoch, last = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert epoch["samples_per_s"] == pytest.approx(30)
+    assert epoch["loader_share"] == pytest.approx(0.1)
+    assert (last["step"], last["left_s"]) == (40, 120)
 
 
-def test_a_bar_shows_numbers_and_a_line_an_epoch(capfd: pytest.CaptureFixture[str]):
-    bar = TerminalBar(100)
-    bar.step(step(31))
-    bar.epoch(RECORD)
-    bar.close()
-    told = capfd.readouterr().err
+def test_a_bar_shows_numbers_and_a_line_an_epoch():
+    out = io.StringIO()
+    with Progress(console=Console(file=out, force_terminal=True, width=110, color_system=None)) as shown:
+        bar = TrainingProgress(shown, "a.ckpt")
+        bar.step(step(31))
+        bar.epoch(RECORD)
+    told = out.getvalue()
     assert "epoch   3  loss 0.5000  validation 0.2500  accuracy 0.8750  best" in told
-    assert "31/100" in told
+    assert "31/100" in told and "30 samples/s  0:02:18 left  data 10%" in told
     assert "None" not in told
 
 
-def test_lines_are_json_also_on_a_terminal(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    lines = display("a.ckpt", 100, 0, as_json=True)
-    assert isinstance(lines, JsonLines)
-    monkeypatch.setattr("time.monotonic", lambda: 1e12)
+def test_lines_are_json_also_on_a_terminal():
+    out, clock = io.StringIO(), FakeClock()
+    lines = TrainingProgress(Progress(True, clock, Console(file=out, force_terminal=True)), "a.ckpt")
+    clock.now_s = 11.0
     lines.step(step(31))
     lines.step(step(32))
     lines.epoch(RECORD)
-    first, second = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
+    first, second = [json.loads(line) for line in out.getvalue().splitlines()]
     assert (first["event"], first["step"], first["steps"], first["left_s"]) == ("progress", 31, 100, 138)
     assert (first["samples_per_s"], first["loader_share"]) == (30.0, 0.1)
     assert (second["event"], second["val_auc"], second["best"]) == ("epoch", None, True)

@@ -1,0 +1,182 @@
+"""How far a command is, on standard error: a bar on a terminal, else lines of text; JSON lines for `--json`.
+
+It lies below `cluster` and `train`, which do not know each other, and needs neither Ray nor torch.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TextColumn
+from rich.progress import Progress as Bar
+from rich.table import Column
+from rich.text import Text
+
+from schemas.errors import printable
+
+_RATE_OVER_S, _LINE_EVERY_S, _DRAW_EVERY_S = 60.0, 10.0, 0.2
+Clock = Callable[[], float]
+Figures = Callable[[], tuple[str, dict[str, object]]]  # for people, and for programs
+Step = Callable[[], None]
+Seen = Callable[[int, int], None]
+
+
+class Pace:
+    """How fast totals that begin at 0 grow per second of `clock`, over the last minute."""
+
+    def __init__(self, clock: Clock = time.monotonic) -> None:
+        self._clock = clock
+        self._seen: deque[tuple[float, tuple[float, ...]]] = deque([(clock(), ())])
+        self._totals: tuple[float, ...] = ()
+
+    def see(self, *totals: float) -> None:
+        now_s, self._totals = self._clock(), totals
+        if now_s - self._seen[-1][0] >= 1.0:
+            self._seen.append((now_s, totals))
+        while len(self._seen) > 2 and now_s - self._seen[1][0] >= _RATE_OVER_S:
+            self._seen.popleft()
+
+    def per_s(self, which: int = 0) -> float:
+        """Growth of one of the totals; 0 before it is known."""
+        then_s, before = self._seen[0]
+        elapsed_s = self._clock() - then_s
+        grown = self._totals[which] - (before[which] if before else 0) if self._totals else 0.0
+        return grown / elapsed_s if elapsed_s > 0 else 0.0
+
+    def left_s(self, more: float, which: int = 0) -> float | None:
+        """Seconds until one of the totals has grown by `more`; None while its rate is unknown."""
+        rate = self.per_s(which)
+        return max(0.0, more) / rate if rate > 0 else None
+
+
+class Progress:
+    """Shows phases by their names, and how much of a countable phase is done, with figures.
+
+    Off a terminal a phase without numbers is a line when it begins, and the others are a line every ten
+    seconds; their last state follows where a line went before it, so that quick work stays quiet.
+    """
+
+    def __init__(
+        self, as_json: bool = False, clock: Clock = time.monotonic, console: Console | None = None
+    ) -> None:
+        self._json, self.clock = as_json, clock
+        self._console = console or Console(stderr=True, force_terminal=sys.stderr.isatty())
+        self._live = self._console.is_interactive and not as_json
+        self._every_s = _DRAW_EVERY_S if self._live else _LINE_EVERY_S
+        self._next_s = clock() + (0.0 if self._live else self._every_s)
+        self._state: tuple[str, int, int, Figures] | None = None  # not shown yet
+        self._told = self._live
+        self._row: TaskID | None = None
+        self._bar = Bar(
+            TextColumn("{task.description}", style="bold", markup=False),
+            BarColumn(bar_width=None),
+            # Where the terminal is narrow, the bar gives way and not the figures.
+            TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=True)),
+            console=self._console,
+            expand=True,
+        )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def phase(self, name: str) -> None:
+        """Name what begins now and has no numbers."""
+        self._end_row()
+        if self._live:
+            self._draw(name)
+        else:
+            self.say("phase", {"phase": name}, name)
+
+    def update(self, what: str, done: int, of: int, figures: Figures) -> None:
+        """`done` things of `of` (0: unknown) are done; `what` names them, in the plural. Cheap to call."""
+        self._state = what, done, of, figures
+        if (now_s := self.clock()) >= self._next_s:
+            self._next_s, self._told = now_s + self._every_s, True
+            self._show()
+
+    def say(self, event: str, values: Mapping[str, object], text: str, style: str = "") -> None:
+        """Write a line above the bar: `text`, or as JSON the event with its values."""
+        self._told = True
+        if self._live:
+            self._console.print(Text(printable(text), style=style), soft_wrap=True)
+        else:
+            line = json.dumps({"event": event, **values}) if self._json else printable(text)
+            print(line, file=self._console.file, flush=True)
+
+    def close(self) -> None:
+        """Show the last state, and give the terminal back."""
+        self._end_row()
+        if self._live:
+            self._bar.stop()
+
+    def _end_row(self) -> None:
+        if self._told:
+            self._show()
+        if self._row is not None and self._bar.tasks[-1].total is None:
+            self._bar.remove_task(self._row)
+        self._row = None
+
+    def _show(self) -> None:
+        if self._state is None:
+            return
+        (what, done, of, figures), self._state = self._state, None
+        text, values = figures()
+        if self._live:
+            self._draw(what, done, of, f"{done}/{of or '?'}  {text}")
+        else:
+            self.say("progress", values, f"{what} {done}/{of}  {text}")
+
+    def _draw(self, name: str, done: int = 0, of: int = 0, text: str = "") -> None:
+        if self._row is None:
+            self._row = self._bar.add_task(name, total=None, text="")
+        self._bar.update(self._row, description=name, completed=done, total=of or None, text=text)
+        self._bar.start()
+
+
+@contextmanager
+def counting(what: str, as_json: bool = False, clock: Clock = time.monotonic, of: int = 0) -> Generator[Seen]:
+    """Give a function to call with (done, of how many), which shows that with rate and time left."""
+    with Progress(as_json, clock) as progress:
+        pace = Pace(clock)
+
+        def seen(done: int, of: int) -> None:
+            def figures() -> tuple[str, dict[str, object]]:
+                rate, left_s = pace.per_s(), pace.left_s(of - done)
+                values = {"what": what, "done": done, "of": of, "per_s": round(rate, 1)}
+                return f"{rate:,.0f}/s  {clock_text(left_s)} left", {**values, "left_s": whole(left_s)}
+
+            pace.see(done)
+            progress.update(what, done, of, figures)
+
+        seen(0, of)  # a terminal names it from the beginning
+        yield seen
+
+
+@contextmanager
+def steps(what: str, total: int, as_json: bool = False, clock: Clock = time.monotonic) -> Generator[Step]:
+    """Give a function to call after each of `total` steps, shown as by `counting`."""
+    with counting(what, as_json, clock, total) as seen:
+        done = itertools.count(1)
+        yield lambda: seen(next(done), total)
+
+
+def whole(seconds: float | None) -> int | None:
+    """Whole seconds, for JSON."""
+    return None if seconds is None else round(seconds)
+
+
+def clock_text(seconds: float | None) -> str:
+    """`h:mm:ss`, or dashes when not known."""
+    if (left_s := whole(seconds)) is None:
+        return "-:--:--"
+    return f"{left_s // 3600}:{left_s // 60 % 60:02d}:{left_s % 60:02d}"
