@@ -164,7 +164,7 @@ def test_a_full_disk(tiny_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     file = tmp_path / "small.toml"
     file.write_text(CONFIG)
     arguments = ["submit", "heuristic", "--n", "128", "--out", str(run), "--candidates-per-scene", "8"]
-    assert cli.run([*arguments, "--workers", "0", "--config", str(file)]) == 2
+    assert cli.run([*arguments, "--workers", "0", "--config", str(file), "--json"]) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("{")]
     assert len(told) == 1 and "No space left on device" in told[0] and "resume" in told[0].lower()
     assert not (run / "data.zarr").exists()
