@@ -85,7 +85,7 @@ def run(
         )
         made = Run.create_or_open(open_storage(out), manifest, n)
         work = Work(made, absolute(options.houses), absolute(options.objects))
-        plan = JobPlan(made.storage, out, [work], Placing(workers=workers), ())
+        plan = JobPlan(made.storage, out, [work], Placing(workers=workers), time.monotonic(), ())
         started_s = time.perf_counter()
         summary = make_missing(plan, open_board(plan))
         ended_s = time.perf_counter()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -41,12 +41,14 @@ class Board(Protocol):
 class Watch:
     """Events that keep a board: the state every `beat_s` seconds, a look for wishes every `look_s`.
 
+    `shown` hears each event before.
     `clock` gives seconds and only grows. What the wish asks is asked of `stop`, once each.
     """
 
     board: Board
     stop: StopRequest
     labels_per_shard: int
+    shown: Events
     clock: Callable[[], float] = time.monotonic
     beat_s: float = 10.0
     look_s: float = 3.0
@@ -59,13 +61,16 @@ class Watch:
 
     def ended(self, report: AttemptReport, action: str) -> None:
         """Each attempt is in the ledger; nothing is added here."""
+        self.shown.ended(report, action)
 
     def stopping(self, reason: str) -> None:
         """Say at the next tick that the job is stopping."""
+        self.shown.stopping(reason)
         self._reason, self._next_beat_s = reason, self.clock()
 
     def tick(self, tally: Tally) -> None:
         """Look and tell when it is time."""
+        self.shown.tick(tally)
         self._pace.see(tally.labels)
         now_s = self.clock()
         if now_s >= self._next_look_s:
@@ -83,22 +88,3 @@ class Watch:
         # Somebody at the terminal may have asked before: that is not asking twice.
         while not (self.stop.force if wish == "force" else self.stop.drain):
             self.stop.ask()
-
-
-class Together:
-    """Several listeners as one."""
-
-    def __init__(self, listeners: Sequence[Events]) -> None:
-        self._listeners = listeners
-
-    def ended(self, report: AttemptReport, action: str) -> None:
-        for listener in self._listeners:
-            listener.ended(report, action)
-
-    def tick(self, tally: Tally) -> None:
-        for listener in self._listeners:
-            listener.tick(tally)
-
-    def stopping(self, reason: str) -> None:
-        for listener in self._listeners:
-            listener.stopping(reason)

@@ -25,7 +25,7 @@ from cluster.ray_executor import RayExecutor, ray_executor
 from cluster.stop import StopRequest, stop_on_signals
 from cluster.tally import JobSummary, Tally, no_work
 from cluster.task import ShardTask
-from cluster.watch import Together, Watch
+from cluster.watch import Watch
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
@@ -172,7 +172,7 @@ def _drive(
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     shown.phase("making labels")
-    events = Together([JobProgress(shown, per_shard, done), Watch(board, stop, per_shard)])
+    events = Watch(board, stop, per_shard, JobProgress(shown, per_shard, done))
     return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
 
 
@@ -246,6 +246,8 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
 
 
 def _time(summary: JobSummary) -> str:
-    rate = summary.tally.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
+    if not summary.tally.labels:
+        return seconds(summary.start_s + summary.elapsed_s)
+    rate = summary.tally.labels / max(summary.elapsed_s, 1e-6)
     parts = f"start {seconds(summary.start_s)}, labels {seconds(summary.elapsed_s)}"
-    return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts}" + (f" at {rate:,.0f}/s" if rate else "")
+    return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts} at {rate:,.0f}/s"

@@ -12,7 +12,7 @@ from cluster.driver import drive
 from cluster.policy import Policy
 from cluster.stop import StopRequest
 from cluster.tally import JobSummary
-from cluster.watch import Standing, Together, Watch, Wish
+from cluster.watch import Standing, Watch, Wish
 from tests.cluster.simulated import FakeClock, Heard, PaperBooks, SimulatedExecutor
 
 SHARD_S = 5.0
@@ -41,7 +41,7 @@ def watched(
     clock, books, heard = FakeClock(), PaperBooks(), Heard()
     board, stop = PaperBoard(clock, wished), stop or StopRequest()
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", SHARD_S), slots=4)
-    events = Together([heard, Watch(board, stop, labels_per_shard=10, clock=clock)])
+    events = Watch(board, stop, labels_per_shard=10, shown=heard, clock=clock)
     summary = drive(range(shards), lambda o: o, executor, books, Policy(), events, stop, clock)
     return summary, board, books, heard
 
