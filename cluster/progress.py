@@ -19,15 +19,10 @@ class JobProgress:
 
     def ended(self, report: AttemptReport, action: str) -> None:
         if action in ("retry", "quarantine", "abort"):
-            values = {
-                "shard": report.shard,
-                "attempt": report.attempt,
-                "cause": report.cause,
-                "action": action,
-            }
+            values = {name: getattr(report, name) for name in ("shard", "attempt", "cause")}
             text = f"shard {report.shard} {report.outcome}: {report.cause} ({action})"
             style = "yellow" if action == "retry" else "red"
-            self._shown.say("attempt_" + report.outcome, values, text, style)
+            self._shown.say("attempt_" + report.outcome, {**values, "action": action}, text, style)
 
     def tick(self, tally: Tally) -> None:
         self._pace.see(tally.labels)

@@ -38,8 +38,8 @@ class TrainingProgress:
         self._shown.say("epoch", {"out": self._place, **record, **self._speed(4)}, text)
 
     def _speed(self, rate_digits: int) -> dict[str, float]:
-        samples, share = self._pace.per_s(0), self._pace.per_s(1)
-        return {"samples_per_s": round(samples, rate_digits), "loader_share": round(share, 4)}
+        samples_per_s = round(self._pace.per_s(0), rate_digits)
+        return {"samples_per_s": samples_per_s, "loader_share": round(self._pace.per_s(1), 4)}
 
     def _figures(self, step: Step) -> tuple[str, dict[str, object]]:
         speed, left_s = self._speed(1), self._pace.left_s(step.steps - step.step, 2)
