@@ -8,7 +8,6 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import resumable
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job

@@ -39,9 +39,9 @@ class Placing:
         float, Parameter(help="Share of the run's shards that may be given up before the job has failed.")
     ] = DEFAULT_SHARE
     detach: Annotated[bool, Parameter(negative=(), help=_DETACH)] = False
-    json: Annotated[
-        bool, Parameter(negative=(), help="Report progress as JSON lines on standard error.")
-    ] = False
+    json: Annotated[bool, Parameter(negative=(), help="Report progress as JSON lines on standard error.")] = (
+        False
+    )
 
     def refuse_bad(self) -> None:
         """Raise InputError for values out of range and, unless detached, for a cluster that is not there."""
@@ -75,7 +75,10 @@ def refuse_odd_n(n: int) -> None:
 
 @contextmanager
 def opening(words: Sequence[str], placing: Placing) -> Generator[float]:
-    """Show that sources are being opened, and tell whoever interrupts that how to go on; gives when it began."""
+    """Show that sources are being opened, and tell whoever interrupts that how to go on.
+
+    Gives the moment at which it began, by the monotonic clock.
+    """
     began_s = time.monotonic()
     with resumable([*words, *placing.address_words()]), Progress(placing.json) as shown:
         shown.phase("opening houses and objects")
