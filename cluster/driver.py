@@ -176,7 +176,9 @@ class _Driver(Generic[T]):
     # Begin ---------------------------------------------------------------------------------
 
     def _fill(self) -> None:
-        room = window(self._policy, self._executor.slots) - len(self._flights)
+        # After two rounds of losses one at a time: then it shows whether a shard takes the others along.
+        width = self._at_once()
+        room = (1 if self._lost_in_a_row >= 2 * width else width) - len(self._flights)
         while room > 0 and (shard := self._next_shard()) is not None:
             self._submit(shard)
             room -= 1
@@ -260,9 +262,11 @@ class _Driver(Generic[T]):
             self.kill_all("the job cannot go on")
         self._events.ended(report, decision.action)
 
+    def _at_once(self) -> int:
+        return min(window(self._policy, self._executor.slots), self._tally.shards - self._tally.finished)
+
     def _nothing_runs(self) -> bool:
-        at_once = min(window(self._policy, self._executor.slots), self._tally.shards - self._tally.finished)
-        return nothing_runs(self._policy, self._lost_in_a_row, at_once)
+        return nothing_runs(self._policy, self._lost_in_a_row, self._at_once())
 
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
         """A worker may die, or lose its store's answer, after its commit: the commit record decides."""

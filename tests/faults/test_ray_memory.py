@@ -38,7 +38,7 @@ def test_who_fills_the_memory_is_ended_and_tried_once_more(
 
         def make_task(order: Order) -> ScriptedTask:
             tries = str(tmp_path / "tries")
-            return ScriptedTask(0, order.attempt, 60, notes, ("fill_memory",), tries)
+            return ScriptedTask(0, order.attempt, 200, notes, ("fill_memory",), tries)
 
         policy = Policy(max_quarantined_share=1.0, backoff_s=0.05)
         summary = drive(
