@@ -22,6 +22,7 @@ from datagen import cli
 from schemas.fields import sized_schema
 from schemas.run import Run
 from schemas.run_records import QuarantineRecord
+from tests.refusals import refused
 from tests.small_runs import (
     PER_SCENE,
     arrays_of,
@@ -133,12 +134,7 @@ def test_another_specification_is_refused_and_changes_nothing(
         at = arguments.index(more[0])
         del arguments[at : at + 2]
     before = files_of(finished)
-    capsys.readouterr()
-    assert cli.run([*arguments, *more]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("error: ") and len(told.splitlines()) == 1 and str(finished) in told
-    for word in fields:
-        assert word in told
+    refused([*arguments, *more], capsys, str(finished), *fields)
     assert files_of(finished) == before
 
 
