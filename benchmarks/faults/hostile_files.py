@@ -23,6 +23,7 @@ from pathlib import Path
 
 from benchmarks.faults.hostile_kinds import ARCHIVES, HOUSE_FILES, ODD_FILES, TEXTS, TOML_FILES
 from tests.datagen.assets.flaky_server import Site, serve
+from tests.refusals import without_phases
 from tests.workers.houses.house_files import two_rooms, write_houses
 from tests.workers.objects.toy_set import write_bundle
 
@@ -140,7 +141,8 @@ def run_case(case: Case, scratch: Path, memory_bytes: int, limit_s: float) -> Ou
         late.cancel()
         process.returncode = os.waitstatus_to_exitcode(status)
         told.seek(0)
-        lines = [line for line in told.read().decode("utf-8", "replace").splitlines() if line[:1] != "{"]
+        text = told.read().decode("utf-8", "replace")
+        lines = [line for line in without_phases(text) if line[:1] != "{"]
     took_s = time.perf_counter() - started_s
     broken = f"no answer in {limit_s:g} s" if took_s >= limit_s else ""
     if not broken and process.returncode not in case.passes:

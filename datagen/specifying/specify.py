@@ -172,10 +172,9 @@ def read_toml(path: Path, mend: str = "Give a TOML file as docs/specification.md
 
 def parse_toml(text: str) -> dict[str, Any]:
     """What TOML text holds. ValueError where it is none, or nested more deeply than any configuration."""
-    if any(
-        line.count(".") > 1000 for line in text.splitlines()
-    ):  # the parser's memory grows with their square
-        raise ValueError("more than 1000 dots in a line")
+    # The parser's memory grows with the square of the parts of a dotted key.
+    if any(line.count(".") > 1000 for line in text.splitlines()):
+        raise ValueError("nested too deeply: more than 1000 dots in a line")
     try:
         document = tomllib.loads(text)
     except RecursionError:
