@@ -16,11 +16,11 @@ import numpy as np
 
 from datagen.reports.agreement import Labelled, agreement, confusion
 from datagen.reports.labelled import read_labelled
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.specification import HeuristicParams
-from workers.bases.candidate_sets import CANDIDATE_SETS, Bools
-from workers.labels.heuristic import heuristic
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.specification import HeuristicParams
+from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, Bools
+from datagen.workers.labels.heuristic import heuristic
 
 # Distances in reaches of the arm: nothing beyond one can be grasped.
 OVER_REACH = HeuristicParams(

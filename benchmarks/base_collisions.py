@@ -17,14 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from schemas.run import Run
-from schemas.scene_rows import read_scene
-from schemas.specification import CandidateParams
-from workers.bases.clearance import STEP_M, base_clearance_m
-from workers.geometry.mesh import F64
-from workers.geometry.planar import convex_hull, inside_any, signed_distances_to_convex, stack_polygons
-from workers.houses.house import House
-from workers.world import PreparedHouse, open_world
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.specification import CandidateParams
+from datagen.workers.bases.clearance import STEP_M, base_clearance_m
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.planar import (
+    convex_hull,
+    inside_any,
+    signed_distances_to_convex,
+    stack_polygons,
+)
+from datagen.workers.houses.house import House
+from datagen.workers.world import PreparedHouse, open_world
 
 RADII_M = (0.25, 0.2, 0.15, 0.1, 0.05)
 _IN_THE_WAY = ("a wall", "the furniture with the target", "other furniture")

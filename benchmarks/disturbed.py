@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import zarr
 
-from schemas.outcomes import OUTCOMES
-from schemas.sealing import SEALED
-from workers.geometry.mesh import F64
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.sealing import SEALED
+from datagen.workers.geometry.mesh import F64
 
 _NAMES = tuple(OUTCOMES)
 COLUMNS = (

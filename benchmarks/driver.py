@@ -11,15 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from cluster.driver import Order, drive
-from cluster.guard import Meter, utc_now
-from cluster.policy import Policy
-from cluster.ray_cluster import RaySettings, ray_cluster
-from cluster.ray_executor import RayExecutor
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary
-from cluster.task import Product
-from schemas.run_records import Cost, LedgerEntry
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter, utc_now
+from datagen.cluster.policy import Policy
+from datagen.cluster.ray_cluster import RaySettings, ray_cluster
+from datagen.cluster.ray_executor import RayExecutor
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary
+from datagen.cluster.task import Product
+from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.cluster.bad_cluster import Silent, simulate
 from tests.cluster.simulated import PaperBooks
 from tests.faults.scripted import ScriptedTask

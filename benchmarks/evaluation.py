@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
-from workers.bases.candidate_sets import CANDIDATE_SETS
 
 
 def main() -> None:

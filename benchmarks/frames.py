@@ -16,21 +16,21 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.specification import NoiseParams, Source, Specification
-from train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
-from train.prediction.ground import find_ground, floor_points
-from train.prediction.growing import grow_mask
-from train.prediction.target import locate
-from workers.geometry.mesh import F64
-from workers.houses import open_houses
-from workers.objects import open_objects
-from workers.rendering.embree_renderer import render_rays
-from workers.rendering.noise import add_noise
-from workers.scenes.draw import draw_scene
-from workers.scenes.scene import Scene
-from workers.world import assemble_world
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import NoiseParams, Source, Specification
+from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
+from datagen.train.prediction.ground import find_ground, floor_points
+from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.target import locate
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.rendering.noise import add_noise
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.scene import Scene
+from datagen.workers.world import assemble_world
 
 
 def main() -> None:

@@ -22,14 +22,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.specification import GraspParams
-from workers.grasps.floating_hand import HandTest, held_trials
-from workers.grasps.keep import scored_grasps
-from workers.grasps.targets import Graspability, Targets, graspability
-from workers.objects import open_objects
-from workers.objects.model import ObjectModel
-from workers.robots import gripper_of
-from workers.robots.robot import Gripper
+from datagen.schemas.specification import GraspParams
+from datagen.workers.grasps.floating_hand import HandTest, held_trials
+from datagen.workers.grasps.keep import scored_grasps
+from datagen.workers.grasps.targets import Graspability, Targets, graspability
+from datagen.workers.objects import open_objects
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots import gripper_of
+from datagen.workers.robots.robot import Gripper
 
 _STABILITY_GRASPS = 8  # of each object
 _VARIANTS = {

@@ -18,11 +18,11 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from workers.geometry.mesh import F32
-from workers.geometry.transforms import translation
-from workers.objects import open_objects
-from workers.objects.merging import merge_parts
-from workers.settling.sapien_bodies import add_object, add_static
+from datagen.workers.geometry.mesh import F32
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.objects import open_objects
+from datagen.workers.objects.merging import merge_parts
+from datagen.workers.settling.sapien_bodies import add_object, add_static
 
 
 def main() -> None:

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from train.dataset import SampleStream
-from train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
-from train.inputs import Batch
-from train.models.shared import SharedModel
-from train.models.tokens import Tokens
-from train.tensors import to_torch
+from datagen.train.dataset import SampleStream
+from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
+from datagen.train.inputs import Batch
+from datagen.train.models.shared import SharedModel
+from datagen.train.models.tokens import Tokens
+from datagen.train.tensors import to_torch
 
 # Name -> changes of the configuration, and the layers whose output is held at zero.
 VARIANTS: dict[str, tuple[Mapping[str, Any], Sequence[str]]] = {

@@ -10,11 +10,11 @@ import time
 
 import numpy as np
 
-from schemas.specification import HeuristicParams
-from train.baselines.baseline import mount_m, planar_distance_m, reach_m
-from train.dataset import SampleStream
-from train.observed_visibility import observed_visibility
-from workers.labels.heuristic import heuristic
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.baselines.baseline import mount_m, planar_distance_m, reach_m
+from datagen.train.dataset import SampleStream
+from datagen.train.observed_visibility import observed_visibility
+from datagen.workers.labels.heuristic import heuristic
 
 
 def main(places: list[str]) -> None:

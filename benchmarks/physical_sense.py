@@ -18,21 +18,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.options import scene_options
+from datagen.schemas.cost import StageClock
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.specifying.specify import specify
-from schemas.cost import StageClock
-from schemas.identity import Stream, generator
-from schemas.specification import DisturbanceParams, Specification, TrialParams
-from workers.bases.candidates import Candidates
-from workers.geometry.mesh import F64
-from workers.houses import open_houses
-from workers.labels.trials import ArmInScene, arm_in_scene, arm_of, draw_disturbances, try_candidate
-from workers.motion.plan import MotionPlan
-from workers.motion.scene import pose_of_base
-from workers.objects import open_objects
-from workers.scenes.draw import draw_scene
-from workers.trials.execute import prepare_trials, run_trial
-from workers.trials.trial import Disturbance
-from workers.world import assemble_world
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses import open_houses
+from datagen.workers.labels.trials import ArmInScene, arm_in_scene, arm_of, draw_disturbances, try_candidate
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.scene import pose_of_base
+from datagen.workers.objects import open_objects
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.trials.trial import Disturbance
+from datagen.workers.world import assemble_world
 
 
 @dataclass(frozen=True, eq=False)

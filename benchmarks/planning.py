@@ -23,23 +23,23 @@ import numpy as np
 
 from benchmarks.options import scene_options
 from benchmarks.robots import robots_folder
+from datagen.schemas.cost import StageClock
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import ArmParams
 from datagen.specifying.specify import specify
-from schemas.cost import StageClock
-from schemas.identity import Stream, generator
-from schemas.specification import ArmParams
-from workers.bases.candidates import Candidates
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, quaternion_wxyz
-from workers.grasps.keep import grasps_of
-from workers.houses import open_houses
-from workers.motion.candidate import plan_candidate
-from workers.motion.plan import PlanReport
-from workers.motion.scene import PlanningScene, pose_of_base, prepare
-from workers.objects import open_objects
-from workers.robots import open_robot, robot_limits
-from workers.scenes.draw import draw_scene
-from workers.scenes.scene import Scene
-from workers.world import World, assemble_world
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
+from datagen.workers.grasps.keep import grasps_of
+from datagen.workers.houses import open_houses
+from datagen.workers.motion.candidate import plan_candidate
+from datagen.workers.motion.plan import PlanReport
+from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.objects import open_objects
+from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.scene import Scene
+from datagen.workers.world import World, assemble_world
 
 _POINTS = 8000  # of a scene, for the peer
 _RESOLUTION_M = 0.02

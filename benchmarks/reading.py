@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 import zarr
 
-from schemas.run import Run
-from schemas.sealing import SEALED, seal
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import SEALED, seal
+from datagen.train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
+from datagen.train.batching import SAMPLE_FIELDS as SAMPLES
+from datagen.train.batching import SCENE_FIELDS as SCENES
+from datagen.train.dataset import SampleStream
+from datagen.train.opening import open_parts
+from datagen.train.reader import load_shard
 from tests.train.stream_runs import make_stream_run
-from train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
-from train.batching import SAMPLE_FIELDS as SAMPLES
-from train.batching import SCENE_FIELDS as SCENES
-from train.dataset import SampleStream
-from train.opening import open_parts
-from train.reader import load_shard
 
 REPEATS = 5
 FIELDS = (*SCENES, *SAMPLES, "sample_scene_index")

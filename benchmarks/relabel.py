@@ -14,11 +14,11 @@ import time
 from pathlib import Path
 
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from schemas.run import Run
-from schemas.sealing import seal
-from schemas.storage import open_storage
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
+from datagen.workers.labels import load_label_source
 from tests.made_runs import make_run, small_spec
-from workers.labels import load_label_source
 
 SCENES_PER_SHARD, PER_SCENE = 32, 60
 

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import quaternion_wxyz
-from workers.registry import entry
-from workers.robots import ROBOTS, open_robot
-from workers.robots.arm import Arm
-from workers.robots.description import robots_folder
-from workers.robots.robot import Robot
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import quaternion_wxyz
+from datagen.workers.registry import entry
+from datagen.workers.robots import ROBOTS, open_robot
+from datagen.workers.robots.arm import Arm
+from datagen.workers.robots.description import robots_folder
+from datagen.workers.robots.robot import Robot
 
 CASES = (
     ("panda", None, 0.8),

@@ -26,10 +26,10 @@ os.environ.setdefault("OMP_PLACES", "cores")
 import numpy as np
 import torch
 
-from train.dataset import SampleStream
-from train.inputs import Batch, Candidates, Clouds, Robots
-from train.models import Model, build_model
-from train.tensors import to_torch
+from datagen.train.dataset import SampleStream
+from datagen.train.inputs import Batch, Candidates, Clouds, Robots
+from datagen.train.models import Model, build_model
+from datagen.train.tensors import to_torch
 
 LIGHT = {
     "centroids": (256, 64),

@@ -31,15 +31,15 @@ import zarr
 
 from datagen.jobs.job import JobPlan, Work, make_missing, open_board
 from datagen.jobs.options import Placing
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.run_records import Commit
-from schemas.sealing import seal
-from schemas.storage import open_storage
-from workers.houses import open_houses
-from workers.objects import open_objects
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
 
 WANTED = 180_000
 CANDIDATES = 60

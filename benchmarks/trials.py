@@ -19,13 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.physical_sense import Case, plan_options, planned_cases
-from schemas.identity import Stream, generator
-from schemas.specification import DisturbanceParams, Specification, TrialParams
-from workers.labels.trials import arm_of, draw_disturbances
-from workers.trials import physics
-from workers.trials.execute import TrialScene, prepare_trials, run_trial
-from workers.trials.prepared import Things, pedestal_below, still_parts_near
-from workers.trials.trial import Disturbance, TrialResult
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
+from datagen.workers.labels.trials import arm_of, draw_disturbances
+from datagen.workers.trials import physics
+from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
+from datagen.workers.trials.prepared import Things, pedestal_below, still_parts_near
+from datagen.workers.trials.trial import Disturbance, TrialResult
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def print_maniskill(
     """The same trials in ManiSkill: time, ratio, agreement."""
     import gymnasium
 
-    from workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
+    from datagen.workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
 
     spent_s, agree = 0.0, 0
     for case, scene, result in zip(cases, prepare_all(cases, trial), results, strict=False):

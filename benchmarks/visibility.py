@@ -17,18 +17,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.options import scene_options
+from datagen.schemas.cost import StageClock
 from datagen.specifying.specify import specify
-from schemas.cost import StageClock
-from workers.geometry.mesh import F64
-from workers.houses import open_houses
-from workers.objects import open_objects
-from workers.rendering.embree_renderer import ray_stage
-from workers.rendering.frame import Stage
-from workers.rendering.pybullet_renderer import PybulletStage
-from workers.rendering.rays import RayStage, first_hits, into_frame
-from workers.rendering.visibility import visible_pixels
-from workers.scenes.draw import draw_scene
-from workers.world import assemble_world
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.frame import Stage
+from datagen.workers.rendering.pybullet_renderer import PybulletStage
+from datagen.workers.rendering.rays import RayStage, first_hits, into_frame
+from datagen.workers.rendering.visibility import visible_pixels
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.world import assemble_world
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
 NEAR_M = 0.025  # a rasteriser's usual near plane, and a little for rays beside the middle one

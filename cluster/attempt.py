@@ -6,18 +6,18 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
-from cluster.guard import Meter, this_host, utc_now
-from cluster.task import JobCannotGoOn, Product, ShardTask
-from schemas.errors import InputError
-from schemas.keys import commit_key
-from schemas.run import Run
-from schemas.run_records import Commit
-from schemas.scene_rows import read_scenes
-from schemas.shard_files import encode_shard
-from schemas.storage.errors import FORBIDDEN, FULL, machine_error
-from workers.robots import gripper_of
-from workers.run_shard import run_shard
-from workers.world import World, open_world
+from datagen.cluster.guard import Meter, this_host, utc_now
+from datagen.cluster.task import JobCannotGoOn, Product, ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_key
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage.errors import FORBIDDEN, FULL, machine_error
+from datagen.workers.robots import gripper_of
+from datagen.workers.run_shard import run_shard
+from datagen.workers.world import World, open_world
 
 
 def run_attempt(task: ShardTask, meter: Meter) -> Product:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 
-from cluster.guard import utc_now
-from cluster.policy import Trouble
-from schemas.errors import InputError
-from schemas.keys import commit_key
-from schemas.ledger import end_from_commit, lost_end
-from schemas.run import Run
-from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
-from schemas.shard_ranges import ShardRanges
-from schemas.summaries import refresh
+from datagen.cluster.guard import utc_now
+from datagen.cluster.policy import Trouble
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_key
+from datagen.schemas.ledger import end_from_commit, lost_end
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.summaries import refresh
 
 # The index is brought up to date after so many attempts, and not before so many times the time that it
 # took last: a job of a million shards spends a small share of its driver on it.

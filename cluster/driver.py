@@ -20,9 +20,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from cluster.executor import Executor
-from cluster.open_shards import OpenShards
-from cluster.policy import (
+from datagen.cluster.executor import Executor
+from datagen.cluster.open_shards import OpenShards
+from datagen.cluster.policy import (
     Durations,
     Policy,
     Trouble,
@@ -34,11 +34,11 @@ from cluster.policy import (
     too_many_quarantined,
     window,
 )
-from cluster.stop import StopRequest
-from cluster.tally import End, JobSummary, Tally
-from cluster.task import AttemptReport
-from schemas.run_records import Commit, LedgerEntry, Outcome
-from schemas.shard_ranges import ShardRanges
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import End, JobSummary, Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
+from datagen.schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
 # Upper bound of one wait, so that a request to stop is heeded soon.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, TypeVar
 
-from cluster.task import AttemptReport
+from datagen.cluster.task import AttemptReport
 
 T_contra = TypeVar("T_contra", contravariant=True)
 

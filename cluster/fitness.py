@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from cluster.attempt import open_task
-from cluster.task import JobCannotGoOn, ShardTask
-from schemas.errors import InputError
-from schemas.run import Run
+from datagen.cluster.attempt import open_task
+from datagen.cluster.task import JobCannotGoOn, ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
 
 _PATIENCE_S = 120.0  # sources are opened, and the first time their digests are taken
 _SHARED = "Put the run and its sources where every machine has them under the same name, or on s3://"

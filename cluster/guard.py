@@ -29,12 +29,12 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
-from cluster.task import AttemptReport, JobCannotGoOn, Product, Task
-from schemas.cost import StageClock
-from schemas.private_folders import is_private
-from schemas.run_records import Cost, Host, Outcome
-from schemas.storage.errors import FULL, StoreFailure, machine_error
-from schemas.whole_files import whole_file
+from datagen.cluster.task import AttemptReport, JobCannotGoOn, Product, Task
+from datagen.schemas.cost import StageClock
+from datagen.schemas.private_folders import is_private
+from datagen.schemas.run_records import Cost, Host, Outcome
+from datagen.schemas.storage.errors import FULL, StoreFailure, machine_error
+from datagen.schemas.whole_files import whole_file
 
 T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.

@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from cluster.guard import Meter, guarded, utc_now
-from cluster.task import AttemptReport, Product, Task
+from datagen.cluster.guard import Meter, guarded, utc_now
+from datagen.cluster.task import AttemptReport, Product, Task
 
 T = TypeVar("T", bound=Task)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.shard_ranges import ShardRanges
+from datagen.schemas.shard_ranges import ShardRanges
 
 
 class OpenShards:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from cluster.task import AttemptReport
+from datagen.cluster.task import AttemptReport
 
 Action = Literal["done", "retry", "quarantine", "drop", "abort"]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import psutil
 
-from schemas.private_folders import locked_folder
-from schemas.whole_files import whole_file
+from datagen.schemas.private_folders import locked_folder
+from datagen.schemas.whole_files import whole_file
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"

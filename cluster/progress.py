@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cluster.tally import Tally
-from cluster.task import AttemptReport
-from schemas.progress import Pace, Progress, clock_text, whole
+from datagen.cluster.tally import Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.progress import Pace, Progress, clock_text, whole
 
 
 class JobProgress:

@@ -12,16 +12,22 @@ import socket
 import sys
 import threading
 from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, chdir, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cluster.environment import changed_environment
-from cluster.private_folder import RAY, private_folder
-from cluster.ray_local import START_MEND, slim_node
-from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token, token_environment
-from schemas.errors import InputError
+from datagen.cluster.environment import changed_environment
+from datagen.cluster.private_folder import RAY, private_folder
+from datagen.cluster.ray_local import START_MEND, slim_node
+from datagen.cluster.ray_settings import (
+    OBJECT_STORE_BYTES,
+    head_environment,
+    import_root,
+    new_token,
+    token_environment,
+)
+from datagen.schemas.errors import InputError
 
 _PATIENCE_S = 10.0
 _SILENT_START_S = 5.0  # then standard error says what is waited for
@@ -73,7 +79,9 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
             start.enter_context(slim_node())
         start.enter_context(_announced(f"waiting for Ray to start: --address {settings.address}\n"))
         try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+            # Ray puts the working directory first on the workers' sys.path, and a user's may hold a train.py.
+            with chdir(import_root()):
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except InputError:
             raise
         except (OSError, RuntimeError, ValueError, AuthenticationError) as error:

@@ -14,12 +14,20 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from cluster.guard import Meter, Remains, clear_notes, collect_remains, guarded, obituary, resident_bytes
-from cluster.ray_cluster import RaySettings, first_line, ray_cluster
-from cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, remains_of
-from cluster.task import AttemptReport, Product, Task
-from schemas.errors import InputError
-from schemas.run_records import Outcome
+from datagen.cluster.guard import (
+    Meter,
+    Remains,
+    clear_notes,
+    collect_remains,
+    guarded,
+    obituary,
+    resident_bytes,
+)
+from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
+from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, remains_of
+from datagen.cluster.task import AttemptReport, Product, Task
+from datagen.schemas.errors import InputError
+from datagen.schemas.run_records import Outcome
 
 _SLOTS_SEEN_FOR_S = 5.0
 _BEGUN_SEEN_FOR_S = 1.0

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
-from cluster.environment import JOB_ENVIRONMENT, changed_environment
-from cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
-from schemas.errors import InputError
+from datagen.cluster.environment import JOB_ENVIRONMENT, changed_environment
+from datagen.cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
+from datagen.schemas.errors import InputError
 
 _MEND = (
     "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it asks for one"
@@ -38,7 +38,7 @@ class RayJobs:
         """
         runtime: dict[str, Any] = {"env_vars": dict(environment)}
         if JOB_ENVIRONMENT in environment:
-            runtime["worker_process_setup_hook"] = "cluster.environment.adopt_job_environment"
+            runtime["worker_process_setup_hook"] = "datagen.cluster.environment.adopt_job_environment"
         until_s = time.monotonic() + _AGENT_WITHIN_S
         while True:
             try:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 _START_WITHIN_S = 300.0
 _LOOK_S = 0.05

@@ -10,7 +10,8 @@ import secrets
 import socket
 from pathlib import Path
 
-from cluster.private_folder import OWNER
+import datagen
+from datagen.cluster.private_folder import OWNER
 
 OBJECT_STORE_BYTES = 80 * 2**20  # only reports travel, so the least that Ray accepts
 
@@ -30,6 +31,11 @@ _LOCAL = {
 }
 
 
+def import_root() -> Path:
+    """The folder from which this process imports `datagen`."""
+    return Path(datagen.__file__).resolve().parent.parent
+
+
 def new_token() -> str:
     """A random token of 256 bits: who has it may run code on the cluster."""
     return secrets.token_hex(32)
@@ -39,9 +45,9 @@ def head_environment(token: str, folder: Path | None = None) -> dict[str, str]:
     """Environment, over the caller's own, of a cluster of this machine alone and of its clients.
 
     The processes listen on the loopback address, answer only those who have the token, and belong to a
-    private folder. Workers find the five packages by PYTHONPATH, wherever the caller found them.
+    private folder. Workers find the package by PYTHONPATH, wherever the caller found them.
     """
-    paths = [str(Path(__file__).resolve().parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [str(import_root()), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
         **_LOCAL,
         **WORKER_ENVIRONMENT,

@@ -6,8 +6,8 @@ from collections import Counter
 from dataclasses import dataclass, field, fields
 from typing import Literal, get_args
 
-from cluster.task import AttemptReport
-from schemas.run_records import Outcome
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.run_records import Outcome
 
 End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
 _NAMED = 20  # quarantined shards that the summary lists by number

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from schemas.run_records import Cost, Host, Layout, Outcome
-from schemas.specification import Specification
+from datagen.schemas.run_records import Cost, Host, Layout, Outcome
+from datagen.schemas.specification import Specification
 
 
 class Task(Protocol):

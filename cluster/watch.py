@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from cluster.driver import Events
-from cluster.progress import left_of
-from cluster.stop import StopRequest
-from cluster.tally import Tally
-from cluster.task import AttemptReport
-from schemas.progress import Pace
+from datagen.cluster.driver import Events
+from datagen.cluster.progress import left_of
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.progress import Pace
 
 Wish = Literal["drain", "force"]
 

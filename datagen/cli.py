@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError, UnknownCommandError
 
-from cluster.environment import job_environment
 from datagen import __version__
-from schemas.errors import InputError, one_line, refuse_not_utf8
-from workers.registry import missing_library
+from datagen.cluster.environment import job_environment
+from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
+from datagen.workers.registry import missing_library
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,26 +28,32 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
 # Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
-    "submit": ("datagen.submit:submit", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.resume:resume", "Make what is missing of a run, or of merged runs."),
-    "extend": ("datagen.extend:extend", "Want more labels of a run, and make them."),
-    "cancel": ("datagen.cancel:cancel", "Ask the jobs of a run to stop, and wait for their end."),
-    "logs": ("datagen.logs:logs", "What happened in a run, in order of time."),
-    "status": ("datagen.status:status", "How far a run is, and what failed."),
-    "seal": ("datagen.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
-    "unseal": ("datagen.seal:unseal", "Remove that store; the run keeps every shard."),
-    "merge": ("datagen.merge:merge", "One run of several that were made apart."),
-    "verify": ("datagen.verify:verify", "Whether a run is what it says, to the last byte."),
-    "repair": ("datagen.repair:repair", "Mend what verify finds, and touch nothing else."),
-    "replay": ("datagen.replay:replay", "One sample's scene made again, beside what is stored."),
-    "relabel": ("datagen.relabel:relabel", "Labels by another rule, from stored distances."),
-    "calibrate": ("datagen.calibrate:calibrate", "Fit the heuristic's rule to labels of trials."),
-    "audit": ("datagen.audit:audit", "What labels cost, by stage, and what 180,000 would."),
-    "gc": ("datagen.gc:gc", "Remove what a run holds and nothing names."),
-    "show": ("datagen.show:show", "A picture of one scene of a run."),
-    "train": ("datagen.train:train", "Train a model on labels: stage 1, stage 2, or sim labels alone."),
-    "evaluate": ("datagen.evaluate:evaluate", "How good models are, beside baselines and the paper."),
-    "predict": ("datagen.predict:predict", "A base pose from a depth camera's frame."),
+    "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
+    "resume": ("datagen.commands.resume:resume", "Make what is missing of a run, or of merged runs."),
+    "extend": ("datagen.commands.extend:extend", "Want more labels of a run, and make them."),
+    "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop, and wait for their end."),
+    "logs": ("datagen.commands.logs:logs", "What happened in a run, in order of time."),
+    "status": ("datagen.commands.status:status", "How far a run is, and what failed."),
+    "seal": ("datagen.commands.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
+    "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
+    "merge": ("datagen.commands.merge:merge", "One run of several that were made apart."),
+    "verify": ("datagen.commands.verify:verify", "Whether a run is what it says, to the last byte."),
+    "repair": ("datagen.commands.repair:repair", "Mend what verify finds, and touch nothing else."),
+    "replay": ("datagen.commands.replay:replay", "One sample's scene made again, beside what is stored."),
+    "relabel": ("datagen.commands.relabel:relabel", "Labels by another rule, from stored distances."),
+    "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's rule to labels of trials."),
+    "audit": ("datagen.commands.audit:audit", "What labels cost, by stage, and what 180,000 would."),
+    "gc": ("datagen.commands.gc:gc", "Remove what a run holds and nothing names."),
+    "show": ("datagen.commands.show:show", "A picture of one scene of a run."),
+    "train": (
+        "datagen.commands.train:train",
+        "Train a model on labels: stage 1, stage 2, or sim labels alone.",
+    ),
+    "evaluate": (
+        "datagen.commands.evaluate:evaluate",
+        "How good models are, beside baselines and the paper.",
+    ),
+    "predict": ("datagen.commands.predict:predict", "A base pose from a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
 }
@@ -104,7 +110,7 @@ def _lines_for(error: Exception) -> list[str] | None:
     if isinstance(error, CycloptsError):
         return [_usage_line(error)]
     if isinstance(error, OSError):
-        from schemas.storage.errors import machine_error
+        from datagen.schemas.storage.errors import machine_error
 
         return [str(known)] if (known := machine_error(error)) else None
     if (missing := missing_library(error)) is not None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
-from schemas.outcomes import OUTCOMES, REDRAW_CAUSES
-from schemas.run_records import FORMAT_VERSION
-from schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
+from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
+from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
+from datagen.schemas.run_records import FORMAT_VERSION
+from datagen.schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
 
 _HEAD = f"""# Data format
 

@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from schemas.errors import InputError, choices
-from schemas.outcomes import OUTCOMES, REDRAW_CAUSES
-from schemas.specification import Specification
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
+from datagen.schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
 

@@ -7,7 +7,7 @@ import stat
 from io import BufferedReader
 from pathlib import Path
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 
 def open_regular(path: Path, most_bytes: int, mend: str) -> BufferedReader:

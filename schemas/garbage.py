@@ -26,13 +26,13 @@ from datetime import datetime
 from itertools import groupby
 from typing import Literal
 
-from schemas.errors import InputError
-from schemas.jobs import Jobs
-from schemas.keys import REMOVING, commit_copy_key, commit_key
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.storage import Storage, StoredFile
-from schemas.summaries import unreadable_files
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.storage import Storage, StoredFile
+from datagen.schemas.summaries import unreadable_files
 
 Seen = Callable[[int, int], None]
 Kind = Literal["attempts", "drafts", "probes", "index"]

@@ -16,10 +16,10 @@ from typing import Annotated, Literal, TypeVar
 import psutil
 from pydantic import BaseModel, Field
 
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
-from schemas.run_records import FORMAT_VERSION, StoredRecord
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.run_records import FORMAT_VERSION, StoredRecord
+from datagen.schemas.storage import Storage
 
 JobId = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{8}$")]
 JobEnd = Literal["", "complete", "interrupted", "failed", "aborted", "broken"]

@@ -9,10 +9,10 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
-from schemas.run_records import AttemptStart, Commit, LedgerEntry
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
+from datagen.schemas.storage import Storage
 
 MAX_STACK_CHARS = 20_000
 LOST_CAUSE = "it left no end, and its shard was decided without it"

@@ -12,9 +12,9 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field
 
-from schemas.record_files import encode_record, read_record
-from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION, StoredRecord
+from datagen.schemas.record_files import encode_record, read_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION, StoredRecord
 
 LINEAGE = "lineage.json"
 _Shard = Annotated[int, Field(ge=0, le=10**18)]

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.record_files import read_record
-from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION, Merged, other_value
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.record_files import read_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION, Merged, other_value
+from datagen.schemas.storage import Storage, open_storage
 
 
 def open_runs(place: Storage | Path | str) -> list[Run]:

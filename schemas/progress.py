@@ -19,7 +19,7 @@ from rich.progress import Progress as Bar
 from rich.table import Column
 from rich.text import Text
 
-from schemas.errors import printable
+from datagen.schemas.errors import printable
 
 _RATE_OVER_S, _LINE_EVERY_S, _DRAW_EVERY_S = 60.0, 10.0, 0.2
 Clock = Callable[[], float]

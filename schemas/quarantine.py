@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from itertools import count
 
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, read_record
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, read_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
 
 _LIFTED = re.compile(r"quarantine/([0-9]{6,18})\.lifted-([1-9][0-9]{0,8})\.json")
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.errors import InputError
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.storage import Storage
 
 MAX_RECORD_BYTES = 16 * 2**20
 _MEND = "Mend it with `datagen repair`, or restore the file from a copy"

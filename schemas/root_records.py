@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, different_fields
-from schemas.run_records import Manifest
-from schemas.storage import Storage
-from schemas.storage.errors import OddFile
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, different_fields
+from datagen.schemas.run_records import Manifest
+from datagen.schemas.storage import Storage
+from datagen.schemas.storage.errors import OddFile
 
 
 def copy_key(key: str) -> str:

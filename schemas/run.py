@@ -15,13 +15,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
-from schemas.errors import InputError
-from schemas.fields import RecordSchema, sized_schema
-from schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
-from schemas.ledger import MAX_STACK_CHARS, Ledger
-from schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
-from schemas.root_records import publish, refuse_foreign, refuse_other
-from schemas.run_records import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import RecordSchema, sized_schema
+from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
+from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.root_records import publish, refuse_foreign, refuse_other
+from datagen.schemas.run_records import (
     FORMAT_VERSION,
     Commit,
     FileEntry,
@@ -33,9 +33,9 @@ from schemas.run_records import (
     foreign_field,
     other_value,
 )
-from schemas.shard_ranges import ShardRanges
-from schemas.storage import Storage, open_storage
-from schemas.storage.errors import StoreFailure
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.storage import Storage, open_storage
+from datagen.schemas.storage.errors import StoreFailure
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # What became of an attempt that was to be removed. `damaged`: it was committed while its files went.

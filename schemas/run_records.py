@@ -16,7 +16,7 @@ from pydantic import (
     model_serializer,
 )
 
-from schemas.specification import Specification
+from datagen.schemas.specification import Specification
 
 FORMAT_VERSION = 2
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

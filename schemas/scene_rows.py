@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.fields import SceneRows
-from schemas.run import Run
-from schemas.shard_reading import Array, read_committed
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.run import Run
+from datagen.schemas.shard_reading import Array, read_committed
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:

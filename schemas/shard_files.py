@@ -23,10 +23,10 @@ from numcodecs.zstd import Zstd
 from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
-from schemas.errors import InputError
-from schemas.fields import Field, RecordSchema, Table
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.run_records import Layout
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field, RecordSchema, Table
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.run_records import Layout
 
 Array = npt.NDArray[Any]
 # A schema's name, version and fields; its axis lengths; scenes a shard and candidates a scene.

@@ -22,11 +22,11 @@ import numpy.typing as npt
 from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
-from schemas.errors import InputError
-from schemas.keys import shard_folder
-from schemas.run_records import Commit
-from schemas.shard_files import MAX_TEXT_BYTES
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.run_records import Commit
+from datagen.schemas.shard_files import MAX_TEXT_BYTES
+from datagen.schemas.storage import Storage
 
 Array = npt.NDArray[Any]
 

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from schemas.specification import Interval, Range, Specification
+from datagen.schemas.specification import Interval, Range, Specification
 
 _HEAD = """# Specification
 

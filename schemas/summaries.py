@@ -18,10 +18,10 @@ from itertools import chain, islice
 
 from pydantic import Field, ValidationError
 
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, decode_record
-from schemas.run import Run
-from schemas.run_records import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import (
     AttemptName,
     AttemptStart,
     Cost,

@@ -1,6 +1,6 @@
 """Files that are written aside and renamed: whoever reads one sees nothing, the old one or the new one.
 
-Files of runs are written by `schemas.storage`, which also counts on what a crash leaves.
+Files of runs are written by `datagen.schemas.storage`, which also counts on what a crash leaves.
 """
 
 from __future__ import annotations

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.fields import Field, RecordSchema, sized_schema
-from schemas.identity import sample_ids
-from schemas.keys import shard_folder
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.record_files import now
-from schemas.run import Run
-from schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
-from schemas.shard_files import encode_shard
-from schemas.specification import ObservationParams, SceneParams, Source, Specification
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field, RecordSchema, sized_schema
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.record_files import now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.specification import ObservationParams, SceneParams, Source, Specification
+from datagen.schemas.storage import open_storage
 
 Tables = tuple[dict[str, np.ndarray[Any, Any]], dict[str, np.ndarray[Any, Any]]]
 

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from workers.registry import SIM_MODULES
+from datagen.workers.registry import SIM_MODULES
 
 SIM_INSTALLED = all(find_spec(name) is not None for name in (*SIM_MODULES, "sapien"))
 needs_sim = pytest.mark.skipif(not SIM_INSTALLED, reason="the extra `sim` is not installed")

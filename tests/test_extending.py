@@ -46,7 +46,9 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     for kind, place, code in blocks():
         if kind == "file":
             if not place.startswith("tests/"):
-                modules[place] = executed(monkeypatch, place.removesuffix(".py").replace("/", "."), code)
+                modules[place] = executed(
+                    monkeypatch, "datagen." + place.removesuffix(".py").replace("/", "."), code
+                )
             continue
         assert code.count("\n") == 1, f"more than one line for {place}"
         module, registry = place.split(":")
@@ -58,7 +60,7 @@ def extended(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
 
 
 def test_each_example_is_one_file_one_line_and_one_test() -> None:
-    shape = [(kind, place.split("/")[0].split(".")[0]) for kind, place, _ in blocks()]
+    shape = [(kind, re.split(r"[/.]", place.removeprefix("datagen."))[0]) for kind, place, _ in blocks()]
     assert shape == [("file", "workers"), ("line", "workers"), ("file", "tests")] * 4
     assert PAGE.read_text().count("```python") == len(shape)  # no block escapes this test
     for kind, place, _ in blocks():
@@ -100,7 +102,9 @@ def test_the_robot_conforms_by_its_line_alone() -> None:
     from tests.workers.robots import test_conformance, test_physics
     from tests.workers.robots.robots_under_test import cases_of, opened
 
-    robots = [name for code in lines_of("workers.robots:ROBOTS") for name in eval("{" + code + "}", {})]
+    robots = [
+        name for code in lines_of("datagen.workers.robots:ROBOTS") for name in eval("{" + code + "}", {})
+    ]
     checks = [
         check
         for module in (test_conformance, test_physics)

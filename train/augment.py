@@ -19,8 +19,8 @@ from math import cos, pi, sin
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.batching import View
+from datagen.schemas.errors import InputError
+from datagen.train.batching import View
 
 F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
 
 Rows = npt.NDArray[np.intp]
 

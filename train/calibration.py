@@ -16,11 +16,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.specification import HeuristicParams
-from train.evaluation.bootstrap import Estimate, resample_weights, summed
-from train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
-from workers.labels.heuristic import effective_distance, heuristic, visibility_score
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.evaluation.bootstrap import Estimate, resample_weights, summed
+from datagen.train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from datagen.workers.labels.heuristic import effective_distance, heuristic, visibility_score
 
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
 Objective = Literal["balanced", "accuracy"]

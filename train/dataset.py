@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from schemas.at_once import in_order
-from schemas.errors import InputError
-from train.augment import Augmentation
-from train.batching import (
+from datagen.schemas.at_once import in_order
+from datagen.schemas.errors import InputError
+from datagen.train.augment import Augmentation
+from datagen.train.batching import (
     SAMPLE_FIELDS,
     SCENE_FIELDS,
     StoredScene,
@@ -23,11 +23,11 @@ from train.batching import (
     stored_scenes,
     stored_view,
 )
-from train.epoch_plan import EpochPlan, batches_of, plan_epoch
-from train.inputs import Array, Batch
-from train.opening import open_parts
-from train.reader import JOIN_FIELDS, load_shard
-from train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
+from datagen.train.epoch_plan import EpochPlan, batches_of, plan_epoch
+from datagen.train.inputs import Array, Batch
+from datagen.train.opening import open_parts
+from datagen.train.reader import JOIN_FIELDS, load_shard
+from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)
 

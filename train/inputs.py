@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 A = TypeVar("A")  # np.ndarray or torch.Tensor
 Array = npt.NDArray[Any]

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from train.inputs import Array, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, Candidates, Clouds, Robots
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

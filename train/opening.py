@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from schemas.errors import InputError, choices
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.run_records import Commit
-from schemas.shard_reading import ShardPlace, StoredArray, committed_place
-from schemas.storage import open_storage
-from train.sealed import is_sealed_store, open_sealed
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.schemas.shard_reading import ShardPlace, StoredArray, committed_place
+from datagen.schemas.storage import open_storage
+from datagen.train.sealed import is_sealed_store, open_sealed
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Columns of runs as they are stored, a shard at a time: whatever fields are asked for, in stored order.
 
-Training reads through `train.dataset`, which builds batches on the shards that are loaded here.
+Training reads through `datagen.train.dataset`, which builds batches on the shards that are loaded here.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.shard_reading import ShardPlace, StoredArray
-from train.opening import open_parts
+from datagen.schemas.errors import InputError
+from datagen.schemas.shard_reading import ShardPlace, StoredArray
+from datagen.train.opening import open_parts
 
 Array = npt.NDArray[Any]
 Columns = dict[str, Array]

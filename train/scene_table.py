@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.opening import Part
-from train.reader import JOIN_FIELDS, Columns, load_shard
+from datagen.schemas.errors import InputError
+from datagen.train.opening import Part
+from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
 
 I64 = npt.NDArray[np.int64]
 

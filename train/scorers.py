@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.inputs import Array, Batch, is_clear
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch, is_clear
 
 if TYPE_CHECKING:
-    from train.models import Model
+    from datagen.train.models import Model
 
 
 class Scorer(Protocol):
@@ -53,7 +53,7 @@ class ModelScorer:
         """
         import torch
 
-        from train.tensors import to_torch
+        from datagen.train.tensors import to_torch
 
         trained = self.model.training
         self.model.eval()

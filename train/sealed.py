@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError, choices
-from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
-from schemas.keys import MERGED
-from schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
+from datagen.schemas.keys import MERGED
+from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray
+from datagen.schemas.storage import open_storage
 
 _MEND = "Seal the run again, and copy its data.zarr whole"
 

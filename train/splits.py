@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError
-from train.dataset import SampleStream
+from datagen.schemas.errors import InputError
+from datagen.train.dataset import SampleStream
 
 # Other salts than that of a run's own split (workers/houses/split.py): the tenth that is held out here
 # is a tenth of a run of that split's training houses too.

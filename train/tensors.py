@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from train.inputs import Array, Batch
+from datagen.train.inputs import Array, Batch
 
 T = TypeVar("T")
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP
-from schemas.whole_files import whole_file
+from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP
+from datagen.schemas.whole_files import whole_file
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 # Type and shape of every array; lengths with one name are equal.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.outcomes import REDRAW_CAUSES
 
 
 class Redraw(Exception):

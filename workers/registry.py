@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from schemas.errors import InputError, choices
+from datagen.schemas.errors import InputError, choices
 
 # What extras bring, by the names that are imported: what pip calls it, and the extra. The core works without.
 SIM_MODULES = {"pinocchio": "pin", "coal": "coal", "mani_skill": "mani-skill"}

@@ -17,20 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.fields import SceneRows, sized_schema
-from schemas.identity import sample_ids
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates
-from workers.labels import load_label_source
-from workers.labels.source import LabelSource
-from workers.rendering.frame import Camera
-from workers.scenes.draw import draw_scene
-from workers.scenes.recall import recall_candidates, recall_scene
-from workers.scenes.scene import Scene, SettledScene
-from workers.world import World
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows, sized_schema
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.labels import load_label_source
+from datagen.workers.labels.source import LabelSource
+from datagen.workers.rendering.frame import Camera
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.scene import Scene, SettledScene
+from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.specification import Specification
-from workers.bases.clearance import Obstacles, obstacles_of
-from workers.geometry.mesh import F64
-from workers.houses import ids_of_split, open_houses
-from workers.houses.house import House, HouseSource
-from workers.objects import open_objects
-from workers.objects.model import ObjectModel, ObjectSource
-from workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.clearance import Obstacles, obstacles_of
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses import ids_of_split, open_houses
+from datagen.workers.houses.house import House, HouseSource
+from datagen.workers.objects import open_objects
+from datagen.workers.objects.model import ObjectModel, ObjectSource
+from datagen.workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays
 
 if TYPE_CHECKING:
-    from workers.grasps.targets import Targets
+    from datagen.workers.grasps.targets import Targets
 
 # Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
 _HOUSES_KEPT = 16
@@ -110,8 +110,8 @@ class World:
     @cached_property
     def _arm_targets(self) -> Targets:
         # Imported here: labels without an arm need neither robots nor grasps.
-        from workers.grasps.targets import Targets
-        from workers.robots import gripper_of
+        from datagen.workers.grasps.targets import Targets
+        from datagen.workers.robots import gripper_of
 
         assert self.spec.arm is not None
         gripper = gripper_of(self.spec.arm.robot)

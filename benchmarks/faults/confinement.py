@@ -13,7 +13,7 @@ from collections.abc import Callable
 import obstore
 from obstore.store import LocalStore
 
-from schemas.storage import open_storage
+from datagen.schemas.storage import open_storage
 
 KEY = "shards/000001/000001-abcd-000001/points_m/c.0.0"
 

@@ -16,23 +16,23 @@ import tempfile
 import time
 from pathlib import Path
 
-from schemas.keys import commit_key
-from schemas.record_files import encode_record, now
-from schemas.run import Run
-from schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
-from schemas.shard_files import encode_shard
-from schemas.summaries import CommitSummary, Summaries, refresh
+from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import encode_record, now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.summaries import CommitSummary, Summaries, refresh
 from tests.made_runs import commit_of, make_run, rows_of
 
 _ANSWERS = {
-    "open + missing": ("from schemas.run import Run", "len(Run.open(place).missing())"),
+    "open + missing": ("from datagen.schemas.run import Run", "len(Run.open(place).missing())"),
     "status": ("from datagen.reports.standing import status_report", "status_report(Run.open(place))"),
     "audit": ("from datagen.reports.accounts import account_for", "account_for([Run.open(place)])"),
 }
 _TIMED = """
 import json, sys, time
 from pathlib import Path
-from schemas.run import Run
+from datagen.schemas.run import Run
 place = sys.argv[1]
 {imported}
 start_s = time.perf_counter()

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil
 
-from schemas.run import Run
+from datagen.schemas.run import Run
 
 CONFIG = """
 [observation]
@@ -43,7 +43,7 @@ PER_SCENE = 2
 _READ = """
 import json, sys
 import psutil
-from train.dataset import SampleStream
+from datagen.train.dataset import SampleStream
 stream = SampleStream([sys.argv[1]], scenes_per_batch=4, buffer_shards=2)
 samples, scenes, seen = [], 0, psutil.Process()
 for batch in stream.epoch(0):

@@ -23,8 +23,8 @@ from datagen.assets.catalogue import CATALOGUE, Asset, select
 from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
-from schemas.errors import InputError, choices
-from workers.content_cache import cache_folder
+from datagen.schemas.errors import InputError, choices
+from datagen.workers.content_cache import cache_folder
 
 Folder = Annotated[Path, Parameter(help="The folder of assets.")]
 

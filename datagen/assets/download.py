@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
 
 _CHUNK_BYTES = 2**18
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")

@@ -11,8 +11,8 @@ from datagen.assets.catalogue import CATALOGUE, Asset
 from datagen.assets.download import Policy, Progress, download
 from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
-from schemas.errors import InputError
-from schemas.whole_files import whole_file
+from datagen.schemas.errors import InputError
+from datagen.schemas.whole_files import whole_file
 
 
 @dataclass(frozen=True)

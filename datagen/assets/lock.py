@@ -16,10 +16,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from schemas.errors import InputError
-from schemas.foreign_files import open_regular, read_regular
-from schemas.run_records import Digest, StoredRecord
-from schemas.whole_files import whole_file
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import open_regular, read_regular
+from datagen.schemas.run_records import Digest, StoredRecord
+from datagen.schemas.whole_files import whole_file
 
 LOCK_NAME = "assets.lock.json"
 _MAX_LOCK_BYTES = 64 * 2**20

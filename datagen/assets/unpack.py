@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, cast
 
-from schemas.archives import DAMAGED_ZIP, open_member
-from schemas.errors import InputError
+from datagen.schemas.archives import DAMAGED_ZIP, open_member
+from datagen.schemas.errors import InputError
 
 _CHUNK_BYTES = 2**20
 # zipfile reads its list of members in one piece, tarfile a header's extension, which may hold another one.

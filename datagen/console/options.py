@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 _MOST_RESAMPLES = 10_000
 

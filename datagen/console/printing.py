@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from schemas.errors import printable
+from datagen.schemas.errors import printable
 
 
 def print_json(value: Any, indent: int | None = 2) -> None:

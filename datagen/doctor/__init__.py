@@ -19,7 +19,7 @@ from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check
 from datagen.doctor.engines import engine_checks
 from datagen.doctor.host import host_checks
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
@@ -35,13 +35,13 @@ def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
 
 
 def _houses(ref: str) -> int:
-    from workers.houses import open_houses
+    from datagen.workers.houses import open_houses
 
     return len(open_houses(ref).house_ids())
 
 
 def _objects(ref: str) -> int:
-    from workers.objects import open_objects
+    from datagen.workers.objects import open_objects
 
     return len(open_objects(ref).names())
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from datagen.doctor.check import Check, probe
-from workers.registry import SIM_MEND
-from workers.robots import ROBOTS, robot_limits
+from datagen.workers.registry import SIM_MEND
+from datagen.workers.robots import ROBOTS, robot_limits
 
 _LIBRARIES = """
 import importlib, importlib.metadata, importlib.util
@@ -21,7 +21,7 @@ print("pinocchio " + pinocchio.__version__ + ", coal " + importlib.metadata.vers
 """
 
 _ROBOT = """
-from workers.robots import open_robot
+from datagen.workers.robots import open_robot
 robot = open_robot({name!r}, {reach_m!r}, {height_m!r})
 home = robot.homes_rad[0]
 assert not robot.collides_itself(home), "the first tucked pose touches itself"

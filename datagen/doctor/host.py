@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 from datagen.doctor.check import Check
-from workers.content_cache import cache_folder
+from datagen.workers.content_cache import cache_folder
 
 GIB = 2**30
 CGROUP = Path("/sys/fs/cgroup")

@@ -17,10 +17,10 @@ from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
 from datagen.drawing.outcome_colours import LOOKS
 from datagen.drawing.outcome_map import draw_outcome_legend, draw_outcomes, draw_pick, draw_reach
 from datagen.drawing.scene_picture import best_clear, draw_frame, object_outlines, wrapped
-from schemas.outcomes import OUTCOMES
-from workers.rendering.frame import Frame
-from workers.robots.robot import Robot
-from workers.scenes.recall import RecalledScene
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.rendering.frame import Frame
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.recall import RecalledScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")

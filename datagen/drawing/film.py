@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from datagen.drawing.film_camera import Shot, Subject, choose_shot, nothing, scaled_camera
 from datagen.drawing.posed_robot import RobotBodies
-from workers.geometry.mesh import F64, U8
-from workers.rendering.embree_renderer import cast_pixels
-from workers.rendering.frame import Camera
-from workers.rendering.rays import RayMesh, RayStage
-from workers.scenes.recall import RecalledScene
-from workers.trials.trial import Recording
+from datagen.workers.geometry.mesh import F64, U8
+from datagen.workers.rendering.embree_renderer import cast_pixels
+from datagen.workers.rendering.frame import Camera
+from datagen.workers.rendering.rays import RayMesh, RayStage
+from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

@@ -9,12 +9,12 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F64, Mesh, concatenate
-from workers.geometry.transforms import look_at
-from workers.houses.house import Body, House
-from workers.rendering.embree_renderer import cast_pixels
-from workers.rendering.frame import Camera
-from workers.rendering.rays import RayMesh, RayStage, occluded, ray_mesh
+from datagen.workers.geometry.mesh import F64, Mesh, concatenate
+from datagen.workers.geometry.transforms import look_at
+from datagen.workers.houses.house import Body, House
+from datagen.workers.rendering.embree_renderer import cast_pixels
+from datagen.workers.rendering.frame import Camera
+from datagen.workers.rendering.rays import RayMesh, RayStage, occluded, ray_mesh
 
 _AZIMUTHS, _ELEVATIONS_DEG = 20, (20.0, 42.0)
 _PROBE_PX = 56  # width of the pictures by which views are compared

@@ -11,7 +11,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from datagen.drawing.film import OUTLINE_RGB, Film, pictures
 from datagen.drawing.film_camera import Shot
-from workers.geometry.mesh import U8
+from datagen.workers.geometry.mesh import U8
 
 # Sizes of the far and the near view, (width, height), that suit a sheet and a film.
 SHEET_WIDE_PX, SHEET_NEAR_PX = (460, 345), (460, 276)

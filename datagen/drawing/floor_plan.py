@@ -11,10 +11,10 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patches import Polygon
 
-from workers.geometry.mesh import F64
-from workers.geometry.planar import convex_hull
-from workers.houses.house import Body, House
-from workers.rendering.frame import Camera
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.planar import convex_hull
+from datagen.workers.houses.house import Body, House
+from datagen.workers.rendering.frame import Camera
 
 _HEAD_ROOM_M = 1.9  # what hangs higher, such as the wall over a door, hides nothing from above
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}

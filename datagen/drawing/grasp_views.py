@@ -12,14 +12,14 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 
-from workers.geometry.mesh import F32, F64, U8, Mesh
-from workers.geometry.transforms import look_at
-from workers.houses.solids import box, join
-from workers.rendering.embree_renderer import render_rays
-from workers.rendering.frame import Camera, Frame
-from workers.rendering.rays import RayStage, ray_mesh
-from workers.robots.robot import Gripper
-from workers.scenes.recall import RecalledScene
+from datagen.workers.geometry.mesh import F32, F64, U8, Mesh
+from datagen.workers.geometry.transforms import look_at
+from datagen.workers.houses.solids import box, join
+from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering.rays import RayStage, ray_mesh
+from datagen.workers.robots.robot import Gripper
+from datagen.workers.scenes.recall import RecalledScene
 
 _SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles meet a grasp to 0.5 mm and 0.5 degrees only
 _FAR_M = 6.0  # so far away that the view is nearly parallel

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from datagen.drawing.outcome_colours import LOOKS
-from schemas.outcomes import OUTCOMES
-from workers.geometry.mesh import F64
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.geometry.mesh import F64
 
 _DOT, _LEGEND_DOT = 34, 70  # areas in points^2
 _RECEDING = {"out_of_reach": 12, "base_collision": 18}  # what fills most of a grid and says little

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workers.geometry.mesh import F64, I32, Mesh
-from workers.geometry.transforms import inverse, translation
-from workers.houses.solids import frustum, join
-from workers.rendering.rays import RayMesh, ray_mesh
-from workers.robots.robot import Robot
-from workers.robots.urdf import read_urdf
+from datagen.workers.geometry.mesh import F64, I32, Mesh
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.houses.solids import frustum, join
+from datagen.workers.rendering.rays import RayMesh, ray_mesh
+from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.urdf import read_urdf
 
 _PEDESTAL_RGB, _PEDESTAL_SIDES = (196, 205, 216), 24
 _FINGER_RGB = (0, 185, 200)  # few objects have it, so one sees the fingers close

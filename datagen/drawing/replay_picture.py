@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 
 from datagen.drawing.floor_plan import draw_camera, draw_house, draw_labels, draw_objects, frame_axes
 from datagen.drawing.scene_picture import draw_frame, object_outlines
-from schemas.fields import SceneRows
-from schemas.identity import Stream, generator
-from schemas.specification import Specification
-from workers.scenes.draw import render_frame
-from workers.scenes.recall import RecalledScene
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import Specification
+from datagen.workers.scenes.draw import render_frame
+from datagen.workers.scenes.recall import RecalledScene
 
 Side = tuple[RecalledScene, SceneRows]
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from datagen.drawing.film import Told, told_moments
-from schemas.cost import StageClock
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse
-from workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
-from workers.motion.plan import MotionPlan
-from workers.motion.rrt_connect import dense
-from workers.motion.surroundings import surroundings
-from workers.robots.robot import Robot
-from workers.scenes.scene import SettledScene
-from workers.trials.trial import Recording, TrialResult
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.rrt_connect import dense
+from datagen.workers.motion.surroundings import surroundings
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.trial import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
 _STEP_RAD = 0.08  # that a plan advances meanwhile, over all joints

@@ -19,11 +19,11 @@ from datagen.drawing.floor_plan import (
     draw_scores,
     frame_axes,
 )
-from schemas.outcomes import REDRAW_CAUSES
-from workers.geometry.mesh import F64
-from workers.geometry.planar import convex_hull
-from workers.rendering.frame import Frame
-from workers.scenes.recall import RecalledScene
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.planar import convex_hull
+from datagen.workers.rendering.frame import Frame
+from datagen.workers.scenes.recall import RecalledScene
 
 Columns = Mapping[str, Any]
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from datagen.drawing.arm_picture import best_success, draw_arm_picture, robots_of
 from datagen.drawing.scene_picture import best_clear, draw_scene_picture
-from schemas.fields import SceneRows
-from schemas.identity import Stream, generator
-from schemas.specification import Specification
-from workers.rendering.frame import Frame
-from workers.robots import open_robot
-from workers.scenes.draw import render_frame
-from workers.scenes.recall import RecalledScene
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import Specification
+from datagen.workers.rendering.frame import Frame
+from datagen.workers.robots import open_robot
+from datagen.workers.scenes.draw import render_frame
+from datagen.workers.scenes.recall import RecalledScene
 
 Lines = list[tuple[str, str]]
 

@@ -19,10 +19,10 @@ from datagen.drawing.outcome_colours import LOOKS
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.retrial import Retrial, try_again
 from datagen.drawing.shown import Lines, Shown
-from schemas.errors import InputError
-from schemas.outcomes import OUTCOMES
-from workers.labels.trials import arm_of
-from workers.scenes.recall import recall_candidates
+from datagen.schemas.errors import InputError
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.labels.trials import arm_of
+from datagen.workers.scenes.recall import recall_candidates
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:

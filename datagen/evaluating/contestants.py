@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from schemas.errors import InputError
-from train.baselines.scalars import Scalars
-from train.evaluation.comparisons import NO_TRAINING, TrainedBy
-from train.evaluation.evaluation import Method
-from train.scorers import ModelScorer, Scorer
+from datagen.schemas.errors import InputError
+from datagen.train.baselines.scalars import Scalars
+from datagen.train.evaluation.comparisons import NO_TRAINING, TrainedBy
+from datagen.train.evaluation.evaluation import Method
+from datagen.train.scorers import ModelScorer, Scorer
 
 if TYPE_CHECKING:
-    from train.training.checkpoints import CheckpointHead
+    from datagen.train.training.checkpoints import CheckpointHead
 
 # What a checkpoint's stage is called as a regime of training: stage 2 is the end of two.
 REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
@@ -95,7 +95,7 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
     """The models of these checkpoints, named by their regimes, and by what else tells equal ones apart."""
     if not places:
         return []
-    from train.training.checkpoints import load_model
+    from datagen.train.training.checkpoints import load_model
 
     loaded = [(place, *load_model(place)) for place in places]
     names = _names([(_regime_name(head), head.model) for _, _, head in loaded])

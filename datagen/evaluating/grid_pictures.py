@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from datagen.evaluating.svg import new_figure
-from train.evaluation.columns import Columns, Example
-from train.evaluation.grids import picks
+from datagen.train.evaluation.columns import Columns, Example
+from datagen.train.evaluation.grids import picks
 
 _MOST_METHODS = 5
 _PANEL_IN = 2.55

@@ -11,13 +11,13 @@ from pydantic import ValidationError
 
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import SCENES_PER_BATCH, Place, refuse_no_trials
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import steps
+from datagen.schemas.specification import HeuristicParams
 from datagen.specifying.specify import first_of, read_toml
-from schemas.errors import InputError
-from schemas.progress import steps
-from schemas.specification import HeuristicParams
-from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
-from train.dataset import SampleStream
-from train.splits import refuse_shared_houses
+from datagen.train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
+from datagen.train.dataset import SampleStream
+from datagen.train.splits import refuse_shared_houses
 
 NONE = "none"
 

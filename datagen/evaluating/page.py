@@ -11,8 +11,8 @@ from datagen.evaluating.grid_pictures import draw_examples
 from datagen.evaluating.rows import Shown
 from datagen.evaluating.svg import svg_of
 from datagen.evaluating.wording import Report
-from schemas.errors import printable
-from train.evaluation.columns import Gathered
+from datagen.schemas.errors import printable
+from datagen.train.evaluation.columns import Gathered
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; margin: 2rem auto; max-width: 76rem;

@@ -9,13 +9,13 @@ from typing import Any
 
 from datagen.evaluating.contestants import Contestant
 from datagen.reports.specified import specification_record
-from schemas.errors import InputError
-from schemas.merged import open_runs
-from schemas.specification import Specification
-from train.baselines import FIELDS
-from train.dataset import SampleStream
-from train.evaluation.columns import EXTRA
-from workers.bases.candidate_sets import CANDIDATE_SETS
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged import open_runs
+from datagen.schemas.specification import Specification
+from datagen.train.baselines import FIELDS
+from datagen.train.dataset import SampleStream
+from datagen.train.evaluation.columns import EXTRA
+from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
 # Whole scenes with all their candidates: a few of 625 are what a model scores at once.
 SCENES_PER_BATCH = 8

@@ -10,11 +10,11 @@ import numpy as np
 from datagen import __version__
 from datagen.evaluating.contestants import Contestant
 from datagen.evaluating.places import Place
-from schemas.errors import InputError
-from train.evaluation import paper
-from train.evaluation.bootstrap import LEVEL
-from train.evaluation.columns import Columns, Gathered
-from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation import paper
+from datagen.train.evaluation.bootstrap import LEVEL
+from datagen.train.evaluation.columns import Columns, Gathered
+from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
 
 UNSEEN, SEEN = "unseen", "seen"
 

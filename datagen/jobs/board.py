@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from cluster.tally import End, JobSummary, Tally
-from cluster.watch import Standing, Wish
-from schemas.errors import InputError
-from schemas.jobs import JobEnd, JobRecord, Jobs, JobState
-from schemas.record_files import now
+from datagen.cluster.tally import End, JobSummary, Tally
+from datagen.cluster.watch import Standing, Wish
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState
+from datagen.schemas.record_files import now
 
 
 class JobBoard:

@@ -10,16 +10,16 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
-from cluster.private_folder import write_private
-from cluster.ray_head import ensure_head, head_token
-from cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
+from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
+from datagen.cluster.private_folder import write_private
+from datagen.cluster.ray_head import ensure_head, head_token
+from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
 from datagen.jobs.job import JOBS_API, SUBMISSION
 from datagen.jobs.options import Placing
-from schemas.errors import InputError
-from schemas.jobs import new_job_id
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import new_job_id
 
 _BEGUN_WITHIN_S = 60.0
 _LOOK_S = 0.3

@@ -12,15 +12,15 @@ from datagen.jobs.job import JobPlan, Work, carry_out
 from datagen.jobs.options import Placing, absolute_place, absolute_source
 from datagen.remaking.shards import open_origin
 from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import different_fields
+from datagen.schemas.run import Run
+from datagen.schemas.specification import Specification
+from datagen.schemas.storage import Storage
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.specify import label_engines, scene_engines
-from schemas.errors import InputError
-from schemas.record_files import different_fields
-from schemas.run import Run
-from schemas.specification import Specification
-from schemas.storage import Storage
-from workers.labels import load_label_source
-from workers.robots import gripper_of
+from datagen.workers.labels import load_label_source
+from datagen.workers.robots import gripper_of
 
 
 def source_words(given: Sources) -> list[str]:

@@ -11,32 +11,32 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
-from cluster.attempt import run_attempt
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.executor import Executor
-from cluster.fitness import refuse_unfit_machines
-from cluster.guard import notes_of_a_job
-from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy, too_many_quarantined
-from cluster.progress import JobProgress
-from cluster.ray_cluster import RaySettings
-from cluster.ray_executor import RayExecutor, ray_executor
-from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary, Tally, no_work
-from cluster.task import ShardTask
-from cluster.watch import Watch
+from datagen.cluster.attempt import run_attempt
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.executor import Executor
+from datagen.cluster.fitness import refuse_unfit_machines
+from datagen.cluster.guard import notes_of_a_job
+from datagen.cluster.inprocess import InProcessExecutor
+from datagen.cluster.policy import Policy, too_many_quarantined
+from datagen.cluster.progress import JobProgress
+from datagen.cluster.ray_cluster import RaySettings
+from datagen.cluster.ray_executor import RayExecutor, ray_executor
+from datagen.cluster.stop import StopRequest, stop_on_signals
+from datagen.cluster.tally import JobSummary, Tally, no_work
+from datagen.cluster.task import ShardTask
+from datagen.cluster.watch import Watch
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing
-from schemas.errors import InputError, one_line
-from schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
-from schemas.progress import Progress
-from schemas.record_files import now
-from schemas.run import Run
-from schemas.sealing import seal
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError, one_line
+from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
+from datagen.schemas.progress import Progress
+from datagen.schemas.record_files import now
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import Storage
 
 # Set for the driver of a detached job: its name at the Jobs API, and where that listens.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"

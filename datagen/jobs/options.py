@@ -11,11 +11,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from cluster.ray_cluster import refuse_unusable
+from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.console.command_lines import resumable, words_of
 from datagen.console.whole_number import WHOLE_NUMBER
-from schemas.errors import InputError, refuse_not_utf8
-from schemas.progress import Progress
+from datagen.schemas.errors import InputError, refuse_not_utf8
+from datagen.schemas.progress import Progress
 
 DEFAULT_SHARE = 0.01
 _DETACH = (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.console.printing import counted, seconds
-from schemas.jobs import Job, Jobs
-from schemas.storage import Storage
+from datagen.schemas.jobs import Job, Jobs
+from datagen.schemas.storage import Storage
 
 
 def jobs_report(place: Storage) -> list[dict[str, Any]]:

@@ -7,30 +7,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.guard import Meter
-from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy
-from cluster.progress import JobProgress
-from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary, no_work
-from cluster.task import Product
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter
+from datagen.cluster.inprocess import InProcessExecutor
+from datagen.cluster.policy import Policy
+from datagen.cluster.progress import JobProgress
+from datagen.cluster.stop import StopRequest, stop_on_signals
+from datagen.cluster.tally import JobSummary, no_work
+from datagen.cluster.task import Product
 from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.progress import Progress
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
+from datagen.schemas.root_records import publish, refuse_foreign
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Merged
+from datagen.schemas.sealing import seal
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.specification import Specification
+from datagen.schemas.storage import Storage
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.stored_scenes import StoredScenes, specify_again
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.progress import Progress
-from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.root_records import publish, refuse_foreign
-from schemas.run import Run
-from schemas.run_records import Merged
-from schemas.sealing import seal
-from schemas.shard_ranges import ShardRanges
-from schemas.specification import Specification
-from schemas.storage import Storage
-from workers.labels import load_label_source
+from datagen.workers.labels import load_label_source
 
 
 @dataclass

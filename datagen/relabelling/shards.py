@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from cluster.attempt import ends_job
-from cluster.guard import Meter, this_host, utc_now
-from cluster.task import Product
-from schemas.cost import StageClock
-from schemas.identity import sample_ids
-from schemas.keys import shard_folder
-from schemas.run import Run
-from schemas.run_records import Commit, FileEntry
-from schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
-from schemas.shard_reading import read_committed
-from workers.labels import heuristic as formula
+from datagen.cluster.attempt import ends_job
+from datagen.cluster.guard import Meter, this_host, utc_now
+from datagen.cluster.task import Product
+from datagen.schemas.cost import StageClock
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, FileEntry
+from datagen.schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
+from datagen.schemas.shard_reading import read_committed
+from datagen.workers.labels import heuristic as formula
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from datagen.console.printing import print_json, print_lines, print_rows
 from datagen.remaking.shards import Origin, remade_files, remake
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
-from workers.run_shard import ShardResult
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
+from datagen.workers.run_shard import ShardResult
 
 
 class ShardFailed(Exception):

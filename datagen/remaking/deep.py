@@ -21,11 +21,11 @@ from datagen.remaking.stages import (
     beyond_tolerance,
     compare_stages,
 )
-from schemas.checking.finding import Finding
-from schemas.errors import InputError
-from schemas.keys import shard_folder
-from schemas.run import Run
-from schemas.scene_rows import read_scenes
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
 
 _MEND = "Trust neither it nor its neighbours: find out what made it"
 # Candidates of a drawn scene that are labelled where a label is a plan or a trial.

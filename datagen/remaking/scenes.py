@@ -9,20 +9,20 @@ from importlib.metadata import PackageNotFoundError
 
 import numpy as np
 
-from cluster.guard import this_host
+from datagen.cluster.guard import this_host
 from datagen.remaking.shards import Origin, source_of
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.run import Run
 from datagen.specifying.specify import label_engines, scene_engines
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.fields import SceneRows
-from schemas.run import Run
-from workers.bases.candidates import Candidates
-from workers.labels import load_label_source
-from workers.run_shard import Columns, candidate_columns, scene_row
-from workers.scenes.draw import draw_scene
-from workers.scenes.recall import recall_candidates, recall_scene
-from workers.scenes.scene import SettledScene
-from workers.world import World, assemble_world
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.labels import load_label_source
+from datagen.workers.run_shard import Columns, candidate_columns, scene_row
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.world import World, assemble_world
 
 
 @dataclass(frozen=True, eq=False)

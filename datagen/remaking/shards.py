@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from datagen.remaking.sources import AS_FOUND, Sources
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.scene_rows import read_scenes
-from schemas.shard_files import encode_shard
-from workers.run_shard import ShardResult, run_shard
-from workers.world import World, open_world
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_files import encode_shard
+from datagen.workers.run_shard import ShardResult, run_shard
+from datagen.workers.world import World, open_world
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.fields import Field, RecordSchema, SceneRows
-from schemas.specification import Specification
-from workers.labels.heuristic import heuristic
+from datagen.schemas.fields import Field, RecordSchema, SceneRows
+from datagen.schemas.specification import Specification
+from datagen.workers.labels.heuristic import heuristic
 
 Array = np.ndarray[Any, Any]
 

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import fsum
 
-from schemas.run import Run
-from schemas.run_records import Cost
-from schemas.summaries import Summaries
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Cost
+from datagen.schemas.summaries import Summaries
 
 
 @dataclass

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.outcomes import OUTCOMES
-from workers.bases.candidate_sets import (
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.bases.candidate_sets import (
     DISTANCE_EDGES_M,
     TENTHS,
     VISIBILITY_EDGES,

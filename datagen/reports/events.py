@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from datagen.console.printing import counted
-from schemas.jobs import Jobs
-from schemas.merged import open_runs
-from schemas.quarantine import lifted_records
-from schemas.run import Run
-from schemas.storage import Storage
-from schemas.summaries import Summaries
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.merged import open_runs
+from datagen.schemas.quarantine import lifted_records
+from datagen.schemas.run import Run
+from datagen.schemas.storage import Storage
+from datagen.schemas.summaries import Summaries
 
 _GOOD = ("committed", "superseded")
 

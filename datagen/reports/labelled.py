@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from datagen.reports.agreement import ROWS, Labelled
-from schemas.run import Run
-from schemas.shard_reading import Array, read_committed
+from datagen.schemas.run import Run
+from datagen.schemas.shard_reading import Array, read_committed
 
 _COLUMNS = {
     "sample_scene_index": "scene",

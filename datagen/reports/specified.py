@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from schemas.specification import Specification
+from datagen.schemas.specification import Specification
 
 
 def is_disturbed(spec: Specification) -> bool:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from cluster.policy import Policy
-from schemas.lineage import lineage_summary
-from schemas.merged import open_runs
-from schemas.quarantine import lifted_records
-from schemas.run import Run
-from schemas.run_records import Outcome
-from schemas.sealing import SealedPart, SealedRoot, sealed_root
-from schemas.shard_ranges import ShardRanges
-from schemas.storage import Storage
-from schemas.summaries import Summaries
+from datagen.cluster.policy import Policy
+from datagen.schemas.lineage import lineage_summary
+from datagen.schemas.merged import open_runs
+from datagen.schemas.quarantine import lifted_records
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Outcome
+from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.storage import Storage
+from datagen.schemas.summaries import Summaries
 
 _SHOWN = 20  # causes and stacks
 _GOOD = ("committed", "superseded", "cancelled")

@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from schemas.errors import InputError, choices
-from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
-from workers.registry import SIM_MEND
-from workers.robots import ROBOTS, robot_limits
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
+from datagen.workers.registry import SIM_MEND
+from datagen.workers.robots import ROBOTS, robot_limits
 
 # Label sources that move an arm, and the distributions whose version can move bits of their labels.
 ARM_PACKAGES: dict[str, tuple[str, ...]] = {

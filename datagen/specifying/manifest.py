@@ -6,12 +6,12 @@ import platform
 from importlib.metadata import version
 
 from datagen import __version__
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.record_files import now
+from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.specification import Specification
 from datagen.specifying.arms import arm_versions
-from schemas.fields import SCHEMAS
-from schemas.record_files import now
-from schemas.run_records import Layout, Manifest
-from schemas.specification import Specification
-from workers.labels import load_label_source
+from datagen.workers.labels import load_label_source
 
 _LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 

@@ -10,6 +10,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.run_records import Layout
+from datagen.schemas.specification import Source, Specification
 from datagen.specifying.arms import (
     ARM_PACKAGES,
     arm_versions,
@@ -18,16 +22,12 @@ from datagen.specifying.arms import (
     refuse_unsuited,
     robot_of,
 )
-from schemas.errors import InputError, choices
-from schemas.foreign_files import read_regular
-from schemas.run_records import Layout
-from schemas.specification import Source, Specification
-from workers.houses.house import HouseSource
-from workers.labels import load_label_source
-from workers.objects.model import ObjectSource
-from workers.rendering import RENDERERS, load_renderer
-from workers.scenes import VERSION as SCENES_VERSION
-from workers.settling import SETTLERS, first_settler, load_settler
+from datagen.workers.houses.house import HouseSource
+from datagen.workers.labels import load_label_source
+from datagen.workers.objects.model import ObjectSource
+from datagen.workers.rendering import RENDERERS, load_renderer
+from datagen.workers.scenes import VERSION as SCENES_VERSION
+from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
 Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
 

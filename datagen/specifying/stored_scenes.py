@@ -7,6 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.scene_rows import committed_scenes
+from datagen.schemas.specification import Specification
 from datagen.specifying.arms import ARM_PACKAGES, complete_arm, refuse_unsuited, robot_of
 from datagen.specifying.specify import (
     label_engines,
@@ -16,11 +21,6 @@ from datagen.specifying.specify import (
     scene_engine_names,
     validated,
 )
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.scene_rows import committed_scenes
-from schemas.specification import Specification
 
 # What a configuration may still decide: how stored scenes are labelled.
 _LABEL_SECTIONS = ("arm", "heuristic", "visibility")

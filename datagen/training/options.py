@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
+from datagen.schemas.errors import InputError, choices
 from datagen.specifying.specify import parse_toml, read_toml
-from schemas.errors import InputError, choices
 
 if TYPE_CHECKING:
-    from train.augment import Augmentation
+    from datagen.train.augment import Augmentation
 
 _MEND = "Give a TOML file as docs/training.md shows it"
 
@@ -38,7 +38,7 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     """What `--augment` asks for, by names of effects or in a TOML file, and the same as plain data."""
     if word is None:
         return None, {}
-    from train.augment import Augmentation
+    from datagen.train.augment import Augmentation
 
     kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
     asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}

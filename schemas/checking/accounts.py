@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from schemas.checking.commits import account_finding, odd_cost
-from schemas.checking.finding import Finding, Restore, curable
-from schemas.checking.records import read
-from schemas.ledger import lost_end, start_from_end
-from schemas.quarantine import name_before
-from schemas.record_files import encode_record, now
-from schemas.run import Run
-from schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
+from datagen.schemas.checking.commits import account_finding, odd_cost
+from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.checking.records import read
+from datagen.schemas.ledger import lost_end, start_from_end
+from datagen.schemas.quarantine import name_before
+from datagen.schemas.record_files import encode_record, now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
 
 _GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, at a cost unknown"
 

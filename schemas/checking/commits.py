@@ -7,15 +7,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from schemas.checking.finding import Finding, Restore, curable
-from schemas.checking.records import AnyRecord, Read, compare, read
-from schemas.errors import InputError
-from schemas.keys import commit_copy_key, commit_key
-from schemas.ledger import end_from_commit, end_key, start_from_end, start_key
-from schemas.record_files import decode_record, encode_record
-from schemas.run import Run
-from schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
-from schemas.storage import Storage, StoredFile
+from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.checking.records import AnyRecord, Read, compare, read
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_copy_key, commit_key
+from datagen.schemas.ledger import end_from_commit, end_key, start_from_end, start_key
+from datagen.schemas.record_files import decode_record, encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import AttemptStart, Commit, Cost, LedgerEntry, foreign_field
+from datagen.schemas.storage import Storage, StoredFile
 
 _ROUNDING = 1e-6
 _ROUNDING_S = 1e-3  # of clocks

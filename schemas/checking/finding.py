@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.run import Run
-from schemas.run_records import FileEntry
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FileEntry
 
 # record: a JSON record is damaged, missing, or unlike its copy. account: the ledger does not add up.
 # file: a committed file is missing or has other bytes. rows: what was committed breaks the schema.

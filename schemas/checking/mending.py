@@ -11,21 +11,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
-from schemas.at_once import in_order
-from schemas.checking.finding import Finding, Remake, Reseal, Restore
-from schemas.checking.place import Checked, check_place
-from schemas.checking.roots import open_roots
-from schemas.checking.sealed import SealedSlice, read_root, slices_of
-from schemas.checking.shards import form_of
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.run_records import FileEntry
-from schemas.sealing import SEALED, seal
-from schemas.sealing.contents import read_contents
-from schemas.sealing.metadata import ROOT
-from schemas.shard_files import chunk_key
-from schemas.shard_reading import ShardPlace
-from schemas.storage import Storage, StoredFile
+from datagen.schemas.at_once import in_order
+from datagen.schemas.checking.finding import Finding, Remake, Reseal, Restore
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.roots import open_roots
+from datagen.schemas.checking.sealed import SealedSlice, read_root, slices_of
+from datagen.schemas.checking.shards import form_of
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FileEntry
+from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.sealing.metadata import ROOT
+from datagen.schemas.shard_files import chunk_key
+from datagen.schemas.shard_reading import ShardPlace
+from datagen.schemas.storage import Storage, StoredFile
 
 # Mending a record shows what rests on it: commits, then files, then the sealed store.
 _PASSES = 5

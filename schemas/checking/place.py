@@ -6,17 +6,24 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from schemas.at_once import in_order
-from schemas.checking.accounts import Books, check_quarantine, check_rest
-from schemas.checking.commits import check_account, check_commit
-from schemas.checking.finding import Finding
-from schemas.checking.roots import below, check_notes, check_plans, open_roots
-from schemas.checking.sealed import SealedSlice, SealedTally, check_chunks, check_store, read_root, slices_of
-from schemas.checking.shards import ShardForm, check_shard, form_of
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.run_records import Commit
-from schemas.storage import Storage
+from datagen.schemas.at_once import in_order
+from datagen.schemas.checking.accounts import Books, check_quarantine, check_rest
+from datagen.schemas.checking.commits import check_account, check_commit
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.roots import below, check_notes, check_plans, open_roots
+from datagen.schemas.checking.sealed import (
+    SealedSlice,
+    SealedTally,
+    check_chunks,
+    check_store,
+    read_root,
+    slices_of,
+)
+from datagen.schemas.checking.shards import ShardForm, check_shard, form_of
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.schemas.storage import Storage
 
 _THREADS = 4  # hashing and unpacking leave Python's lock
 _REMOTE_THREADS = 16  # requests wait for each other's answers

@@ -8,10 +8,10 @@ from typing import Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
-from schemas.checking.finding import Finding, Restore, curable
-from schemas.errors import InputError
-from schemas.record_files import MAX_RECORD_BYTES, decode_record, signed_json
-from schemas.storage import Storage
+from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, signed_json
+from datagen.schemas.storage import Storage
 
 Record = TypeVar("Record", bound=BaseModel)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from schemas.checking.finding import Finding, Restore, curable
-from schemas.checking.records import AnyRecord, compare, read, sound
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.lineage import LINEAGE, Lineage
-from schemas.record_files import encode_record
-from schemas.root_records import copy_key
-from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
-from schemas.storage import Storage
+from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.checking.records import AnyRecord, compare, read, sound
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.lineage import LINEAGE, Lineage
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.root_records import copy_key
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
+from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
 _BROKEN_OFF = "Merge the runs again: a merge was broken off, and the next one finishes it"

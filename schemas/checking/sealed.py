@@ -7,17 +7,17 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 
-from schemas.checking.finding import Finding, Reseal, curable
-from schemas.checking.shards import ShardForm, same_json
-from schemas.errors import InputError
-from schemas.keys import shard_folder
-from schemas.record_files import MAX_RECORD_BYTES
-from schemas.run import Run
-from schemas.run_records import Commit
-from schemas.sealing.contents import MOST_SHARDS, Contents, RowsDigest, SealedRun, SealedShard
-from schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
-from schemas.shard_files import TABLES, chunk_key, rows_per_shard
-from schemas.storage import Storage
+from datagen.schemas.checking.finding import Finding, Reseal, curable
+from datagen.schemas.checking.shards import ShardForm, same_json
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.record_files import MAX_RECORD_BYTES
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.schemas.sealing.contents import MOST_SHARDS, Contents, RowsDigest, SealedRun, SealedShard
+from datagen.schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
+from datagen.schemas.shard_files import TABLES, chunk_key, rows_per_shard
+from datagen.schemas.storage import Storage
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from schemas.checking.finding import Finding, Remake, curable
-from schemas.errors import InputError
-from schemas.fields import Field, RecordSchema, Table
-from schemas.identity import sample_ids
-from schemas.keys import commit_key, shard_folder
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.run import Run
-from schemas.run_records import Commit, FileEntry
-from schemas.shard_files import MAX_TEXT_BYTES, TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
-from schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
-from schemas.storage import StoredFile
+from datagen.schemas.checking.finding import Finding, Remake, curable
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field, RecordSchema, Table
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.keys import commit_key, shard_folder
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, FileEntry
+from datagen.schemas.shard_files import (
+    MAX_TEXT_BYTES,
+    TABLES,
+    chunk_key,
+    chunk_rows,
+    group_metadata,
+    rows_per_shard,
+)
+from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
+from datagen.schemas.storage import StoredFile
 
 _WRITTEN_SO = "It was written so: remove the commit and its copy, and `datagen resume` makes it anew"
 # What the checks of a shard's rows need together; every other array is looked at by itself.

@@ -6,19 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.merged import open_runs, wanted
-from schemas.merging.plan import Union, plan_union, refuse_incompatible
-from schemas.merging.resharding import common_layout
-from schemas.merging.writing import Written, begin_union, replace_record, write_union
-from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.root_records import refuse_foreign
-from schemas.run import Run
-from schemas.run_records import Layout, Merged
-from schemas.sealing import SEALED, seal, sealed_metadata
-from schemas.sealing.contents import read_contents
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.merged import open_runs, wanted
+from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
+from datagen.schemas.merging.resharding import common_layout
+from datagen.schemas.merging.writing import Written, begin_union, replace_record, write_union
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
+from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout, Merged
+from datagen.schemas.sealing import SEALED, seal, sealed_metadata
+from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.storage import Storage, open_storage
 
 _ELSEWHERE = "Choose a new --out, and name this one among the runs that are merged"
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.fields import RecordSchema, SceneRows
-from schemas.keys import shard_folder
-from schemas.run import Run
-from schemas.scene_rows import read_scenes
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import RecordSchema, SceneRows
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
 
 
 def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int) -> None:

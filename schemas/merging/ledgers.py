@@ -10,12 +10,12 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from schemas.keys import commit_key
-from schemas.ledger import LOST_CAUSE, end_from_commit, end_key, lost_end, start_key
-from schemas.merging.plan import Holding, Union
-from schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
-from schemas.run_records import AttemptStart, Commit, LedgerEntry
-from schemas.storage import Storage
+from datagen.schemas.keys import commit_key
+from datagen.schemas.ledger import LOST_CAUSE, end_from_commit, end_key, lost_end, start_key
+from datagen.schemas.merging.plan import Holding, Union
+from datagen.schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
+from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
+from datagen.schemas.storage import Storage
 
 SPARE_CAUSE = "merged: this shard is held from another attempt"
 GUESS_CAUSE = f"merged: {LOST_CAUSE}"  # of a guess made here, which gives way to one that was noted

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from schemas.errors import InputError
-from schemas.identity import digest_of
-from schemas.merging.conflicts import refuse_different_rows
-from schemas.merging.resharding import Cut, rank
-from schemas.record_files import different_fields, encode_record
-from schemas.run import Run
-from schemas.run_records import Commit, Cost, Layout, Manifest, Plan
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.schemas.merging.conflicts import refuse_different_rows
+from datagen.schemas.merging.resharding import Cut, rank
+from datagen.schemas.record_files import different_fields, encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, Cost, Layout, Manifest, Plan
 
 # What may differ between runs that merge: they are other samples of the same kind.
 FREE_FIELDS = ("seed", "split", "houses", "objects", "scenes_from")

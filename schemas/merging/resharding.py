@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 
-from schemas.run_records import Cost, Layout
+from datagen.schemas.run_records import Cost, Layout
 
 _PIECE = re.compile(r"(.*)\.cut([0-9]+)")
 _MAX_NAME = 100

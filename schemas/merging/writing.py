@@ -9,20 +9,20 @@ from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, replace
 from itertools import groupby
 
-from schemas.errors import InputError
-from schemas.keys import shard_folder
-from schemas.ledger import end_key, start_key
-from schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
-from schemas.merging.ledgers import UnitedAttempt, united_attempts
-from schemas.merging.plan import Holding, Union
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.root_records import copy_key, publish
-from schemas.run import Run
-from schemas.run_records import Commit, QuarantineRecord
-from schemas.scene_rows import read_shard
-from schemas.shard_files import encode_shard
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.ledger import end_key, start_key
+from datagen.schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
+from datagen.schemas.merging.ledgers import UnitedAttempt, united_attempts
+from datagen.schemas.merging.plan import Holding, Union
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
+from datagen.schemas.root_records import copy_key, publish
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, QuarantineRecord
+from datagen.schemas.scene_rows import read_shard
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage import Storage
 
 Tick = Callable[[], None]
 

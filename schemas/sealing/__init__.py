@@ -7,10 +7,10 @@ shape alone.
 
 from __future__ import annotations
 
-from schemas.sealing.contents import read_contents
-from schemas.sealing.local import seal_folder, unseal_folder
-from schemas.sealing.metadata import SEALED, SealedPart, SealedRoot, sealed_metadata, sealed_root
-from schemas.storage import Storage
+from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.sealing.local import seal_folder, unseal_folder
+from datagen.schemas.sealing.metadata import SEALED, SealedPart, SealedRoot, sealed_metadata, sealed_root
+from datagen.schemas.storage import Storage
 
 __all__ = ["SEALED", "SealedPart", "SealedRoot", "seal", "sealed_metadata", "sealed_root", "unseal"]
 
@@ -28,7 +28,7 @@ def seal(place: Storage) -> str:
         seal_folder(contents, place.folder, metadata)
     else:
         # Loaded here: who works on a disk does not wait for the client of object stores.
-        from schemas.sealing.remote import seal_prefix
+        from datagen.schemas.sealing.remote import seal_prefix
 
         seal_prefix(contents, metadata)
     return f"{place.url}/{SEALED}"
@@ -39,6 +39,6 @@ def unseal(place: Storage) -> None:
     if place.folder is not None:
         unseal_folder(place.folder)
     else:
-        from schemas.sealing.remote import unseal_prefix
+        from datagen.schemas.sealing.remote import unseal_prefix
 
         unseal_prefix(place)

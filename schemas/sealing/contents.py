@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from hashlib import sha256
 
-from schemas.errors import InputError
-from schemas.fields import Field, RecordSchema, Table
-from schemas.keys import part_folder, shard_folder
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.run_records import Commit, Layout
-from schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
-from schemas.shard_ranges import ShardRanges
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field, RecordSchema, Table
+from datagen.schemas.keys import part_folder, shard_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, Layout
+from datagen.schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.storage import Storage
 
 # Far above any run that can be made; what asks for more was made up.
 MOST_SHARDS = 10_000_000

@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from schemas.errors import InputError
-from schemas.fields import Field
-from schemas.sealing.contents import Contents
-from schemas.sealing.metadata import SEALED
-from schemas.shard_files import TABLES
-from schemas.storage import storage_error
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field
+from datagen.schemas.sealing.contents import Contents
+from datagen.schemas.sealing.metadata import SEALED
+from datagen.schemas.shard_files import TABLES
+from datagen.schemas.storage import storage_error
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2

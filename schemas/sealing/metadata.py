@@ -11,10 +11,10 @@ from pydantic import BaseModel, ValidationError
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
-from schemas.record_files import MAX_RECORD_BYTES
-from schemas.sealing.contents import Contents, SealedRun
-from schemas.shard_files import TABLES, root_attributes, zarr_metadata
-from schemas.storage import Storage
+from datagen.schemas.record_files import MAX_RECORD_BYTES
+from datagen.schemas.sealing.contents import Contents, SealedRun
+from datagen.schemas.shard_files import TABLES, root_attributes, zarr_metadata
+from datagen.schemas.storage import Storage
 
 SEALED = "data.zarr"
 ROOT = "zarr.json"

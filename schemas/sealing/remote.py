@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from schemas.fields import Field
-from schemas.sealing.contents import Contents
-from schemas.sealing.metadata import ROOT, SEALED, sealed_root
-from schemas.shard_files import TABLES
-from schemas.storage import Storage
+from datagen.schemas.fields import Field
+from datagen.schemas.sealing.contents import Contents
+from datagen.schemas.sealing.metadata import ROOT, SEALED, sealed_root
+from datagen.schemas.shard_files import TABLES
+from datagen.schemas.storage import Storage
 
 
 def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:

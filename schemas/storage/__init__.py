@@ -15,14 +15,14 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from schemas.at_once import in_order
-from schemas.errors import InputError, refuse_not_utf8
-from schemas.storage.errors import FileTooLarge, storage_error
-from schemas.storage.local_files import LocalFiles
-from schemas.storage.stored_file import StoredFile
+from datagen.schemas.at_once import in_order
+from datagen.schemas.errors import InputError, refuse_not_utf8
+from datagen.schemas.storage.errors import FileTooLarge, storage_error
+from datagen.schemas.storage.local_files import LocalFiles
+from datagen.schemas.storage.stored_file import StoredFile
 
 if TYPE_CHECKING:
-    from schemas.storage.remote_objects import RemoteObjects
+    from datagen.schemas.storage.remote_objects import RemoteObjects
 
 __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 
@@ -207,7 +207,7 @@ def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> 
     scheme, colon, rest = text.partition("://")
     if colon and scheme == "s3":
         # Loaded here: who works on a disk does not wait for the client.
-        from schemas.storage.remote_objects import RemoteObjects
+        from datagen.schemas.storage.remote_objects import RemoteObjects
 
         storage = Storage(RemoteObjects(text))
     elif colon and scheme != "file":

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 # What any write may meet, whatever is written: the machine is at fault, and no shard or program.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -15,8 +15,8 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from schemas.storage.errors import OddFile, storage_error, too_large
-from schemas.storage.stored_file import StoredFile
+from datagen.schemas.storage.errors import OddFile, storage_error, too_large
+from datagen.schemas.storage.stored_file import StoredFile
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Enough to go through a folder, without permission to read it.

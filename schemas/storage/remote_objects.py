@@ -18,10 +18,10 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
-from schemas.errors import InputError
-from schemas.storage.errors import StoreTrouble, store_trouble, too_large
-from schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
-from schemas.storage.stored_file import StoredFile
+from datagen.schemas.errors import InputError
+from datagen.schemas.storage.errors import StoreTrouble, store_trouble, too_large
+from datagen.schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
+from datagen.schemas.storage.stored_file import StoredFile
 
 PATIENCE = 1.5  # timeouts for which a request is repeated, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0

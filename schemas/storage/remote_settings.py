@@ -6,7 +6,7 @@ import os
 import re
 from urllib.parse import urlsplit
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 TIMEOUT_S = 20.0  # silence of the store after which a request is given up
 _TRUE = ("true", "1", "yes", "on")

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from cluster.driver import Order, drive
-from cluster.policy import Policy, Trouble
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary, Tally
-from cluster.task import AttemptReport
-from schemas.run_records import Commit, Cost, Host
-from schemas.shard_ranges import ShardRanges
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.policy import Policy, Trouble
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.run_records import Commit, Cost, Host
+from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Heard, PaperBooks, report_of
 
 # Share of attempts, and how they end. What is silent never ends by itself.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import threading
 from typing import TypeVar
 
-from cluster.driver import Order, drive
-from cluster.policy import Policy
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary
-from cluster.task import AttemptReport
-from schemas.shard_ranges import ShardRanges
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
 
 T = TypeVar("T")

@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from cluster.driver import Order
-from cluster.policy import Trouble
-from cluster.tally import Tally
-from cluster.task import AttemptReport
-from schemas.run_records import Commit, Cost, LedgerEntry
-from schemas.shard_ranges import ShardRanges
+from datagen.cluster.driver import Order
+from datagen.cluster.policy import Trouble
+from datagen.cluster.tally import Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.run_records import Commit, Cost, LedgerEntry
+from datagen.schemas.shard_ranges import ShardRanges
 
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]

@@ -11,17 +11,23 @@ from pathlib import Path
 
 import pytest
 
-from cluster import attempt
-from cluster.attempt import run_attempt
-from cluster.guard import Meter, guarded
-from cluster.task import JobCannotGoOn, ShardTask
-from schemas.keys import commit_copy_key, commit_key, shard_folder
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.specification import CandidateParams, ObservationParams, SceneParams, Source, Specification
+from datagen.cluster import attempt
+from datagen.cluster.attempt import run_attempt
+from datagen.cluster.guard import Meter, guarded
+from datagen.cluster.task import JobCannotGoOn, ShardTask
+from datagen.schemas.keys import commit_copy_key, commit_key, shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.specification import (
+    CandidateParams,
+    ObservationParams,
+    SceneParams,
+    Source,
+    Specification,
+)
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
 from tests.made_runs import check_digests, make_run, small_spec
-from workers.houses import open_houses
-from workers.objects import open_objects
 
 
 def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-import cluster.books
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.policy import Trouble
-from schemas.run import Run
-from schemas.run_records import Cost, LedgerEntry
-from schemas.summaries import index_files, refresh
+import datagen.cluster.books
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.policy import Trouble
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Cost, LedgerEntry
+from datagen.schemas.summaries import index_files, refresh
 from tests.made_runs import make_run, write
 
 TROUBLE = Trouble(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))
@@ -81,8 +81,8 @@ def test_an_index_that_cannot_be_written_keeps_no_job_from_its_end(tmp_path: Pat
 def test_the_index_follows_a_long_job_now_and_then(
     factor: float, left_out: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster.books, "_INDEX_FACTOR", factor)
-    monkeypatch.setattr(cluster.books, "_INDEX_EVERY", 3)
+    monkeypatch.setattr(datagen.cluster.books, "_INDEX_FACTOR", factor)
+    monkeypatch.setattr(datagen.cluster.books, "_INDEX_EVERY", 3)
     run = make_run(tmp_path / "run", shards=())
     books, indexed = RunBooks(run), list[bool]()
     for shard in range(3):

@@ -19,8 +19,8 @@ import psutil
 import pytest
 
 from datagen import cli
-from schemas.errors import InputError
-from schemas.run import Run
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
 from tests.small_runs import CONFIG
 
 SCRIPT = Path(__file__).resolve().parents[2] / "cluster" / "deploy" / "slurm" / "datagen.sbatch"

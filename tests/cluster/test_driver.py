@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cluster.driver import Order, drive
-from cluster.open_shards import OpenShards
-from cluster.policy import Policy
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary, Tally
-from cluster.task import AttemptReport
-from schemas.errors import InputError
-from schemas.run_records import Commit, Cost, Host, LedgerEntry
-from schemas.shard_ranges import ShardRanges
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.open_shards import OpenShards
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.errors import InputError
+from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry
+from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.bad_cluster import simulate
 from tests.cluster.several_drivers import drive_together, waste
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor, report_of
@@ -411,7 +411,7 @@ def test_drivers_that_begin_together_waste_little(
     drivers: int, shards: int, attempts: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = np.random.default_rng(0)
-    monkeypatch.setattr("cluster.driver.secrets.token_hex", lambda n: names.bytes(n).hex())
+    monkeypatch.setattr("datagen.cluster.driver.secrets.token_hex", lambda n: names.bytes(n).hex())
     wasted = []
     for _ in range(12):
         summaries = drive_together(drivers, shards)

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from cluster.fitness import Fitness, look_at, refuse_unfit_machines, versions_of
-from cluster.task import ShardTask
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.storage import open_storage
+from datagen.cluster.fitness import Fitness, look_at, refuse_unfit_machines, versions_of
+from datagen.cluster.task import ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
 from tests.small_runs import files_of, make_small_run
 
 Ask = Callable[..., dict[str, Any]]

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from cluster.books import RunBooks
-from cluster.driver import Order, drive
-from cluster.guard import Meter, Note, guarded, obituary, read_note
-from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy
-from cluster.stop import StopRequest, stop_on_signals
-from cluster.tally import JobSummary
-from cluster.task import JobCannotGoOn, Product
-from schemas.run import Run
+from datagen.cluster.books import RunBooks
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter, Note, guarded, obituary, read_note
+from datagen.cluster.inprocess import InProcessExecutor
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest, stop_on_signals
+from datagen.cluster.tally import JobSummary
+from datagen.cluster.task import JobCannotGoOn, Product
+from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import make_run, write

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.policy import (
+from datagen.cluster.policy import (
     Durations,
     Policy,
     Trouble,
@@ -20,8 +20,8 @@ from cluster.policy import (
     too_many_quarantined,
     window,
 )
-from cluster.task import AttemptReport
-from schemas.run_records import Outcome
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.run_records import Outcome
 
 POLICY = Policy()
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.private_folder import OWNER, RAY, private_folder
+from datagen.cluster.private_folder import OWNER, RAY, private_folder
 from tests.other_user import NOBODY, as_another_user, needs_root
 
 # Owns a folder with a process in it, says both, and waits to be killed.
 OWNER_PROGRAM = f"""
 import os, subprocess, sys
-from cluster.private_folder import private_folder
+from datagen.cluster.private_folder import private_folder
 with private_folder() as folder:
     child = subprocess.Popen(["sleep", "inf"], env=os.environ | {{"{OWNER}": str(folder)}})
     print(folder, child.pid, flush=True)

@@ -7,10 +7,10 @@ import json
 
 from rich.console import Console
 
-from cluster.progress import JobProgress
-from cluster.tally import Tally
-from cluster.task import AttemptReport
-from schemas.progress import Progress
+from datagen.cluster.progress import JobProgress
+from datagen.cluster.tally import Tally
+from datagen.cluster.task import AttemptReport
+from datagen.schemas.progress import Progress
 from tests.cluster.simulated import FakeClock
 
 CRASH = AttemptReport("a", 5, "crashed", cause="Fatal Python error: Segmentation fault")

@@ -12,11 +12,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster import ray_cluster as ray_cluster_module
-from cluster.private_folder import private_folder
-from cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
-from cluster.ray_settings import head_arguments, head_environment, new_token
-from schemas.errors import InputError
+from datagen.cluster import ray_cluster as ray_cluster_module
+from datagen.cluster.private_folder import private_folder
+from datagen.cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
+from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
+from datagen.schemas.errors import InputError
 from tests.other_user import as_another_user, needs_root, traces_of
 
 LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
@@ -131,7 +131,7 @@ def test_another_user_can_neither_enter_nor_read_nor_speak_to_a_local_cluster() 
 def test_the_next_cluster_removes_what_a_killed_driver_left() -> None:
     program = """
 import ray, sys
-from cluster.ray_cluster import RaySettings, ray_cluster
+from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 with ray_cluster(RaySettings(workers=1)) as ray:
     print(ray._private.worker._global_node.temp_dir, flush=True)
     sys.stdin.read()

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cluster import ray_head
-from cluster.private_folder import new_folder
-from cluster.ray_head import ensure_head, running_head, stop_head
-from schemas.errors import InputError
+from datagen.cluster import ray_head
+from datagen.cluster.private_folder import new_folder
+from datagen.cluster.ray_head import ensure_head, running_head, stop_head
+from datagen.schemas.errors import InputError
 
 
 @pytest.fixture

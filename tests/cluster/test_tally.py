@@ -6,7 +6,7 @@ from functools import reduce
 
 import pytest
 
-from cluster.tally import End, JobSummary, Tally, no_work
+from datagen.cluster.tally import End, JobSummary, Tally, no_work
 
 
 def summary(end: End, cause: str = "", committed: int = 1) -> JobSummary:

@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import pytest
 
-from cluster.driver import drive
-from cluster.policy import Policy
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary
-from cluster.watch import Standing, Watch, Wish
+from datagen.cluster.driver import drive
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary
+from datagen.cluster.watch import Standing, Watch, Wish
 from tests.cluster.simulated import FakeClock, Heard, PaperBooks, SimulatedExecutor
 
 SHARD_S = 5.0

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from schemas.keys import commit_copy_key, commit_key
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.scene_rows import read_shard
-from schemas.shard_files import encode_shard
+from datagen.schemas.keys import commit_copy_key, commit_key
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_shard
+from datagen.schemas.shard_files import encode_shard
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

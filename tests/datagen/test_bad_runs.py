@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from datagen import cli
-from schemas.record_files import signed_json
-from schemas.run import Run
+from datagen.schemas.record_files import signed_json
+from datagen.schemas.run import Run
 from tests.made_runs import check_digests
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, files_of, make_small_run, submit_arguments

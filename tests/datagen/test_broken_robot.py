@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.run import Run
+from datagen.schemas.run import Run
 from tests.refusals import without_phases
 from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, make_small_run
@@ -20,7 +20,7 @@ pytestmark = needs_sim
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
     """Of a process that finds a ManiSkill whose Panda is cut off in the middle."""
-    from workers.robots.description import robots_folder
+    from datagen.workers.robots.description import robots_folder
 
     robots = tmp_path / "site" / "mani_skill" / "assets" / "robots"
     (robots / "panda").mkdir(parents=True)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.run import Run
-from schemas.specification import CandidateParams, HeuristicParams, Specification
+from datagen.schemas.run import Run
+from datagen.schemas.specification import CandidateParams, HeuristicParams, Specification
+from datagen.train.reader import SampleReader
+from datagen.workers.labels.heuristic import heuristic
 from tests.made_runs import make_run, small_spec
 from tests.refusals import refused
 from tests.small_runs import arrays_of, json_of, submit_arguments
 from tests.train.conftest import heuristic_run, shared_folder, sim_run  # noqa: F401 (fixtures)
-from train.reader import SampleReader
-from workers.labels.heuristic import heuristic
 
 N = 300
 QUICK = ("--bootstrap", "50")

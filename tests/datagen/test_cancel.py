@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from schemas.jobs import Job, Jobs
-from schemas.storage import open_storage
+from datagen.schemas.jobs import Job, Jobs
+from datagen.schemas.storage import open_storage
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, json_of, submit_arguments
 
@@ -115,7 +115,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         before = (datetime.now(UTC) - timedelta(minutes=5)).isoformat()
         assert job.state is not None
         Jobs(work.place).tell(job.state.model_copy(update={"updated": before}))
-        monkeypatch.setattr("datagen.cancel._GIVE_UP_S", 1.0)
+        monkeypatch.setattr("datagen.commands.cancel._GIVE_UP_S", 1.0)
         assert work.job().health() == "live"
         assert cli.run(["cancel", str(run)]) == 1
         told = capsys.readouterr()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from datagen import __version__, cli
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 
 class Box(BaseModel):

@@ -12,8 +12,8 @@ from datagen import cli, doctor
 from datagen.doctor import arm, engines, host
 from datagen.doctor.check import Check, probe
 from datagen.doctor.host import ENOUGH_DISK_BYTES
-from workers.registry import SIM_MEND
-from workers.robots import ROBOTS
+from datagen.workers.registry import SIM_MEND
+from datagen.workers.robots import ROBOTS
 
 
 def test_a_probe_survives_a_crash() -> None:

@@ -14,11 +14,11 @@ import torch
 
 from datagen import cli
 from datagen.evaluating.contestants import open_models
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 from tests.made_runs import make_run
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, json_of
-from train.models import build_model
-from train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 
 pytestmark = needs_sim
 

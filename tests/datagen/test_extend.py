@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.extend import shares
-from schemas.merged import open_runs
+from datagen.commands.extend import shares
+from datagen.schemas.merged import open_runs
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,

@@ -16,16 +16,16 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.reports.accounts import account_for
-from schemas.errors import InputError
-from schemas.garbage import find_garbage, sweep
-from schemas.jobs import JobRecord, Jobs, new_job_id
-from schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
-from schemas.merged import open_runs
-from schemas.record_files import now
-from schemas.run import Run
-from schemas.sealing import seal
-from schemas.storage import Storage, StoredFile, open_storage
-from schemas.summaries import index_files, refresh
+from datagen.schemas.errors import InputError
+from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
+from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.record_files import now
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import Storage, StoredFile, open_storage
+from datagen.schemas.summaries import index_files, refresh
 from tests.made_runs import attempt, check_digests, files_of, make_run, small_spec, write
 from tests.refusals import refused
 from tests.small_runs import json_of

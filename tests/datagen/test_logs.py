@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from datagen import cli
-from schemas.quarantine import lift_quarantine
-from schemas.run import Run
-from schemas.run_records import LedgerEntry, Outcome, QuarantineRecord
+from datagen.schemas.quarantine import lift_quarantine
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import LedgerEntry, Outcome, QuarantineRecord
 from tests.made_runs import make_run
 from tests.refusals import refused
 from tests.small_runs import json_of

@@ -11,12 +11,12 @@ import pytest
 import zarr
 
 from datagen import cli
-from schemas.merged import open_runs
-from schemas.run import Run
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
 from tests.refusals import refused
 from tests.small_runs import arrays_of, assert_equal_runs, files_of, json_of, make_small_run
-from train.reader import SampleReader
 
 N = 48  # 6 scenes
 

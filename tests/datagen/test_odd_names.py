@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from schemas.errors import InputError
-from schemas.jobs import Jobs
-from schemas.record_files import decode_record, encode_record
-from schemas.run_records import LedgerEntry
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.record_files import decode_record, encode_record
+from datagen.schemas.run_records import LedgerEntry
+from datagen.schemas.storage import open_storage
 from tests.made_runs import files_of, make_run
 from tests.refusals import refused
 from tests.small_runs import submit_arguments

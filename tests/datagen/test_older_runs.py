@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from datagen import cli
-from schemas.identity import digest_of
-from schemas.record_files import signed_json
-from schemas.run import Run
+from datagen.schemas.identity import digest_of
+from datagen.schemas.record_files import signed_json
+from datagen.schemas.run import Run
 from tests.refusals import refused
 from tests.small_runs import HERE, PER_SCENE, arrays_of, assert_equal_runs, make_small_run
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.keys import commit_key, shard_folder
-from schemas.merged import open_runs
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.run_records import Commit
+from datagen.schemas.keys import commit_key, shard_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit
+from datagen.train.opening import open_parts
 from tests.datagen.forged import forge
 from tests.made_runs import check_digests
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, files_of, json_of, make_small_run
-from train.opening import open_parts
 
 SCENES = 6
 N = SCENES * PER_SCENE

@@ -11,14 +11,14 @@ import pytest
 import zarr
 
 from datagen import cli
-from schemas.checking.mending import mend_place
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.record_files import encode_record, signed_json
-from schemas.run import Run
-from schemas.run_records import Merged
-from schemas.sealing import seal
-from schemas.storage import open_storage
+from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.record_files import encode_record, signed_json
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Merged
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, remake
 from tests.made_runs import files_of, make_run, small_spec
 

@@ -14,17 +14,17 @@ import pytest
 from PIL import Image
 
 from datagen import cli
+from datagen.commands.replay import find_sample
 from datagen.remaking.alone import ShardFailed
 from datagen.remaking.stages import STAGES
-from datagen.replay import find_sample
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
+from datagen.workers.labels import distance_visibility
 from tests.datagen.forged import forge
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, arrays_of, files_of, json_of, make_small_run
-from workers.labels import distance_visibility
 
 SCENES = 4
 N = SCENES * PER_SCENE - 3  # the last scene is cut
@@ -92,7 +92,7 @@ def test_ids_that_name_nothing_or_more_are_refused(
     last = id_of(make_small_run(tmp_path / "longer", N + 3), N)
     with pytest.raises(InputError, match="no sample"):
         find_sample([beyond], last)
-    monkeypatch.setattr("datagen.replay._PREFIX_AT_LEAST", 1)
+    monkeypatch.setattr("datagen.commands.replay._PREFIX_AT_LEAST", 1)
     with pytest.raises(InputError, match=r"begins more than one id .*Give more digits"):
         find_sample([beyond], id_of(source, 0)[:1])
 
@@ -265,7 +265,7 @@ def test_a_batch_that_breaks_its_schema_keeps_its_traceback_too(
 def test_the_command_ends_with_1_and_the_traceback(given_up: Path) -> None:
     code = (
         "import sys; from dataclasses import replace; from datagen import cli;"
-        "from workers.labels import distance_visibility as d\n"
+        "from datagen.workers.labels import distance_visibility as d\n"
         "def broken(*_): raise ZeroDivisionError('a defect')\n"
         "d.HEURISTIC = replace(d.HEURISTIC, label=broken)\n"
         "sys.exit(cli.run(sys.argv[1:]))"

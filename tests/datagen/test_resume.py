@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
+import datagen.commands.submit
 import datagen.jobs.going_on
-import datagen.submit
 from datagen import cli
-from schemas.merged import open_runs
-from schemas.quarantine import lifted_records
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.run_records import Manifest, QuarantineRecord
+from datagen.schemas.merged import open_runs
+from datagen.schemas.quarantine import lifted_records
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Manifest, QuarantineRecord
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,
@@ -150,7 +150,7 @@ def test_an_early_ctrl_c_says_how_to_go_on(
 ) -> None:
     run = tmp_path / "run"
     with monkeypatch.context() as patched:  # while the first scene is drawn
-        patched.setattr(datagen.submit, "draw_scene", interrupting)
+        patched.setattr(datagen.commands.submit, "draw_scene", interrupting)
         again = the_command(capsys, lambda: cli.run(submit_arguments(run, N)))
     assert again[:2] == ["submit", "heuristic"] and not run.exists()
     with monkeypatch.context() as patched:  # while workers start: the run is there

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from schemas.jobs import Jobs
-from schemas.keys import commit_key
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
-from schemas.storage import open_storage
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.keys import commit_key
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
+from datagen.schemas.storage import open_storage
 from tests.small_runs import CONFIG, HERE, PER_SCENE, json_of, make_small_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.run import Run
-from schemas.storage import open_storage
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
+from datagen.train.dataset import SampleStream
+from datagen.train.reader import SampleReader
 from tests.faults.s3_campaign import sealed_arrays
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
-from train.dataset import SampleStream
-from train.reader import SampleReader
 
 
 @pytest.fixture

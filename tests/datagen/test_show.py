@@ -11,14 +11,14 @@ from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
 from datagen.drawing.outcome_colours import LOOKS
-from schemas.outcomes import OUTCOMES
-from schemas.run import Run
-from schemas.scene_rows import read_scene
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
+from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.world import open_world
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, make_small_run
-from workers.scenes.recall import recall_candidates, recall_scene
-from workers.world import open_world
 
 pytestmark = needs_sim
 

@@ -19,9 +19,9 @@ import zarr
 from PIL import Image
 
 from datagen import cli
-from schemas.fields import sized_schema
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
+from datagen.schemas.fields import sized_schema
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
 from tests.refusals import refused
 from tests.small_runs import (
     PER_SCENE,

@@ -15,14 +15,14 @@ import pytest
 import torch
 
 from datagen import cli
+from datagen.schemas.errors import InputError
+from datagen.train.training.checkpoints import load_model, read_checkpoint
+from datagen.train.training.devices import choose_device
 from datagen.training.options import model_sizes, read_augmentation, share_cores
-from schemas.errors import InputError
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.train.conftest import heuristic_run, shared_folder, sim_run
 from tests.train.training.small import TINY, equal
-from train.training.checkpoints import load_model, read_checkpoint
-from train.training.devices import choose_device
 
 __all__ = ["heuristic_run", "shared_folder", "sim_run"]
 HERE = ("--threads", "1", "--device", "cpu", "--batch-scenes", "4")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.run import Run
-from schemas.run_records import LedgerEntry
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import LedgerEntry
 from tests.datagen.forged import forge
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, files_of

@@ -16,19 +16,19 @@ from math import fsum, isclose
 from pathlib import Path
 from typing import Any
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.guard import Meter, this_host
-from cluster.open_shards import OpenShards
-from cluster.policy import Policy
-from cluster.stop import StopRequest
-from cluster.task import Product
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter, this_host
+from datagen.cluster.open_shards import OpenShards
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.task import Product
 from datagen.reports.accounts import account_for
-from schemas.cost import StageClock
-from schemas.keys import commit_key
-from schemas.run import Run
-from schemas.sealing import seal
-from schemas.shard_files import encode_shard
+from datagen.schemas.cost import StageClock
+from datagen.schemas.keys import commit_key
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
+from datagen.schemas.shard_files import encode_shard
 from tests.cluster.simulated import Heard
 from tests.faults.processes import ProcessExecutor
 from tests.made_runs import check_digests, commit_of, make_run, rows_of
@@ -77,7 +77,7 @@ def count(counted: str, word: str, attempt: str) -> None:
 
 
 def make_counted(task: CountedRows, meter: Meter) -> Product:
-    """Draw, write and commit the shard, as `cluster.attempt` does with real ones."""
+    """Draw, write and commit the shard, as `datagen.cluster.attempt` does with real ones."""
     run, clock = Run.open(task.run), StageClock()
     count(task.counted, "begins", task.attempt)
     run.ledger.start(task.attempt, task.shard)

@@ -25,9 +25,9 @@ from typing import Any, BinaryIO
 import numpy.random  # noqa: F401 - loaded once, not in every child
 from zarr.core.sync import cleanup_resources
 
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS, sized_schema
-from schemas.shard_files import group_metadata
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS, sized_schema
+from datagen.schemas.shard_files import group_metadata
 from tests.faults.crash_points_forking import REFUSED, Files, bytes_of, copy_tree, files_below, in_child, must
 from tests.faults.crash_points_operations import (
     LAYOUT,

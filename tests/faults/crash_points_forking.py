@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 REFUSED, DEFECT = 3, 4
 Files = Mapping[str, bytes]

@@ -9,25 +9,25 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
-from cluster.books import close_lost_attempts, refresh_index
-from datagen.gc import remove
+from datagen.cluster.books import close_lost_attempts, refresh_index
+from datagen.commands.gc import remove
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from schemas.checking.mending import mend_place
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS, RecordSchema
-from schemas.garbage import find_garbage
-from schemas.keys import MERGED, part_folder
-from schemas.merged import open_runs
-from schemas.merging import carry_out, plan_merge
-from schemas.record_files import encode_record
-from schemas.root_records import publish
-from schemas.run import Run
-from schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
-from schemas.sealing import SEALED, seal, unseal
-from schemas.shard_files import encode_shard
-from schemas.storage import open_storage
-from schemas.summaries import Summaries
+from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS, RecordSchema
+from datagen.schemas.garbage import find_garbage
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.root_records import publish
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
+from datagen.schemas.sealing import SEALED, seal, unseal
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage import open_storage
+from datagen.schemas.summaries import Summaries
 from tests.made_runs import attempt, check_digests, make_run, manifest_of, rows_of, small_spec, write
 
 # A shard of few files, so that every call of every operation can be tried. All that these tests and the

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.checking.finding import Finding
-from schemas.checking.mending import Mended, mend_place
-from schemas.checking.place import Checked, check_place
-from schemas.fields import SCHEMAS
-from schemas.run import Run
-from schemas.run_records import LedgerEntry
-from schemas.sealing import seal
-from schemas.shard_files import encode_shard
-from schemas.storage import open_storage
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.mending import Mended, mend_place
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import LedgerEntry
+from datagen.schemas.sealing import seal
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import make_run, now, rows_of
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from schemas.run import Run
+from datagen.schemas.run import Run
 from tests.faults.counted import SAMPLES_PER_SHARD, all_at_once, await_ends, check_run, start_driver
 from tests.made_runs import make_run
 

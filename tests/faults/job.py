@@ -10,17 +10,17 @@ import sys
 import time
 from dataclasses import dataclass
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.guard import Meter, notes_of_a_job
-from cluster.policy import Policy
-from cluster.progress import JobProgress
-from cluster.ray_cluster import RaySettings
-from cluster.ray_executor import ray_executor
-from cluster.stop import StopRequest, stop_on_signals
-from cluster.task import Product
-from schemas.progress import Progress
-from schemas.run import Run
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter, notes_of_a_job
+from datagen.cluster.policy import Policy
+from datagen.cluster.progress import JobProgress
+from datagen.cluster.ray_cluster import RaySettings
+from datagen.cluster.ray_executor import ray_executor
+from datagen.cluster.stop import StopRequest, stop_on_signals
+from datagen.cluster.task import Product
+from datagen.schemas.progress import Progress
+from datagen.schemas.run import Run
 from tests.made_runs import write
 
 

@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from schemas.run import Run
+from datagen.schemas.run import Run
 from tests.faults.counted import SAMPLES_PER_SHARD, await_ends, check_run, executions, start_driver
 from tests.made_runs import make_run
 

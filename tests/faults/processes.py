@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
-from cluster.guard import Meter, guarded, obituary, read_note
-from cluster.task import AttemptReport, Product, Task
+from datagen.cluster.guard import Meter, guarded, obituary, read_note
+from datagen.cluster.task import AttemptReport, Product, Task
 
 T = TypeVar("T", bound=Task)
 # Forked from a driver that has one thread and has loaded everything: a new worker takes milliseconds. (A

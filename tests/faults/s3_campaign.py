@@ -11,19 +11,19 @@ import zarr
 from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.guard import Meter
-from cluster.inprocess import InProcessExecutor
-from cluster.policy import Policy
-from cluster.stop import StopRequest
-from cluster.task import Product
-from schemas.errors import InputError
-from schemas.keys import commit_copy_key, shard_folder
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.sealing import seal
-from schemas.storage import open_storage
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import Meter
+from datagen.cluster.inprocess import InProcessExecutor
+from datagen.cluster.policy import Policy
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.task import Product
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_copy_key, shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
 from tests.cluster.simulated import Heard
 from tests.made_runs import check_digests, make_run, manifest_of, small_spec, write
 from tests.s3_servers import Faults

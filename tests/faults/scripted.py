@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.guard import Meter
-from cluster.task import JobCannotGoOn, Product
-from schemas.fields import sized_schema
-from schemas.run_records import Layout
+from datagen.cluster.guard import Meter
+from datagen.cluster.task import JobCannotGoOn, Product
+from datagen.schemas.fields import sized_schema
+from datagen.schemas.run_records import Layout
 from tests.made_runs import small_spec, tables_of
 
 

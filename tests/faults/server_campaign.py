@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import psutil
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.guard import notes_of_a_job
-from cluster.policy import Policy
-from cluster.ray_cluster import RaySettings
-from cluster.ray_executor import ray_executor
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary, Tally
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.guard import notes_of_a_job
+from datagen.cluster.policy import Policy
+from datagen.cluster.ray_cluster import RaySettings
+from datagen.cluster.ray_executor import ray_executor
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary, Tally
 from datagen.reports.accounts import account_for
-from schemas.run import Run
-from schemas.sealing import seal
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
 from tests.cluster.simulated import Heard
 from tests.faults.job import RandomRows, make_rows
 from tests.made_runs import check_digests, make_run

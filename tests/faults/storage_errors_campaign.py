@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.books import close_lost_attempts
 from datagen import cli
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.run import Run
-from schemas.sealing import seal
+from datagen.cluster.books import close_lost_attempts
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
 from tests.faults.crash_points_operations import damage, small_schema, units
 from tests.made_runs import attempt, make_run
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.keys import MERGED, part_folder
-from schemas.record_files import encode_record
-from schemas.root_records import publish
-from schemas.run_records import LedgerEntry, Merged, QuarantineRecord
-from schemas.sealing import SEALED, seal
-from schemas.storage import open_storage
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.root_records import publish
+from datagen.schemas.run_records import LedgerEntry, Merged, QuarantineRecord
+from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import copy_run, findings_at, mend_at
 from tests.made_runs import attempt, files_of, make_run, now, small_spec
 

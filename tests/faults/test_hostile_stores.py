@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.storage import open_storage
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.storage import open_storage
+from datagen.train.reader import SampleReader
 from tests.faults.crash_points_operations import small_schema
 from tests.faults.damage_campaign import copy_run, make_place
 from tests.faults.hostile_stores import ATTEMPT, HOSTILE, odd_names
 from tests.faults.opened_files import watched
-from train.reader import SampleReader
 
 SECRET = "the-canary-sings-at-noon"
 # Above what a verb needs for a run of three shards, and far below what the hostile ones ask for.

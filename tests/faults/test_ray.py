@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from cluster.driver import Order, drive
-from cluster.policy import Policy
-from cluster.ray_cluster import RaySettings, ray_cluster
-from cluster.ray_executor import RayExecutor
-from cluster.stop import StopRequest
-from cluster.tally import JobSummary, Tally
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.policy import Policy
+from datagen.cluster.ray_cluster import RaySettings, ray_cluster
+from datagen.cluster.ray_executor import RayExecutor
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import JobSummary, Tally
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.scripted import ScriptedTask, perform
 

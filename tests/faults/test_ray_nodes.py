@@ -9,19 +9,19 @@ from typing import Any
 
 import pytest
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.fitness import refuse_unfit_machines
-from cluster.guard import notes_of_a_job
-from cluster.policy import Policy
-from cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
-from cluster.ray_executor import RayExecutor
-from cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
-from cluster.stop import StopRequest
-from cluster.tally import Tally
-from cluster.task import ShardTask
-from schemas.errors import InputError
-from schemas.run import Run
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.fitness import refuse_unfit_machines
+from datagen.cluster.guard import notes_of_a_job
+from datagen.cluster.policy import Policy
+from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
+from datagen.cluster.ray_executor import RayExecutor
+from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
+from datagen.cluster.stop import StopRequest
+from datagen.cluster.tally import Tally
+from datagen.cluster.task import ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.job import RandomRows, make_rows
 from tests.faults.scripted import ScriptedTask, perform

@@ -16,9 +16,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.ray_cluster import refuse_unusable
-from cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
-from schemas.errors import InputError
+from datagen.cluster.ray_cluster import refuse_unusable
+from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_token
+from datagen.schemas.errors import InputError
 from tests.made_runs import check_digests, make_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]

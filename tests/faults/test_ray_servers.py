@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from cluster.ray_settings import new_token
+from datagen.cluster.ray_settings import new_token
 from tests.faults.server_campaign import check_bytes_and_ledger, kill_servers
 from tests.faults.test_ray_processes import REPOSITORY, kill_machine, ray_start
 from tests.made_runs import make_run

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from schemas.run import Run
+from datagen.schemas.run import Run
 from tests.made_runs import make_run
 
 REPOSITORY = Path(__file__).resolve().parents[2]

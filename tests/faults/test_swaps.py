@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.errors import InputError
-from schemas.keys import commit_copy_key, commit_key
-from schemas.merged import open_runs
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.run_records import Plan
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_copy_key, commit_key
+from datagen.schemas.merged import open_runs
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Plan
 from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, mend_at
 from tests.faults.swap_campaign import Swap, Swaps, exchange, make_world, swaps, try_swap
 from tests.made_runs import attempt, files_of, make_run, small_spec, write

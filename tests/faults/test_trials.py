@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster.books import RunBooks, close_lost_attempts
-from cluster.driver import Order, drive
-from cluster.policy import Policy
-from cluster.ray_cluster import RaySettings, ray_cluster
-from cluster.ray_executor import RayExecutor
-from cluster.stop import StopRequest
 from datagen import cli
-from schemas.run import Run
+from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.driver import Order, drive
+from datagen.cluster.policy import Policy
+from datagen.cluster.ray_cluster import RaySettings, ray_cluster
+from datagen.cluster.ray_executor import RayExecutor
+from datagen.cluster.stop import StopRequest
+from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.trials import FaultyTrials, attempt_with_faults
 from tests.sim_extra import needs_sim

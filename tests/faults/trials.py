@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import workers.labels.trials as label_trials
-from cluster.attempt import run_attempt
-from cluster.guard import Meter
-from cluster.task import Product, ShardTask
+import datagen.workers.labels.trials as label_trials
+from datagen.cluster.attempt import run_attempt
+from datagen.cluster.guard import Meter
+from datagen.cluster.task import Product, ShardTask
 from tests.faults.scripted import misbehave
 
 

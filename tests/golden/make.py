@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from datagen import cli
-from schemas.fields import SCHEMA_VERSION
-from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION
+from datagen.schemas.fields import SCHEMA_VERSION
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION
 from tests.golden.archive import digests_of, pack
 
 HERE = Path(__file__).parent

@@ -13,18 +13,18 @@ from datagen import cli
 from datagen.remaking.deep import deep_findings
 from datagen.remaking.scenes import what_differs_here
 from datagen.remaking.shards import open_origin
-from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.run_records import FORMAT_VERSION
-from schemas.scene_rows import read_scene
+from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION
+from datagen.schemas.scene_rows import read_scene
+from datagen.train.reader import SampleReader
+from datagen.workers.houses import open_houses
+from datagen.workers.labels import load_label_source
+from datagen.workers.objects import open_objects
 from tests.golden.archive import digest_of, digests_of, unpack
 from tests.made_runs import check_digests
 from tests.small_runs import json_of
-from train.reader import SampleReader
-from workers.houses import open_houses
-from workers.labels import load_label_source
-from workers.objects import open_objects
 
 HERE = Path(__file__).parent
 STORES = sorted(path.stem for path in HERE.glob("*.zip"))

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from schemas.fields import SCHEMAS, sized_schema
-from schemas.identity import sample_ids
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.shard_files import encode_shard
-from schemas.specification import HeuristicParams, Specification
+from datagen.schemas.fields import SCHEMAS, sized_schema
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.specification import HeuristicParams, Specification
+from datagen.workers.labels import heuristic, load_label_source
 from tests.made_runs import small_spec, tables_of
-from workers.labels import heuristic, load_label_source
 
 LAYOUT = Layout(scenes_per_shard=1, candidates_per_scene=2)
 PER_SHARD = LAYOUT.samples_per_shard

@@ -13,16 +13,16 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.run import Run
-from schemas.specification import Specification
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.run import Run
+from datagen.schemas.specification import Specification
+from datagen.workers.geometry.mesh import Mesh
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.house import House
+from datagen.workers.objects import open_objects
+from datagen.workers.objects.model import ObjectModel
 from tests.independent import camera_axes, pixel_counts, score
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, make_small_run
-from workers.geometry.mesh import Mesh
-from workers.houses import open_houses
-from workers.houses.house import House
-from workers.objects import open_objects
-from workers.objects.model import ObjectModel
 
 SCENES = 8
 WINDOW_PX = 64

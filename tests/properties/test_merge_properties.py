@@ -18,17 +18,17 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from datagen.reports.accounts import Books, account_for
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.keys import shard_folder
-from schemas.merged import open_runs
-from schemas.merging import carry_out, plan_merge
-from schemas.run import Run
-from schemas.run_records import Cost, LedgerEntry, QuarantineRecord
-from schemas.scene_rows import read_shard
-from schemas.shard_files import encode_shard
-from schemas.storage import open_storage
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Cost, LedgerEntry, QuarantineRecord
+from datagen.schemas.scene_rows import read_shard
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import commit_of, files_of, make_run, rows_of, small_spec, write
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.relabelling.runs import relabel_all, relabelled_specification
+from datagen.schemas.run import Run
+from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.storage import open_storage
 from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
-from schemas.run import Run
-from schemas.specification import HeuristicParams
-from schemas.storage import open_storage
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, make_small_run
 
 N = 2 * PER_SCENE

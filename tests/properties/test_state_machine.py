@@ -20,23 +20,23 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from cluster.books import close_lost_attempts
+from datagen.cluster.books import close_lost_attempts
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from schemas.checking.mending import mend_place
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.garbage import find_garbage, sweep
-from schemas.keys import commit_key, shard_folder
-from schemas.merged import open_runs
-from schemas.merging import carry_out, plan_merge
-from schemas.quarantine import lift_quarantine
-from schemas.record_files import now
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
-from schemas.sealing import SEALED, seal, unseal
-from schemas.specification import HeuristicParams
-from schemas.storage import open_storage
+from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.keys import commit_key, shard_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.quarantine import lift_quarantine
+from datagen.schemas.record_files import now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
+from datagen.schemas.sealing import SEALED, seal, unseal
+from datagen.schemas.specification import HeuristicParams
+from datagen.schemas.storage import open_storage
 from tests.made_runs import attempt, manifest_of, write
 from tests.properties.state_model import (
     LAYOUT,

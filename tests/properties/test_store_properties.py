@@ -12,14 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from schemas.errors import InputError
-from schemas.fields import Field, RecordSchema
-from schemas.run_records import Layout
-from schemas.sealing import seal
-from schemas.shard_files import encode_shard
-from schemas.shard_reading import decode_chunk, parse_metadata
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import Field, RecordSchema
+from datagen.schemas.run_records import Layout
+from datagen.schemas.sealing import seal
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.shard_reading import decode_chunk, parse_metadata
+from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
-from train.reader import SampleReader
 
 # Every example writes whole runs durably: few examples, short runs.
 few = settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from schemas.checking.finding import Finding
-from schemas.checking.place import Checked, check_place
-from schemas.record_files import signed_json
-from schemas.run import Run
-from schemas.run_records import Cost, LedgerEntry
-from schemas.sealing import seal
-from schemas.storage import open_storage
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.record_files import signed_json
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Cost, LedgerEntry
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
 from tests.made_runs import make_run
 
 

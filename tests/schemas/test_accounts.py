@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from schemas.checking.finding import Finding, Restore
-from schemas.ledger import end_from_commit, lost_end
-from schemas.quarantine import lift_quarantine
-from schemas.record_files import decode_record
-from schemas.run import Run, commit_copy_key, commit_key
-from schemas.run_records import AttemptStart, Cost, LedgerEntry, Outcome, QuarantineRecord
+from datagen.schemas.checking.finding import Finding, Restore
+from datagen.schemas.ledger import end_from_commit, lost_end
+from datagen.schemas.quarantine import lift_quarantine
+from datagen.schemas.record_files import decode_record
+from datagen.schemas.run import Run, commit_copy_key, commit_key
+from datagen.schemas.run_records import AttemptStart, Cost, LedgerEntry, Outcome, QuarantineRecord
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import make_run
 from tests.schemas.checked import check, edit, folder_of, found

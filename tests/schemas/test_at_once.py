@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.at_once import in_order
+from datagen.schemas.at_once import in_order
 
 
 @given(st.integers(0, 30), st.integers(1, 5), st.integers(1, 9))

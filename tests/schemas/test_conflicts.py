@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.merging.conflicts import refuse_different_rows
-from schemas.run import Run
-from schemas.shard_files import encode_shard
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.merging.conflicts import refuse_different_rows
+from datagen.schemas.run import Run
+from datagen.schemas.shard_files import encode_shard
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import commit_of, make_run, rows_of
 

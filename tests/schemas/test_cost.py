@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from schemas import cost
-from schemas.cost import StageClock
+from datagen.schemas import cost
+from datagen.schemas.cost import StageClock
 
 
 class Hands:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from schemas.data_format import page
-from schemas.fields import SCHEMAS
+from datagen.schemas.data_format import page
+from datagen.schemas.fields import SCHEMAS
 
 PAGE = Path(__file__).parents[2] / "docs" / "data-format.md"
 

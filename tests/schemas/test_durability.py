@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from schemas.fields import SCHEMAS
-from schemas.merging import carry_out, plan_merge
-from schemas.run import Run
-from schemas.sealing import seal, unseal
-from schemas.storage import open_storage
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal, unseal
+from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import attempt, make_run, write
 

@@ -13,15 +13,15 @@ import pytest
 from datagen import cli
 from datagen.remaking.deep import deep_findings
 from datagen.remaking.shards import open_origin
-from schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION, SCHEMAS, Field, sized_schema
-from schemas.run import Run
-from schemas.scene_rows import read_scene
+from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION, SCHEMAS, Field, sized_schema
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
+from datagen.train.reader import SampleReader
+from datagen.workers import run_shard
+from datagen.workers.labels import distance_visibility
 from tests.made_runs import small_spec
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
-from train.reader import SampleReader
-from workers import run_shard
-from workers.labels import distance_visibility
 
 N = 2 * PER_SCENE
 NEWER = SCHEMA_VERSION + 1

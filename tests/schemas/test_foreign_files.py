@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.foreign_files import open_regular, read_regular
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import open_regular, read_regular
 
 
 def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path) -> None:

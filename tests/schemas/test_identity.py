@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.identity import Stream, canonical_json, digest_of, generator, sample_ids
+from datagen.schemas.identity import Stream, canonical_json, digest_of, generator, sample_ids
 
 seeds = st.integers(0, 2**63 - 1)
 

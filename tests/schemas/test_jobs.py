@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.jobs import JobRecord, Jobs, JobState, new_job_id
-from schemas.quarantine import lift_quarantine, lifted_records
-from schemas.run_records import QuarantineRecord
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import JobRecord, Jobs, JobState, new_job_id
+from datagen.schemas.quarantine import lift_quarantine, lifted_records
+from datagen.schemas.run_records import QuarantineRecord
+from datagen.schemas.storage import open_storage
 from tests.made_runs import make_run
 
 MINE = "mine"

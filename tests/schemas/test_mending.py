@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from schemas.checking import mending
-from schemas.checking.finding import Finding
-from schemas.checking.mending import mend_place
-from schemas.keys import commit_copy_key, commit_key
-from schemas.record_files import MAX_RECORD_BYTES, encode_record
-from schemas.run_records import Cost, LedgerEntry
+from datagen.schemas.checking import mending
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.keys import commit_copy_key, commit_key
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
+from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.made_runs import make_run, write
 
 

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.keys import MERGED, part_folder
-from schemas.lineage import LINEAGE, Lineage, lineage_summary
-from schemas.merged import find_scene, open_runs, wanted
-from schemas.merging import Result, carry_out, plan_merge
-from schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
-from schemas.record_files import read_record
-from schemas.run import Run
-from schemas.run_records import Commit, LedgerEntry, QuarantineRecord
-from schemas.sealing import seal, sealed_root
-from schemas.shard_files import encode_shard
-from schemas.specification import Source
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
+from datagen.schemas.merged import find_scene, open_runs, wanted
+from datagen.schemas.merging import Result, carry_out, plan_merge
+from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
+from datagen.schemas.record_files import read_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
+from datagen.schemas.sealing import seal, sealed_root
+from datagen.schemas.shard_files import encode_shard
+from datagen.schemas.specification import Source
+from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import attempt, commit_of, files_of, make_run, manifest_of, rows_of, small_spec
 
@@ -219,7 +219,9 @@ def test_quarantine_comes_along_for_shards_that_nobody_has(tmp_path: Path):
 def test_equal_rows_in_other_bytes_are_no_conflict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fill(tmp_path, [0], "a")
     run = fill(tmp_path, [], "b")
-    monkeypatch.setattr("schemas.shard_files.ZSTD_LEVEL", 19)  # as another version of the compressor might
+    monkeypatch.setattr(
+        "datagen.schemas.shard_files.ZSTD_LEVEL", 19
+    )  # as another version of the compressor might
     scenes, samples = rows_of(run, 0)
     files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
     assert run.commit(commit_of(run, 0, "z", run.write_shard(0, "z", files), int(samples["label"].sum())))

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
-from schemas.merging import carry_out, plan_merge
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.storage import Storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
+from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.storage import Storage
 from tests.made_runs import attempt, check_digests, make_run, write
 
 FULL = InputError("the disk", "", "No space left on device", "Free disk space")

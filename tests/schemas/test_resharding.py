@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.merging.resharding import Cut, base_name, common_layout, rank
-from schemas.run_records import AttemptStart, Cost, Layout
+from datagen.schemas.merging.resharding import Cut, base_name, common_layout, rank
+from datagen.schemas.run_records import AttemptStart, Cost, Layout
 
 seconds = st.floats(0, 1e6)
 attempt_names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", fullmatch=True)

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.record_files import encode_record, signed_json
-from schemas.root_records import copy_key, publish
-from schemas.run import Run
-from schemas.run_records import FileEntry, Layout, LedgerEntry, Plan, QuarantineRecord
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import encode_record, signed_json
+from datagen.schemas.root_records import copy_key, publish
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, Plan, QuarantineRecord
+from datagen.schemas.storage import open_storage
 from tests.made_runs import check_digests, commit_of, files_of, make_run, manifest_of, small_spec, write
 
 

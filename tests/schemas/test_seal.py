@@ -15,12 +15,12 @@ import pytest
 import xarray
 import zarr
 
-from schemas import shard_files
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.sealing import SEALED, seal
-from schemas.sealing import local as seal_local
+from datagen.schemas import shard_files
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.sealing import local as seal_local
 from tests.made_runs import check_digests, files_of, make_run, rows_of, small_spec, write
 
 

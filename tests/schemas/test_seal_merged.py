@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import zarr
 
-from schemas.errors import InputError
-from schemas.keys import MERGED, part_folder
-from schemas.merged import open_runs
-from schemas.record_files import encode_record
-from schemas.run import Run
-from schemas.run_records import Merged
-from schemas.sealing import SEALED, seal, sealed_root, unseal
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.merged import open_runs
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Merged
+from datagen.schemas.sealing import SEALED, seal, sealed_root, unseal
+from datagen.schemas.storage import Storage, open_storage
 from tests.made_runs import files_of, make_run, rows_of, small_spec
 
 

@@ -10,12 +10,12 @@ import zarr
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.sealing import SEALED, seal, sealed_root, unseal
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.sealing import SEALED, seal, sealed_root, unseal
+from datagen.schemas.storage import Storage, open_storage
 from tests.faults.crash_points_operations import small_schema
 from tests.made_runs import attempt, manifest_of, rows_of, small_spec
 

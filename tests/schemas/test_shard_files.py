@@ -8,10 +8,16 @@ import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS, Field, sized_schema
-from schemas.run_records import Layout
-from schemas.shard_files import MAX_CHUNK_BYTES, chunk_rows, encode_shard, group_metadata, zarr_metadata
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS, Field, sized_schema
+from datagen.schemas.run_records import Layout
+from datagen.schemas.shard_files import (
+    MAX_CHUNK_BYTES,
+    chunk_rows,
+    encode_shard,
+    group_metadata,
+    zarr_metadata,
+)
 from tests.made_runs import small_spec, tables_of
 
 LAYOUT = Layout(scenes_per_shard=3, candidates_per_scene=4)

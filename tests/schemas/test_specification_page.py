@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 
-from schemas.specification import (
+from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,
     DisturbanceParams,
@@ -13,7 +13,7 @@ from schemas.specification import (
     Specification,
     TrialParams,
 )
-from schemas.specification_page import page
+from datagen.schemas.specification_page import page
 from tests.conftest import REPOSITORY
 
 SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}

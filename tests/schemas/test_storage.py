@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.storage import Storage, open_storage
 from tests.made_runs import files_of
 
 
@@ -82,7 +82,8 @@ def test_of_racing_threads_exactly_one_wins_and_its_bytes_stay(tmp_path: Path):
 
 def test_of_racing_processes_exactly_one_wins(tmp_path: Path):
     code = (
-        "import sys; from schemas.storage import open_storage; s = open_storage(sys.argv[1], probe=False)\n"
+        "import sys; from datagen.schemas.storage import open_storage\n"
+        "s = open_storage(sys.argv[1], probe=False)\n"
         "sys.stdin.readline(); print(sum(s.put_new(f'c/{i}', sys.argv[2].encode()) for i in range(40)))"
     )
     racers = [

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from schemas.root_records import refuse_foreign
-from schemas.storage import Storage, local_files, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.storage import Storage, local_files, open_storage
 from tests.made_runs import files_of
 
 VERBS: dict[str, Callable[[Storage, str], object]] = {

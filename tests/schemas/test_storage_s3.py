@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from obstore.exceptions import GenericError
 
-from schemas.errors import InputError
-from schemas.storage import Storage, open_storage
-from schemas.storage.errors import StoreFailure, store_trouble
+from datagen.schemas.errors import InputError
+from datagen.schemas.storage import Storage, open_storage
+from datagen.schemas.storage.errors import StoreFailure, store_trouble
 from tests.s3_servers import Faults, environment, faulty_proxy
 
 Behind = Callable[[Faults], AbstractContextManager[Storage]]

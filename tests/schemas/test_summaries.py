@@ -17,14 +17,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import schemas.summaries
+import datagen.schemas.summaries
 from datagen.reports.accounts import Books, account_for
-from schemas.errors import InputError
-from schemas.keys import commit_key
-from schemas.record_files import encode_record, signed_json
-from schemas.run import Run
-from schemas.run_records import Commit, Cost, Host, LedgerEntry
-from schemas.summaries import CommitSummary, EndSummary, Summaries, index_files, refresh, unreadable_files
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import encode_record, signed_json
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry
+from datagen.schemas.summaries import (
+    CommitSummary,
+    EndSummary,
+    Summaries,
+    index_files,
+    refresh,
+    unreadable_files,
+)
 from tests.made_runs import commit_of, make_run
 
 SHARDS = 12
@@ -142,7 +149,7 @@ HAPPENS = sorted(name for name, member in vars(History).items() if name[0] != "_
 @given(st.lists(st.sampled_from(HAPPENS), max_size=8), st.integers(0, 2**32), st.sampled_from([4, 16_384]))
 def test_answers_are_those_of_the_records(words: list[str], seed: int, rows: int) -> None:
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schemas.summaries, "ROWS_PER_FILE", rows)
+        patch.setattr(datagen.schemas.summaries, "ROWS_PER_FILE", rows)
         run = bare_run(Path(folder))
         history = History(run, seed)
         history.commits()

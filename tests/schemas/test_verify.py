@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from schemas.checking.finding import Restore
-from schemas.errors import InputError
-from schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
-from schemas.record_files import encode_record, signed_json
-from schemas.run import Run
-from schemas.run_records import Merged, Plan, QuarantineRecord
-from schemas.sealing import seal
-from schemas.storage import open_storage
+from datagen.schemas.checking.finding import Restore
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
+from datagen.schemas.record_files import encode_record, signed_json
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Merged, Plan, QuarantineRecord
+from datagen.schemas.sealing import seal
+from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import attempt, make_run, small_spec
 from tests.schemas.checked import check, edit, folder_of, found, sealed_run

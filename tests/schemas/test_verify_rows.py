@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.fields import RecordSchema
-from schemas.keys import commit_copy_key, commit_key
-from schemas.outcomes import REDRAW_CAUSES
-from schemas.run import Run
-from schemas.run_records import LedgerEntry
-from schemas.shard_files import encode_shard
+from datagen.schemas.fields import RecordSchema
+from datagen.schemas.keys import commit_copy_key, commit_key
+from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import LedgerEntry
+from datagen.schemas.shard_files import encode_shard
 from tests.made_runs import commit_of, make_run, rows_of
 from tests.schemas.checked import check, edit, folder_of, found, sealed_run
 

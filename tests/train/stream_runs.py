@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.shard_files import chunk_key, encode_chunk, encode_shard
-from schemas.storage import open_storage
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.shard_files import chunk_key, encode_chunk, encode_shard
+from datagen.schemas.storage import open_storage
 from tests.made_runs import Tables, commit_of, manifest_of, rows_of, small_spec
 
 ROBOT_FIELDS = ("camera_height_m", "base_height_m", "arm_reach_m")

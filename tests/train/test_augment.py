@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
+from datagen.train.batching import StoredScene, View
+from datagen.train.dataset import SampleStream
+from datagen.workers.rendering.cloud import farthest_points
 from tests.train.stream_runs import make_stream_run
-from train.augment import Augmentation, ColourJitter, DepthHoles, PointDropout, Rotation, SensorNoise
-from train.batching import StoredScene, View
-from train.dataset import SampleStream
-from workers.rendering.cloud import farthest_points
 
 SEEDS = st.integers(0, 2**32)
 ALL = Augmentation(SensorNoise(), DepthHoles(), PointDropout(), ColourJitter(), Rotation())

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from schemas.specification import HeuristicParams
-from train.calibration import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.calibration import (
     FORMS,
     Trials,
     agreements,
@@ -22,7 +22,7 @@ from train.calibration import (
     reach_in_sigmas,
     refuse_too_little,
 )
-from workers.labels.heuristic import visibility_score
+from datagen.workers.labels.heuristic import visibility_score
 
 BEFORE = HeuristicParams()
 N, SCENES = 600, 30

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.sealing import seal
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.sealing import seal
+from datagen.train.augment import Augmentation, ColourJitter, PointDropout, Rotation, SensorNoise
+from datagen.train.dataset import SampleStream
+from datagen.train.inputs import Array, Batch, mount_distance_m
 from tests.train.stream_runs import HOUSES, ROBOT_FIELDS, make_stream_run, stream_rows
-from train.augment import Augmentation, ColourJitter, PointDropout, Rotation, SensorNoise
-from train.dataset import SampleStream
-from train.inputs import Array, Batch, mount_distance_m
 
 N, SCENES, SHARDS = 113, 19, 7
 CHANGES = Augmentation(dropout=PointDropout(), colour=ColourJitter(), rotation=Rotation())

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train import observed_visibility as ov
-from train.observed_visibility import visible_share
+from datagen.train import observed_visibility as ov
+from datagen.train.observed_visibility import visible_share
 
 RADIUS_M = 0.06
 WALL_M = 0.3  # from the target, across the x axis

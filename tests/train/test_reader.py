@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from datagen.reports.labelled import read_labelled
-from schemas import shard_reading
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.scene_rows import read_scene
-from schemas.sealing import seal
-from schemas.shard_files import encode_shard
+from datagen.schemas import shard_reading
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.sealing import seal
+from datagen.schemas.shard_files import encode_shard
+from datagen.train.dataset import SampleStream
+from datagen.train.reader import Columns, SampleReader
 from tests.made_runs import commit_of, make_run, rows_of, small_spec
 from tests.train.stream_runs import make_stream_run
-from train.dataset import SampleStream
-from train.reader import Columns, SampleReader
 
 ALL = ("scene_index", *("points_m", "rgb", "target_mask", "house_id", "object_name"))
 SAMPLES = ("sample_id", "sample_scene_index", "candidate_index", "distance_m", "label", "label_source")

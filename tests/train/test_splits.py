@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.augment import Augmentation, Rotation
+from datagen.train.dataset import SampleStream
+from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
+from datagen.workers.houses.split import split_of
 from tests.train.stream_runs import make_stream_run
-from train.augment import Augmentation, Rotation
-from train.dataset import SampleStream
-from train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
-from workers.houses.split import split_of
 
 
 def test_a_shared_house_is_named_by_id_or_by_content(tmp_path: Path):

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.train.dataset import SampleStream
 from tests.train.stream_runs import make_stream_run
-from train.dataset import SampleStream
 
 torch = pytest.importorskip("torch", reason="the extra `train` is not installed")
 
 
 def test_a_batch_becomes_tensors_on_the_device(tmp_path: Path):
-    from train.tensors import to_torch
+    from datagen.train.tensors import to_torch
 
     make_stream_run(tmp_path, 36)
     extra = ("house_id", "distance_m", "redraws", "T_world_camera", "points_m")

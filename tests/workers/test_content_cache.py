@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.whole_files import whole_file
+from datagen.schemas.whole_files import whole_file
+from datagen.workers.content_cache import Arrays, Shelf, alone_in, drop_unused, read_arrays, refresh
 from tests.other_user import as_another_user, needs_root
-from workers.content_cache import Arrays, Shelf, alone_in, drop_unused, read_arrays, refresh
 
 SHELF = Shelf(
     "things",
@@ -237,7 +237,7 @@ for k in count():
 _COUNTER = """
 import sys
 from pathlib import Path
-from workers.content_cache import alone_in
+from datagen.workers.content_cache import alone_in
 folder = Path(sys.argv[1])
 for _ in range(200):
     with alone_in(folder):
@@ -276,8 +276,8 @@ def test_processes_wait_for_one_another(tmp_path: Path) -> None:
 @needs_root
 def test_a_user_without_a_home_has_no_cache_rather_than_one_that_others_can_write_to() -> None:
     printed = as_another_user(
-        "from workers.content_cache import cache_folder\n"
-        "from schemas.whole_files import whole_file\n"
+        "from datagen.workers.content_cache import cache_folder\n"
+        "from datagen.schemas.whole_files import whole_file\n"
         "print(cache_folder())\n"
         "try:\n"
         "    with whole_file(cache_folder() / 'x'): print('written')\n"

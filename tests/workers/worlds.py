@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from workers.geometry.mesh import F32, F64, I32, U8, Mesh
-from workers.geometry.transforms import look_at, translation
-from workers.houses.house import Body, BodyKind, House, Room, Surface
-from workers.objects.model import ObjectModel
-from workers.rendering.frame import Camera, Stage
+from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh
+from datagen.workers.geometry.transforms import look_at, translation
+from datagen.workers.houses.house import Body, BodyKind, House, Room, Surface
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.frame import Camera, Stage
 
 Vec3 = tuple[float, float, float]
 Colour = tuple[int, int, int]

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from schemas.errors import InputError, choices
-from schemas.specification import HeuristicParams
-from train.baselines.analytic import Analytic
-from train.baselines.baseline import FIELDS, Baseline
-from train.baselines.detection import ThresholdDetector, ViewDetector
-from train.baselines.detector import ZeroShotDetector
-from train.baselines.distance import DistanceBand
-from train.baselines.proximity import Proximity
-from train.baselines.scalars import Scalars
-from train.baselines.threshold import Threshold
-from train.inputs import Array, Batch
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.baselines.analytic import Analytic
+from datagen.train.baselines.baseline import FIELDS, Baseline
+from datagen.train.baselines.detection import ThresholdDetector, ViewDetector
+from datagen.train.baselines.detector import ZeroShotDetector
+from datagen.train.baselines.distance import DistanceBand
+from datagen.train.baselines.proximity import Proximity
+from datagen.train.baselines.scalars import Scalars
+from datagen.train.baselines.threshold import Threshold
+from datagen.train.inputs import Array, Batch
 
 # By the name on the command line. `threshold-detector` is the visibility stand-in until a detector is named.
 BASELINES: dict[str, Callable[[], Baseline]] = {

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.specification import HeuristicParams
-from train.baselines.baseline import F64, Unfitted, mount_m, observed_rho, planar_distance_m, reach_m
-from train.inputs import Array, Batch, is_clear
-from workers.labels.heuristic import heuristic
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.baselines.baseline import F64, Unfitted, mount_m, observed_rho, planar_distance_m, reach_m
+from datagen.train.inputs import Array, Batch, is_clear
+from datagen.workers.labels.heuristic import heuristic
 
 _PAPER = HeuristicParams()
 

@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.inputs import Array, Batch, is_clear, mount_distance_m
-from train.observed_visibility import observed_visibility
-from train.scorers import Scorer
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch, is_clear, mount_distance_m
+from datagen.train.observed_visibility import observed_visibility
+from datagen.train.scorers import Scorer
 
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from train.baselines.baseline import F64, best_cut, is_feasible, labels, observed_rho
-from train.baselines.detector import Detector
-from train.baselines.views import render_views
-from train.inputs import Array, Batch, column
-from train.observed_visibility import eyes
-from train.scorers import scored
+from datagen.train.baselines.baseline import F64, best_cut, is_feasible, labels, observed_rho
+from datagen.train.baselines.detector import Detector
+from datagen.train.baselines.views import render_views
+from datagen.train.inputs import Array, Batch, column
+from datagen.train.observed_visibility import eyes
+from datagen.train.scorers import scored
 
 _VIEWS_AT_ONCE = 8
 

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from workers.registry import install_line
+from datagen.schemas.errors import InputError
+from datagen.workers.registry import install_line
 
 U8 = npt.NDArray[np.uint8]
 

@@ -8,8 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from train.baselines.baseline import F64, RULED_OUT, Bools, labels, mount_m, planar_distance_m, reach_m
-from train.inputs import Array, Batch, is_clear
+from datagen.train.baselines.baseline import (
+    F64,
+    RULED_OUT,
+    Bools,
+    labels,
+    mount_m,
+    planar_distance_m,
+    reach_m,
+)
+from datagen.train.inputs import Array, Batch, is_clear
 
 Kind = Literal["planar", "planar-over-reach", "mount-over-reach"]
 KINDS: tuple[Kind, ...] = ("planar", "planar-over-reach", "mount-over-reach")

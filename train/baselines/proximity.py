@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from train.baselines.baseline import F64, RULED_OUT, Unfitted, planar_distance_m
-from train.inputs import Array, Batch, is_clear
+from datagen.train.baselines.baseline import F64, RULED_OUT, Unfitted, planar_distance_m
+from datagen.train.inputs import Array, Batch, is_clear
 
 
 @dataclass(frozen=True)

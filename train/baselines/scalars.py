@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from schemas.errors import InputError
-from train.baselines.baseline import F64, labels, mount_m, observed_rho, planar_distance_m, reach_m
-from train.inputs import Array, Batch, column, is_clear
+from datagen.schemas.errors import InputError
+from datagen.train.baselines.baseline import F64, labels, mount_m, observed_rho, planar_distance_m, reach_m
+from datagen.train.inputs import Array, Batch, column, is_clear
 
 FEATURES = (
     *("distance_m", "mount_distance_m", "reach_m", "distance_over_reach", "mount_over_reach"),

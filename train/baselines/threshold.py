@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from train.baselines.baseline import F64, Unfitted, is_feasible
-from train.inputs import Array, Batch
+from datagen.train.baselines.baseline import F64, Unfitted, is_feasible
+from datagen.train.inputs import Array, Batch
 
 
 @dataclass(frozen=True)

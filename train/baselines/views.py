@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from train.inputs import Array
+from datagen.train.inputs import Array
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]

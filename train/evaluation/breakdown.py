@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.outcomes import OUTCOMES
-from train.evaluation.columns import Columns
-from train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
-from workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.train.evaluation.columns import Columns
+from datagen.train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
 RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from train.evaluation.metrics import F64, Bools
-from train.inputs import Array, Batch
-from train.scorers import Scorer, scored
-from workers.bases.candidate_sets import in_set
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation.metrics import F64, Bools
+from datagen.train.inputs import Array, Batch
+from datagen.train.scorers import Scorer, scored
+from datagen.workers.bases.candidate_sets import in_set
 
 F32 = npt.NDArray[np.float32]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from train.evaluation.bootstrap import Estimate, are_disjoint, verdict
+from datagen.train.evaluation.bootstrap import Estimate, are_disjoint, verdict
 
 # As they build on each other; what the paper asks is what each adds to the one before it.
 REGIMES = ("stage1", "sim-only", "two-stage")

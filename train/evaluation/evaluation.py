@@ -1,6 +1,6 @@
 """Methods held against labels: every number of the tables with its interval, as plain values.
 
-Values are None where nothing can be said, and intervals are those of `train.evaluation.bootstrap`.
+Values are None where nothing can be said, and intervals are those of `datagen.train.evaluation.bootstrap`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from schemas.errors import InputError
-from train.evaluation import metrics
-from train.evaluation.bootstrap import Estimate, Weights, resample_weights, resampled_area_under_roc, summed
-from train.evaluation.breakdown import breakdown, groups_of
-from train.evaluation.columns import Columns
-from train.evaluation.comparisons import NO_TRAINING, TrainedBy, comparisons, differences, finite, said_of
-from train.evaluation.grids import picks, select
-from train.evaluation.metrics import F64, Bools
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation import metrics
+from datagen.train.evaluation.bootstrap import (
+    Estimate,
+    Weights,
+    resample_weights,
+    resampled_area_under_roc,
+    summed,
+)
+from datagen.train.evaluation.breakdown import breakdown, groups_of
+from datagen.train.evaluation.columns import Columns
+from datagen.train.evaluation.comparisons import (
+    NO_TRAINING,
+    TrainedBy,
+    comparisons,
+    differences,
+    finite,
+    said_of,
+)
+from datagen.train.evaluation.grids import picks, select
+from datagen.train.evaluation.metrics import F64, Bools
 
 _CURVE_POINTS = 200
 # In the order in which they are told; differences are told of each.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from schemas.errors import InputError, choices
-from train.models.model import Model, fast
-from train.models.paper import PaperModel
-from train.models.shared import SharedModel
+from datagen.schemas.errors import InputError, choices
+from datagen.train.models.model import Model, fast
+from datagen.train.models.paper import PaperModel
+from datagen.train.models.shared import SharedModel
 
 MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, "shared": SharedModel}
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from train.inputs import Clouds, Robots
-from train.models.grouping import first_true
+from datagen.train.inputs import Clouds, Robots
+from datagen.train.models.grouping import first_true
 
 # The colour that marks the target (GBPP, arXiv 2509.11594), of 255.
 TARGET_RGB = (0.0, 77.0, 77.0)

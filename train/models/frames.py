@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from train.models.tokens import Tokens, doubled, turned
+from datagen.train.models.tokens import Tokens, doubled, turned
 
 # Below these lengths a direction or a ratio would be noise.
 _TINY_M = 1e-6

@@ -10,8 +10,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor, nn
 
-from schemas.errors import InputError
-from train.inputs import Candidates, Clouds, Robots
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Candidates, Clouds, Robots
 
 ConfigT = TypeVar("ConfigT", bound="ModelConfig")
 
@@ -26,7 +26,7 @@ class Model(nn.Module, ABC):
     """Scores base positions from what a robot sees.
 
     `config` holds plain values that JSON can hold; with `name` it is all that
-    `train.models.build_model` needs to make the same module again, but for its parameters.
+    `datagen.train.models.build_model` needs to make the same module again, but for its parameters.
     """
 
     name: ClassVar[str]

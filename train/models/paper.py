@@ -27,11 +27,11 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from train.inputs import Candidates, Clouds, Robots
-from train.models.crop import Crop, crop_clouds
-from train.models.grouping import ball_query, farthest_points, gather_rows
-from train.models.layers import PointMlp, empty_logits
-from train.models.model import Model, ModelConfig, read_config
+from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.models.crop import Crop, crop_clouds
+from datagen.train.models.grouping import ball_query, farthest_points, gather_rows
+from datagen.train.models.layers import PointMlp, empty_logits
+from datagen.train.models.model import Model, ModelConfig, read_config
 
 CANDIDATE_POINTS = 50
 # Candidates that go through the network together where no gradient is kept: some 20 MB each at full size.

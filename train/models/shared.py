@@ -1,9 +1,9 @@
 """Encodes what a robot sees once, and scores all its candidates on that encoding.
 
 The cloud becomes 80 tokens: places on the target, near it and further away, with the shape of what is
-around them (`train.models.tokens`). A candidate sees each token from its own frame: what has a direction is
+around them (`tokens.py`). A candidate sees each token from its own frame: what has a direction is
 turned into the frame, and offsets from its line of sight and from its arm's way are added
-(`train.models.frames`). A first layer over all of that is linear, so that the part that belongs to the
+(`frames.py`). A first layer over all of that is linear, so that the part that belongs to the
 token is worked out once for all candidates, and the part that turns is a product with (cos, sin, cos 2,
 sin 2) of the frame's angle:
 
@@ -27,13 +27,20 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from train.inputs import Candidates, Clouds, Robots
-from train.models.crop import Crop, crop_clouds
-from train.models.frames import N_PAIR_FEATURES, N_SCALARS, Frames, frames_of, pair_features, target_features
-from train.models.layers import empty_logits, mlp
-from train.models.model import Model, ModelConfig, read_config
-from train.models.tiles import tiles
-from train.models.tokens import (
+from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.models.crop import Crop, crop_clouds
+from datagen.train.models.frames import (
+    N_PAIR_FEATURES,
+    N_SCALARS,
+    Frames,
+    frames_of,
+    pair_features,
+    target_features,
+)
+from datagen.train.models.layers import empty_logits, mlp
+from datagen.train.models.model import Model, ModelConfig, read_config
+from datagen.train.models.tiles import tiles
+from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,
     TARGET_TENSORS,
@@ -43,7 +50,7 @@ from train.models.tokens import (
     token_sizes,
     tokens_of,
 )
-from train.observed_visibility import visible_share
+from datagen.train.observed_visibility import visible_share
 
 # Candidates that are worked on together: their tokens stay in a core's cache. A GPU wants more at once.
 _TILE_CPU, _TILE_CUDA = 64, 4096
@@ -63,7 +70,7 @@ class SharedConfig(ModelConfig):
     """Sizes and inputs of the shared model.
 
     `camera`: "given", or "unknown" for what `paper` sees, which knows the robot's mount and not its camera.
-    `observed_visibility`: also give rho as `train.observed_visibility` estimates it from the robot's
+    `observed_visibility`: also give rho as `datagen.train.observed_visibility` estimates it from the robot's
     crop, on the CPU.
     `mirrored`: the arm is taken to do on its left what it does on its right.
     """

@@ -2,7 +2,7 @@
 
 Nothing here depends on a candidate or has parameters. What a token says is sorted by how it turns when the
 scene is turned about the vertical: numbers that stay, vectors that turn along, and second-order tensors
-that turn twice as fast; so a candidate's own frame can be had by a product (`train.models.frames`). In a
+that turn twice as fast; so a candidate's own frame can be had by a product (`frames.py`). In a
 mirror along a candidate's line to the target numbers stay as well, and what is to the left changes its sign.
 """
 
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from train.models.crop import Crop
-from train.models.grouping import first_true, gather_rows
+from datagen.train.models.crop import Crop
+from datagen.train.models.grouping import first_true, gather_rows
 
 # Products of coordinates that make a second moment: xx, yy, zz, xy, xz, yz.
 _LEFT, _RIGHT = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from train.prediction.candidates import RobotSize
-from train.prediction.frames import read_frame, read_place
-from train.prediction.predict import Prediction, load_scorer, predict
+from datagen.train.prediction.candidates import RobotSize
+from datagen.train.prediction.frames import read_frame, read_place
+from datagen.train.prediction.predict import Prediction, load_scorer, predict
 
 __all__ = ["Prediction", "RobotSize", "load_scorer", "predict", "read_frame", "read_place"]

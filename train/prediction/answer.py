@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from train.prediction.candidates import STATES
-from train.prediction.predict import Prediction
+from datagen.train.prediction.candidates import STATES
+from datagen.train.prediction.predict import Prediction
 
 _OWN_AXES = (
     "z up, floor at z = 0, origin on the floor below the first camera; x to its right, y ahead of it, level"

@@ -9,13 +9,13 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from schemas.specification import CandidateParams
-from train.prediction.files import Bools
-from train.prediction.fusing import SeenPoints
-from train.prediction.ground import depth_error_m, floor_points
-from workers.bases.candidates import grid_offsets
-from workers.bases.clearance import STEP_M
-from workers.geometry.mesh import F32, F64
+from datagen.schemas.specification import CandidateParams
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.fusing import SeenPoints
+from datagen.train.prediction.ground import depth_error_m, floor_points
+from datagen.workers.bases.candidates import grid_offsets
+from datagen.workers.bases.clearance import STEP_M
+from datagen.workers.geometry.mesh import F32, F64
 
 CLEAR, BLOCKED, UNSEEN = STATES = ("clear", "blocked", "unseen")
 # Of the floor under a base, the share that must have been seen for nothing to stand there unseen.

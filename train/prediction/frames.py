@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from schemas.errors import InputError
-from train.prediction.files import (
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.files import (
     MAX_PIXELS,
     Bools,
     checked_pose,
@@ -21,9 +21,9 @@ from train.prediction.files import (
     read_rgb,
     valid_depth,
 )
-from train.prediction.npz import read_arrays
-from train.prediction.ply import read_ply
-from workers.geometry.mesh import F32, F64, U8
+from datagen.train.prediction.npz import read_arrays
+from datagen.train.prediction.ply import read_ply
+from datagen.workers.geometry.mesh import F32, F64, U8
 
 DEPTH_SCALE_M = 0.001
 # Of a folder that holds one frame.
@@ -109,7 +109,7 @@ def read_frame(
     pose: str | Path | None = None,
     depth_scale_m: float = DEPTH_SCALE_M,
 ) -> SensorFrame:
-    """A frame of two aligned pictures and a JSON file of intrinsics, each as `train.prediction.files` has it.
+    """A frame of two aligned pictures and a JSON file of intrinsics, each as `files.py` has it.
 
     InputError where a file is missing or no such thing, or where sizes differ.
     """

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from schemas.specification import ObservationParams
-from train.prediction.files import Bools
-from train.prediction.frames import SensorFrame
-from workers.geometry.mesh import F32, F64, U8
-from workers.rendering.cloud import Cloud, stored_cloud
+from datagen.schemas.specification import ObservationParams
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.frames import SensorFrame
+from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.workers.rendering.cloud import Cloud, stored_cloud
 
 VOXEL_M = 0.005
 # Points of a frame without a mask that are the target's: nearer than this to one that is known to be.
@@ -80,7 +80,7 @@ def join_target(seen: SeenPoints, center_m: F64, radius_m: float, support_m: flo
 
 
 def crop_cloud(seen: SeenPoints, center_m: F64, params: ObservationParams, rng: np.random.Generator) -> Cloud:
-    """The cloud around the target as scenes store it (`workers.rendering.cloud.observe_cloud`).
+    """The cloud around the target as scenes store it (`datagen.workers.rendering.cloud.observe_cloud`).
 
     Within the crop radius, up to `min_target_points` of the target first, then all in random order
     without repetition; the first stored ones are a farthest-point sample.

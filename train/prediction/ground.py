@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from schemas.errors import InputError
-from train.prediction.files import Bools
-from train.prediction.frames import SensorFrame
-from workers.geometry.mesh import F32, F64
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.frames import SensorFrame
+from datagen.workers.geometry.mesh import F32, F64
 
 _SAMPLE = 20_000  # points that are looked at
 _MODES, _VOTERS = 200, 2500  # normals that are tried as the way up, and those that vote

@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from schemas.errors import InputError
-from train.prediction.files import Bools
-from train.prediction.frames import RgbdImage
-from train.prediction.ground import depth_error_m
-from train.prediction.target import from_nearest
-from workers.geometry.mesh import F32, F64
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.frames import RgbdImage
+from datagen.train.prediction.ground import depth_error_m
+from datagen.train.prediction.target import from_nearest
+from datagen.workers.geometry.mesh import F32, F64
 
 _GROWS_M = 0.24  # from the clicked point
 # Growth that comes so near to that distance has run out over a surface.

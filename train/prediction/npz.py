@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from train.prediction.files import FILE_MEND, MAX_FILE_BYTES, MAX_PIXELS
+from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.train.prediction.files import FILE_MEND, MAX_FILE_BYTES, MAX_PIXELS
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
 _MAX_ARRAY_BYTES = 4 * MAX_PIXELS

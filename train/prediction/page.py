@@ -7,12 +7,12 @@ from html import escape
 import numpy as np
 import plotly.graph_objects as go
 
-from schemas.errors import printable
-from schemas.specification import CandidateParams
-from train.prediction.answer import told
-from train.prediction.candidates import STATES
-from train.prediction.pictures import GOLD, shown_rows
-from train.prediction.predict import Prediction
+from datagen.schemas.errors import printable
+from datagen.schemas.specification import CandidateParams
+from datagen.train.prediction.answer import told
+from datagen.train.prediction.candidates import STATES
+from datagen.train.prediction.pictures import GOLD, shown_rows
+from datagen.train.prediction.predict import Prediction
 
 _MOST_POINTS = 20_000
 _SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open"}

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from schemas.specification import CandidateParams
-from train.prediction.answer import told
-from train.prediction.candidates import BLOCKED, CLEAR, STATES, UNSEEN
-from train.prediction.predict import Prediction
-from workers.geometry.mesh import F64
+from datagen.schemas.specification import CandidateParams
+from datagen.train.prediction.answer import told
+from datagen.train.prediction.candidates import BLOCKED, CLEAR, STATES, UNSEEN
+from datagen.train.prediction.predict import Prediction
+from datagen.workers.geometry.mesh import F64
 
 COLOURS, GOLD = "RdYlGn", "#ffc400"
 _EDGE = {CLEAR: "#20502c", UNSEEN: "none", BLOCKED: "none"}

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from train.prediction.files import FILE_MEND, MAX_FILE_BYTES, Bools
-from workers.geometry.mesh import F32, U8
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.train.prediction.files import FILE_MEND, MAX_FILE_BYTES, Bools
+from datagen.workers.geometry.mesh import F32, U8
 
 MAX_POINTS = 20_000_000
 _MAX_ASCII_POINTS = 2_000_000  # parsed as text they take a hundred times their memory

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.specification import CandidateParams, ObservationParams
-from train.inputs import Array, Batch, Candidates, Clouds, Robots
-from train.prediction.candidates import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import CandidateParams, ObservationParams
+from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.prediction.candidates import (
     BLOCKED,
     CLEAR,
     STATES,
@@ -23,15 +23,15 @@ from train.prediction.candidates import (
     look_at_places,
     seen_share,
 )
-from train.prediction.frames import SensorFrame, image_frame
-from train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
-from train.prediction.ground import Ground, find_ground
-from train.prediction.growing import grow_mask
-from train.prediction.target import Filled, TargetBox, fill_target, locate
-from train.scorers import ModelScorer, Scorer, scored
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, yaw_pose
-from workers.rendering.cloud import Cloud
+from datagen.train.prediction.frames import SensorFrame, image_frame
+from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
+from datagen.train.prediction.ground import Ground, find_ground
+from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
+from datagen.train.scorers import ModelScorer, Scorer, scored
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, yaw_pose
+from datagen.workers.rendering.cloud import Cloud
 
 # The margin is to this rank: neighbours of the best are nearly as good, and say nothing of doubt.
 _RANK = 10
@@ -142,7 +142,7 @@ _CROP = ObservationParams()
 def load_scorer(checkpoint: str | Path, device: str = "cpu") -> ModelScorer:
     """A checkpoint's model, ready to predict. InputError for what is no checkpoint."""
     # Imported here: frames are read and refused without torch.
-    from train.training.checkpoints import load_model
+    from datagen.train.training.checkpoints import load_model
 
     model, head = load_model(checkpoint, device)
     return ModelScorer(model, f"{head.model} ({head.stage})")

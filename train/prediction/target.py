@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from schemas.errors import InputError
-from train.prediction.files import Bools
-from train.prediction.frames import SensorFrame
-from workers.geometry.mesh import F32, F64
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.frames import SensorFrame
+from datagen.workers.geometry.mesh import F32, F64
 
 # Nothing that a gripper takes is wider: points farther from the middle of a target belong to other things.
 _LARGEST_M = 0.30

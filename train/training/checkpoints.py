@@ -22,13 +22,13 @@ import torch
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from schemas.whole_files import whole_file
-from train.dataset import Origin
-from train.models import Model, build_model
-from train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
-from train.training.validation import Measured
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.whole_files import whole_file
+from datagen.train.dataset import Origin
+from datagen.train.models import Model, build_model
+from datagen.train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
+from datagen.train.training.validation import Measured
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
 _MEND = "Name a checkpoint that `datagen train` wrote, or train it again"

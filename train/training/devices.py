@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 
 def choose_device(asked: str, processes: int | None) -> tuple[str, int]:

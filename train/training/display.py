@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from schemas.progress import Pace, Progress, clock_text, whole
-from train.training.watching import Step
+from datagen.schemas.progress import Pace, Progress, clock_text, whole
+from datagen.train.training.watching import Step
 
 
 class TrainingProgress:

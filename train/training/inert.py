@@ -16,8 +16,8 @@ import zipfile
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.archives import DAMAGED_ZIP
-from schemas.errors import InputError
+from datagen.schemas.archives import DAMAGED_ZIP
+from datagen.schemas.errors import InputError
 
 MAX_BYTES = 2 << 30
 _MAX_PICKLE_BYTES = 64 << 20

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from schemas.errors import InputError
-from schemas.private_folders import locked_folder
-from train.training.ranks import Ranks
+from datagen.schemas.errors import InputError
+from datagen.schemas.private_folders import locked_folder
+from datagen.train.training.ranks import Ranks
 
 Stopping = Callable[[], bool]
 # What each process does, importable by name; True when it came to its end.

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from schemas.errors import InputError
-from train.models import Model
+from datagen.schemas.errors import InputError
+from datagen.train.models import Model
 
 
 def make_optimiser(model: Model, lr: float, weight_decay: float) -> torch.optim.AdamW:

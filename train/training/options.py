@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 
 @dataclass(frozen=True)

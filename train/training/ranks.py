@@ -11,7 +11,7 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from train.models import Model
+from datagen.train.models import Model
 
 
 @dataclass(frozen=True)

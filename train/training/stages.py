@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from schemas.errors import InputError
-from schemas.progress import Progress
-from train.augment import Augmentation
-from train.dataset import SampleStream
-from train.models import Model, build_model
-from train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
-from train.training.checkpoints import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import Progress
+from datagen.train.augment import Augmentation
+from datagen.train.dataset import SampleStream
+from datagen.train.models import Model, build_model
+from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
+from datagen.train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
     below,
@@ -28,12 +28,12 @@ from train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from train.training.display import TrainingProgress
-from train.training.loop import Position, Training, run
-from train.training.optimising import make_optimiser, optimiser_tensors, put_optimiser_tensors
-from train.training.options import STAGES, Options
-from train.training.ranks import Ranks
-from train.training.watching import TensorBoard, Watcher, Watchers
+from datagen.train.training.display import TrainingProgress
+from datagen.train.training.loop import Position, Training, run
+from datagen.train.training.optimising import make_optimiser, optimiser_tensors, put_optimiser_tensors
+from datagen.train.training.options import STAGES, Options
+from datagen.train.training.ranks import Ranks
+from datagen.train.training.watching import TensorBoard, Watcher, Watchers
 
 
 @dataclass(frozen=True)

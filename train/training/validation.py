@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from schemas.errors import InputError
-from train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
-from train.inputs import Array, Batch
-from train.models import Model
-from train.tensors import to_torch
-from train.training.ranks import Ranks
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
+from datagen.train.inputs import Array, Batch
+from datagen.train.models import Model
+from datagen.train.tensors import to_torch
+from datagen.train.training.ranks import Ranks
 
 
 class Measured(TypedDict):

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from schemas.errors import InputError
-from workers.registry import install_line
+from datagen.schemas.errors import InputError
+from datagen.workers.registry import install_line
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from schemas.specification import CandidateParams, Range
-from workers.bases.clearance import Obstacles, base_clearance_m
-from workers.geometry.mesh import F32, F64
-from workers.redraw import Redraw
+from datagen.schemas.specification import CandidateParams, Range
+from datagen.workers.bases.clearance import Obstacles, base_clearance_m
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.redraw import Redraw
 
 Bools = npt.NDArray[np.bool_]
 

@@ -6,10 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.specification import CandidateParams
-from workers.geometry.mesh import F32, F64
-from workers.geometry.planar import convex_hull, inside_any, signed_distances_to_convex, stack_polygons
-from workers.houses.house import House
+from datagen.schemas.specification import CandidateParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.planar import (
+    convex_hull,
+    inside_any,
+    signed_distances_to_convex,
+    stack_polygons,
+)
+from datagen.workers.houses.house import House
 
 # A base rolls over what is flatter than this, and floors lie below it.
 STEP_M = 0.02

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 
 def convex_hull(points_m: F64) -> F64:

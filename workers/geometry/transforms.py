@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 
 def translation(x_m: float, y_m: float, z_m: float) -> F64:

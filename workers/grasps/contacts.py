@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
-from workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64
 
 Ints = npt.NDArray[np.int64]
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import inverse, rotation_of, translation
-from workers.robots.robot import Gripper, Parts
-from workers.settling.sapien_bodies import add_object, convex_shape, pad_material, sapien_pose
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import inverse, rotation_of, translation
+from datagen.workers.robots.robot import Gripper, Parts
+from datagen.workers.settling.sapien_bodies import add_object, convex_shape, pad_material, sapien_pose
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

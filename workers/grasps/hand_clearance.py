@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64
-from workers.robots.polyhedron import coal, polyhedron
-from workers.robots.robot import Gripper
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.robots.polyhedron import coal, polyhedron
+from datagen.workers.robots.robot import Gripper
 
 Bools = npt.NDArray[np.bool_]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F64
-from workers.grasps.contacts import Contacts, perpendicular
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.grasps.contacts import Contacts, perpendicular
 
 # How far the contacts lie in front of the pads' middle, in half pad lengths: pulled back, the finger tips do
 # not dig below flat things. Beyond 1 the pads would miss the contacts.

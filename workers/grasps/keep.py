@@ -8,13 +8,13 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from schemas.identity import digest_of
-from schemas.specification import GraspParams
-from workers.content_cache import Arrays, Shelf
-from workers.grasps.grasp import GraspSet
-from workers.grasps.search import VERSION, ScoredGrasps, search_grasps
-from workers.objects.model import ObjectModel
-from workers.robots.robot import Gripper, Parts
+from datagen.schemas.identity import digest_of
+from datagen.schemas.specification import GraspParams
+from datagen.workers.content_cache import Arrays, Shelf
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.search import VERSION, ScoredGrasps, search_grasps
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.robot import Gripper, Parts
 
 _KEPT_IN_MEMORY = 512
 _SHELF = Shelf(

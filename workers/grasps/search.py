@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import QhullError
 
-from workers.geometry.mesh import F32, F64
-from workers.grasps.contacts import cone_directions, contact_pairs, solid_of, surface_points
-from workers.grasps.floating_hand import HandTest, held_trials
-from workers.grasps.hand_clearance import HandClearance, lowest_m
-from workers.grasps.hand_poses import flipped, hand_poses, varied
-from workers.objects.model import ObjectModel
-from workers.robots.robot import Gripper
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.grasps.contacts import cone_directions, contact_pairs, solid_of, surface_points
+from datagen.workers.grasps.floating_hand import HandTest, held_trials
+from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
+from datagen.workers.grasps.hand_poses import flipped, hand_poses, varied
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.robot import Gripper
 
 Bools = npt.NDArray[np.bool_]
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.specification import GraspParams
-from workers.grasps.keep import scored_grasps
-from workers.objects.convex import MAX_TARGET_MASS_KG
-from workers.objects.model import ObjectModel
-from workers.robots.robot import Gripper
+from datagen.schemas.specification import GraspParams
+from datagen.workers.grasps.keep import scored_grasps
+from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.robot import Gripper
 
 MIN_CLEAR_GRASPS = 20
 MIN_HELD_SHARE = 0.25

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from workers.houses.house import HouseSource
-from workers.houses.split import ids_of_split, split_of
-from workers.registry import open_source
+from datagen.workers.houses.house import HouseSource
+from datagen.workers.houses.split import ids_of_split, split_of
+from datagen.workers.registry import open_source
 
 # Each opens the source which the text after a reference's colon describes.
 HOUSE_SOURCES: dict[str, str] = {
-    "builtin": "workers.houses.builtin:open_builtin",
-    "procthor": "workers.houses.procthor:open_procthor",
-    "ai2thor": "workers.houses.ai2thor:open_ai2thor",
+    "builtin": "datagen.workers.houses.builtin:open_builtin",
+    "procthor": "datagen.workers.houses.procthor:open_procthor",
+    "ai2thor": "datagen.workers.houses.ai2thor:open_ai2thor",
 }
 
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.houses.reading import Node, parse_json
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.houses.reading import Node, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
 _LARGEST_TABLE_BYTES = 64 << 20

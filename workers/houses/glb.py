@@ -11,10 +11,10 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.geometry.mesh import F64, U8, Mesh
-from workers.houses.reading import parse_json
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.geometry.mesh import F64, U8, Mesh
+from datagen.workers.houses.reading import parse_json
 
 MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.geometry.mesh import F32, F64, Mesh
 
 BodyKind = Literal["wall", "furniture", "small"]
 

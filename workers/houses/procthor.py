@@ -8,14 +8,14 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from schemas.errors import InputError
-from schemas.identity import digest_of
-from workers.houses.asset_table import TABLE_NAMES, Asset, read_asset_table
-from workers.houses.colours import hash_bytes
-from workers.houses.house import House
-from workers.houses.line_index import MAX_LINES, LineIndex, houses_cache, open_lines
-from workers.houses.loader import build_house
-from workers.houses.reading import parse_json
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.workers.houses.asset_table import TABLE_NAMES, Asset, read_asset_table
+from datagen.workers.houses.colours import hash_bytes
+from datagen.workers.houses.house import House
+from datagen.workers.houses.line_index import MAX_LINES, LineIndex, houses_cache, open_lines
+from datagen.workers.houses.loader import build_house
+from datagen.workers.houses.reading import parse_json
 
 _MAX_FILES = 100_000
 _SUFFIXES = (".jsonl.gz", ".jsonl", ".json")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
-from schemas.errors import InputError, printable
+from datagen.schemas.errors import InputError, printable
 
 # No house is larger; a larger coordinate is a unit error or garbage.
 EXTENT_M = 1000.0

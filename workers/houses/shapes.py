@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
-from workers.geometry.mesh import F32, Mesh
-from workers.houses import fixture_shapes as x
-from workers.houses import furniture_shapes as f
-from workers.houses import small_shapes as s
-from workers.houses.asset_table import Asset
-from workers.houses.colours import pick
-from workers.houses.solids import Rgb, Solid, join
+from datagen.workers.geometry.mesh import F32, Mesh
+from datagen.workers.houses import fixture_shapes as x
+from datagen.workers.houses import furniture_shapes as f
+from datagen.workers.houses import small_shapes as s
+from datagen.workers.houses.asset_table import Asset
+from datagen.workers.houses.colours import pick
+from datagen.workers.houses.solids import Rgb, Solid, join
 
 Shape = Callable[[Asset, Rgb], list[Solid]]
 

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from workers.geometry.mesh import F32, F64, I32, Mesh
+from datagen.workers.geometry.mesh import F32, F64, I32, Mesh
 
 Rgb = tuple[int, int, int]
 

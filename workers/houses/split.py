@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Literal
 
-from workers.houses.house import HouseSource
+from datagen.workers.houses.house import HouseSource
 
 SplitName = Literal["train", "val", "test"]
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from workers.labels.source import LabelSource
-from workers.registry import entry
+from datagen.workers.labels.source import LabelSource
+from datagen.workers.registry import entry
 
 LABEL_SOURCES: dict[str, str] = {
-    "heuristic": "workers.labels.distance_visibility:HEURISTIC",
-    "plan": "workers.labels.plan:PLAN",
-    "sim": "workers.labels.sim:SIM",
+    "heuristic": "datagen.workers.labels.distance_visibility:HEURISTIC",
+    "plan": "datagen.workers.labels.plan:PLAN",
+    "sim": "datagen.workers.labels.sim:SIM",
 }
 
 

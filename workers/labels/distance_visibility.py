@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates, distances
-from workers.labels import heuristic as formula
-from workers.labels.source import Columns, LabelSource
-from workers.rendering.visibility import visible_pixels
-from workers.scenes.scene import SettledScene
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates, distances
+from datagen.workers.labels import heuristic as formula
+from datagen.workers.labels.source import Columns, LabelSource
+from datagen.workers.rendering.visibility import visible_pixels
+from datagen.workers.scenes.scene import SettledScene
 
 
 def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.specification import HeuristicParams
-from workers.geometry.mesh import F32, F64, U8
+from datagen.schemas.specification import HeuristicParams
+from datagen.workers.geometry.mesh import F32, F64, U8
 
 VERSION = 1
 

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.outcomes import OUTCOMES
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates
-from workers.geometry.mesh import F64
-from workers.labels import distance_visibility
-from workers.labels.source import Columns, LabelSource
-from workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, target_tcp, try_candidate
-from workers.motion.plan import MotionPlan
-from workers.scenes.scene import SettledScene
+from datagen.schemas.cost import StageClock
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.labels import distance_visibility
+from datagen.workers.labels.source import Columns, LabelSource
+from datagen.workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, target_tcp, try_candidate
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.scenes.scene import SettledScene
 
 VERSION = 1
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates
-from workers.labels import plan
-from workers.labels.source import Columns, LabelSource
-from workers.scenes.scene import SettledScene
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.labels import plan
+from datagen.workers.labels.source import Columns, LabelSource
+from datagen.workers.scenes.scene import SettledScene
 
 VERSION = 1
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.specification import Specification
-from workers.bases.candidates import Candidates
-from workers.scenes.scene import SettledScene
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.scenes.scene import SettledScene
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

@@ -12,26 +12,26 @@ from functools import cached_property
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.identity import Stream, generator
-from schemas.outcomes import OUTCOMES
-from schemas.specification import ArmParams, DisturbanceParams, Specification
-from workers.bases.candidates import Candidates
-from workers.bases.clearance import base_clearance_m
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, translation, yaw_pose
-from workers.grasps.grasp import GraspSet
-from workers.grasps.keep import grasps_of
-from workers.motion.candidate import plan_candidate
-from workers.motion.collision import Bools
-from workers.motion.plan import MotionPlan, PlanReport
-from workers.motion.scene import PlanningScene, pose_of_base, prepare
-from workers.robots import open_robot
-from workers.robots.robot import Robot
-from workers.scenes.scene import SettledScene
-from workers.trials.execute import TrialScene, prepare_trials, run_trial
-from workers.trials.trial import Disturbance, TrialResult
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.clearance import base_clearance_m
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.keep import grasps_of
+from datagen.workers.motion.candidate import plan_candidate
+from datagen.workers.motion.collision import Bools
+from datagen.workers.motion.plan import MotionPlan, PlanReport
+from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.robots import open_robot
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
+from datagen.workers.trials.trial import Disturbance, TrialResult
 
 _PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; success is first
 

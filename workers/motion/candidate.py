@@ -7,16 +7,16 @@ from functools import partial
 
 import numpy as np
 
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse
-from workers.motion.collision import Ints
-from workers.motion.hand import backed, line_offsets_m, raised
-from workers.motion.lines import follow_line
-from workers.motion.plan import MotionPlan, PlanReport
-from workers.motion.reach_table import order_by_distance
-from workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
-from workers.motion.scene import PlanningScene
-from workers.motion.surroundings import Surroundings, surroundings
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.motion.collision import Ints
+from datagen.workers.motion.hand import backed, line_offsets_m, raised
+from datagen.workers.motion.lines import follow_line
+from datagen.workers.motion.plan import MotionPlan, PlanReport
+from datagen.workers.motion.reach_table import order_by_distance
+from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
+from datagen.workers.motion.scene import PlanningScene
+from datagen.workers.motion.surroundings import Surroundings, surroundings
 
 # The order in which a grasp is looked at, cheap questions first: a path is searched only to grasps
 # from which the rest is known to work. A later cause came further.

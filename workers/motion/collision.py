@@ -14,9 +14,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64
-from workers.objects.model import ObjectModel
-from workers.robots.polyhedron import coal, polyhedron
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.polyhedron import coal, polyhedron
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]

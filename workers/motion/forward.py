@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse
-from workers.motion.collision import Ints
-from workers.robots.robot import Robot
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.motion.collision import Ints
+from datagen.workers.robots.robot import Robot
 
 _MOVES = 1e-9
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from workers.geometry.mesh import F64
-from workers.motion.rrt_connect import dense
-from workers.motion.surroundings import Surroundings
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.rrt_connect import dense
+from datagen.workers.motion.surroundings import Surroundings
 
 _OFF_LINE_M = 0.002  # between neighbouring points, where joints and not the hand move evenly
 

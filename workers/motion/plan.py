@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 
 @dataclass(frozen=True, eq=False)

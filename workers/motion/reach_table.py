@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from workers.geometry.mesh import F64
-from workers.motion.collision import Ints
-from workers.motion.forward import ForwardKinematics
-from workers.robots.robot import Robot
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.collision import Ints
+from datagen.workers.motion.forward import ForwardKinematics
+from datagen.workers.robots.robot import Robot
 
 _SAMPLES = 16384
 _PROBES = 1024

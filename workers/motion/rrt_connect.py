@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 # The first of M configurations (M, A) that is in collision, or M where none is.
 FirstBlocked = Callable[[F64], int]

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.specification import MotionParams
-from workers.bases.clearance import STEP_M
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import yaw_pose
-from workers.grasps.grasp import GraspSet
-from workers.motion.collision import (
+from datagen.schemas.specification import MotionParams
+from datagen.workers.bases.clearance import STEP_M
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.motion.collision import (
     Bools,
     Hulls,
     Ints,
@@ -23,11 +23,11 @@ from workers.motion.collision import (
     place,
     place_object,
 )
-from workers.motion.forward import ForwardKinematics, forward_kinematics
-from workers.motion.hand import Hand, best_different, can_be_lifted, free_grasps, hand_of
-from workers.motion.reach_table import ReachTable, reach_table
-from workers.robots.robot import Robot
-from workers.scenes.scene import SettledScene
+from datagen.workers.motion.forward import ForwardKinematics, forward_kinematics
+from datagen.workers.motion.hand import Hand, best_different, can_be_lifted, free_grasps, hand_of
+from datagen.workers.motion.reach_table import ReachTable, reach_table
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
 
 _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount

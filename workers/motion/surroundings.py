@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from workers.geometry.mesh import F64
-from workers.motion.collision import Bools, Hulls, Placed, hits, joined, place, smallest_gap_m
-from workers.motion.scene import ROOM_AROUND_M, PlanningScene
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, joined, place, smallest_gap_m
+from datagen.workers.motion.scene import ROOM_AROUND_M, PlanningScene
 
 _FAR_M = 1.0  # clearances are not looked for beyond this
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from workers.objects.model import ObjectModel, ObjectSource
-from workers.registry import open_source
+from datagen.workers.objects.model import ObjectModel, ObjectSource
+from datagen.workers.registry import open_source
 
 __all__ = ["OBJECT_SOURCES", "ObjectModel", "ObjectSource", "open_objects"]
 
 
 # Each takes what follows the first colon of a reference, "" where there is none.
 OBJECT_SOURCES: dict[str, str] = {
-    "builtin": "workers.objects.builtin:open_builtin",
-    "ycb": "workers.objects.ycb:open_ycb",
+    "builtin": "datagen.workers.objects.builtin:open_builtin",
+    "ycb": "datagen.workers.objects.ycb:open_ycb",
 }
 
 

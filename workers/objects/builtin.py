@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.identity import digest_of
-from workers.geometry.mesh import Mesh
-from workers.objects import shapes
-from workers.objects.builtin_table import RECIPES
-from workers.objects.convex import ConvexParts, convex_parts, fits_gripper
-from workers.objects.model import ObjectModel
-from workers.objects.shapes import Paint, Solid
-from workers.objects.ycb_masses import PUBLISHED_MASS_KG
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.workers.geometry.mesh import Mesh
+from datagen.workers.objects import shapes
+from datagen.workers.objects.builtin_table import RECIPES
+from datagen.workers.objects.convex import ConvexParts, convex_parts, fits_gripper
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.objects.shapes import Paint, Solid
+from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 # Part of every digest: raise it when `shapes` or the assembly here changes what comes out.
 GENERATOR_VERSION = 1

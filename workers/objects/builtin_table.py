@@ -9,7 +9,7 @@ give (wall thicknesses, necks, handles, colours) is chosen to look and weigh lik
 
 from __future__ import annotations
 
-from workers.objects.builtin_pieces import (
+from datagen.workers.objects.builtin_pieces import (
     Piece,
     Points,
     arc,

@@ -14,10 +14,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.geometry.mesh import F32, F64
-from workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
 # A part thinner than this cannot be told from a sheet: physics engines reject or explode on it.
 MIN_THICKNESS_M = 1e-4

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
-from workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64
 
 _ROUNDING_M = 1e-6  # of float32 vertices a few decimetres from the origin
 

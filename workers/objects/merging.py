@@ -14,9 +14,9 @@ import numpy as np
 import scipy
 from scipy.ndimage import map_coordinates
 
-from workers.content_cache import Arrays, Shelf
-from workers.geometry.mesh import F32
-from workers.objects.hulls import (
+from datagen.workers.content_cache import Arrays, Shelf
+from datagen.workers.geometry.mesh import F32
+from datagen.workers.objects.hulls import (
     Hull,
     bounds_m,
     distances_m,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from workers.geometry.mesh import F32, Mesh
+from datagen.workers.geometry.mesh import F32, Mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from schemas.foreign_files import open_regular
-from workers.geometry.mesh import F64
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import open_regular
+from datagen.workers.geometry.mesh import F64
 
 I64 = npt.NDArray[np.int64]
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.foreign_files import open_regular
-from schemas.identity import digest_of
-from workers.content_cache import Arrays, Shelf
-from workers.geometry.mesh import F32, Mesh, Texture
-from workers.objects.convex import ConvexParts, read_convex_parts
-from workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
-from workers.objects.texture import face_colours, read_texture
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import open_regular
+from datagen.schemas.identity import digest_of
+from datagen.workers.content_cache import Arrays, Shelf
+from datagen.workers.geometry.mesh import F32, Mesh, Texture
+from datagen.workers.objects.convex import ConvexParts, read_convex_parts
+from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
+from datagen.workers.objects.texture import face_colours, read_texture
 
 # Part of every cache key: raise it when the reading changes what comes out.
 READER_VERSION = 1

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from workers.geometry.mesh import F32, F64, Mesh, concatenate
+from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
 
 Rgb = tuple[int, int, int]
 Indices = npt.NDArray[np.int64]

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from schemas.errors import InputError
-from schemas.foreign_files import open_regular, read_regular
-from workers.geometry.mesh import F32, I32, U8
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import open_regular, read_regular
+from datagen.workers.geometry.mesh import F32, I32, U8
 
 MAX_FILE_BYTES = 256 * 2**20
 MAX_SIDE_PX = 16_384

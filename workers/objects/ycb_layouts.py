@@ -14,13 +14,13 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.houses.reading import parse_json
-from workers.objects.obj_file import read_obj_header
-from workers.objects.scan import ScanFiles, scan_files
-from workers.objects.texture import texture_of_material
-from workers.objects.ycb_masses import PUBLISHED_MASS_KG
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.houses.reading import parse_json
+from datagen.workers.objects.obj_file import read_obj_header
+from datagen.workers.objects.scan import ScanFiles, scan_files
+from datagen.workers.objects.texture import texture_of_material
+from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 MAX_INDEX_BYTES = 16 * 2**20
 MAX_OBJECTS = 10_000

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from workers.registry import entry
-from workers.rendering.frame import Renderer
+from datagen.workers.registry import entry
+from datagen.workers.rendering.frame import Renderer
 
 RENDERERS: dict[str, str] = {
-    "embree": "workers.rendering.embree_renderer:render_embree",
-    "pybullet": "workers.rendering.pybullet_renderer:render_pybullet",
-    "sapien": "workers.rendering.sapien_renderer:render_sapien",
+    "embree": "datagen.workers.rendering.embree_renderer:render_embree",
+    "pybullet": "datagen.workers.rendering.pybullet_renderer:render_pybullet",
+    "sapien": "datagen.workers.rendering.sapien_renderer:render_sapien",
 }
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from schemas.specification import ObservationParams
-from workers.geometry.mesh import F32, F64, U8
-from workers.rendering.embree_renderer import Pixels, pixel_directions
-from workers.rendering.frame import Camera, Frame
+from datagen.schemas.specification import ObservationParams
+from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.workers.rendering.embree_renderer import Pixels, pixel_directions
+from datagen.workers.rendering.frame import Camera, Frame
 
 PixelCaster = Callable[[npt.NDArray[np.int64]], Pixels]
 _BLOCK = 8192

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64, U8
-from workers.rendering.frame import I16, Camera, Frame, Stage
-from workers.rendering.rays import (
+from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.workers.rendering.rays import (
     MISS,
     Hits,
     RayMesh,
@@ -39,7 +39,7 @@ class Pixels:
 
 
 def ray_stage(stage: Stage) -> RayStage:
-    """Hierarchies of a stage, built from scratch; runs keep them in `workers.world` instead."""
+    """Hierarchies of a stage, built from scratch; runs keep them in `datagen.workers.world` instead."""
     return RayStage(
         house_rays(stage.house),
         [object_rays(model) for model in stage.objects],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from workers.geometry.mesh import F32, U8, Mesh
+from datagen.workers.geometry.mesh import F32, U8, Mesh
 
 _PALETTE_WIDTH = 256
 

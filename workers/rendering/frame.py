@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64, U8
-from workers.houses.house import House
-from workers.objects.model import ObjectModel
+from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.workers.houses.house import House
+from datagen.workers.objects.model import ObjectModel
 
 I16 = npt.NDArray[np.int16]
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from schemas.specification import NoiseParams
-from workers.geometry.mesh import F32, F64
-from workers.rendering.frame import Camera, Frame
+from datagen.schemas.specification import NoiseParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.rendering.frame import Camera, Frame
 
 # Matchers interpolate between pixels and report this fraction of one: a D4 camera's 1/32.
 _DISPARITY_STEP_PX = 1 / 32

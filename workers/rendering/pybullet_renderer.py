@@ -12,11 +12,11 @@ import numpy.typing as npt
 import pybullet
 from PIL import Image
 
-from schemas.errors import InputError
-from workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
-from workers.geometry.transforms import inverse, look_at, quaternion_wxyz
-from workers.rendering.face_texture import face_normals, face_texture
-from workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
+from datagen.workers.geometry.transforms import inverse, look_at, quaternion_wxyz
+from datagen.workers.rendering.face_texture import face_normals, face_texture
+from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
 
 # What is nearer or farther is not drawn. A near plane far off keeps depth sharp; one close to the
 # eye shows the wall that an eye stands in.
@@ -64,7 +64,7 @@ class PybulletStage:
     def visible_pixels(self, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
         """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
 
-        The same cameras as `workers.rendering.visibility.visible_pixels`: each eye (N, 3) looks at
+        The same cameras as `datagen.workers.rendering.visibility.visible_pixels`: each eye (N, 3) looks at
         the target's centre through `window` x `window` pixels that touch its bounding sphere.
         """
         if target not in self._alone:

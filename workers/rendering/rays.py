@@ -15,9 +15,9 @@ import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from workers.geometry.mesh import F32, F64, I32, Mesh, concatenate
-from workers.houses.house import House
-from workers.objects.model import ObjectModel
+from datagen.workers.geometry.mesh import F32, F64, I32, Mesh, concatenate
+from datagen.workers.houses.house import House
+from datagen.workers.objects.model import ObjectModel
 
 MISS = np.float32(1e37)  # what Embree leaves in a ray that hit nothing
 

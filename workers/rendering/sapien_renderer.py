@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from schemas.errors import InputError
-from workers.geometry.mesh import F64, Mesh, concatenate
-from workers.geometry.transforms import quaternion_wxyz
-from workers.rendering.face_texture import face_normals, face_texture
-from workers.rendering.frame import Camera, Frame, Stage
+from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F64, Mesh, concatenate
+from datagen.workers.geometry.transforms import quaternion_wxyz
+from datagen.workers.rendering.face_texture import face_normals, face_texture
+from datagen.workers.rendering.frame import Camera, Frame, Stage
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; whether one works is found out below.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import look_at
-from workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import look_at
+from datagen.workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
 
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.

@@ -6,19 +6,19 @@ import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError
-from workers.registry import entry
-from workers.robots.description import RobotDescription, RobotLimits
+from datagen.schemas.errors import InputError
+from datagen.workers.registry import entry
+from datagen.workers.robots.description import RobotDescription, RobotLimits
 
 if TYPE_CHECKING:
-    from workers.robots.arm import Arm
-    from workers.robots.robot import Gripper, Robot
+    from datagen.workers.robots.arm import Arm
+    from datagen.workers.robots.robot import Gripper, Robot
 
 ROBOTS: dict[str, str] = {
-    "panda-scaled": "workers.robots.panda:PANDA_SCALED",
-    "panda": "workers.robots.panda:PANDA",
-    "xarm7": "workers.robots.xarm7:XARM7",
-    "fetch": "workers.robots.fetch:FETCH",
+    "panda-scaled": "datagen.workers.robots.panda:PANDA_SCALED",
+    "panda": "datagen.workers.robots.panda:PANDA",
+    "xarm7": "datagen.workers.robots.xarm7:XARM7",
+    "fetch": "datagen.workers.robots.fetch:FETCH",
 }
 
 # Reaches and heights are stated in whole millimetres.
@@ -79,7 +79,7 @@ def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Arm:
 @lru_cache(maxsize=64)
 def _built(name: str, reach_m: float | None, base_height_m: float) -> Arm:
     # Imported when asked for, so that limits can be read without a simulator.
-    build = entry({name: "workers.robots.arm:Arm"}, name, "--robot")
+    build = entry({name: "datagen.workers.robots.arm:Arm"}, name, "--robot")
     return build(_description(name), reach_m, base_height_m)
 
 

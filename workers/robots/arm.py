@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from workers.geometry.mesh import F64, Mesh
-from workers.geometry.transforms import inverse
-from workers.robots.assembly import Assembly, assemble, gripper_of
-from workers.robots.description import RobotDescription
-from workers.robots.inverse import solve
-from workers.robots.looks import body_mesh
-from workers.robots.robot import Gripper, Parts
-from workers.robots.self_collision import SelfCollision
-from workers.robots.written import RobotFiles, hull_of
+from datagen.workers.geometry.mesh import F64, Mesh
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.robots.assembly import Assembly, assemble, gripper_of
+from datagen.workers.robots.description import RobotDescription
+from datagen.workers.robots.inverse import solve
+from datagen.workers.robots.looks import body_mesh
+from datagen.workers.robots.robot import Gripper, Parts
+from datagen.workers.robots.self_collision import SelfCollision
+from datagen.workers.robots.written import RobotFiles, hull_of
 
 # Its binary modules have no types.
 pin: Any = pinocchio
 
 
 class Arm:
-    """Implements `workers.robots.robot.Robot`; see there for what each part means."""
+    """Implements `datagen.workers.robots.robot.Robot`; see there for what each part means."""
 
     def __init__(self, description: RobotDescription, reach_m: float | None, base_height_m: float) -> None:
         lift = description.lift

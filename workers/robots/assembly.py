@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.identity import digest_of
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import inverse, translation
-from workers.robots.chain import Chain, largest_reach_m
-from workers.robots.description import HandDescription, RobotDescription, robots_folder
-from workers.robots.hulls import shape_parts
-from workers.robots.robot import Gripper, Parts
-from workers.robots.urdf import Inertial, Joint, Link, Shape, Tree, read_urdf, scaled_inertial
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.robots.chain import Chain, largest_reach_m
+from datagen.workers.robots.description import HandDescription, RobotDescription, robots_folder
+from datagen.workers.robots.hulls import shape_parts
+from datagen.workers.robots.robot import Gripper, Parts
+from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, Tree, read_urdf, scaled_inertial
 
 _TUBE_SIDES = 12
 _REACH_TOLERANCE_M = 1e-6

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
-from schemas.errors import InputError
-from workers.geometry.mesh import F64
-from workers.registry import SIM_MEND
+from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.registry import SIM_MEND
 
 
 @dataclass(frozen=True)

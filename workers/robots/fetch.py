@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from workers.geometry.transforms import translation
-from workers.robots.description import HandDescription, RobotDescription, RobotLimits, TorsoLift
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.robots.description import HandDescription, RobotDescription, RobotLimits, TorsoLift
 
 FETCH_HAND = HandDescription(
     name="fetch-gripper",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from workers.geometry.transforms import translation
-from workers.robots.description import HandDescription
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.robots.description import HandDescription
 
 FRANKA_HAND = HandDescription(
     name="franka-hand",

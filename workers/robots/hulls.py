@@ -12,11 +12,11 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.geometry.mesh import F32, F64, I32
-from workers.robots.robot import Parts
-from workers.robots.urdf import Shape
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.geometry.mesh import F32, F64, I32
+from datagen.workers.robots.robot import Parts
+from datagen.workers.robots.urdf import Shape
 
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio
 from scipy.linalg import lapack
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 # Binary modules have no types.
 pin: Any = pinocchio

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from workers.geometry.mesh import F32, Mesh, concatenate
-from workers.houses.glb import read_glb
-from workers.robots.assembly import Body
-from workers.robots.hulls import hull_faces
+from datagen.workers.geometry.mesh import F32, Mesh, concatenate
+from datagen.workers.houses.glb import read_glb
+from datagen.workers.robots.assembly import Body
+from datagen.workers.robots.hulls import hull_faces
 
 _GREY = 190
 

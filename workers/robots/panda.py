@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from math import pi
 
-from workers.geometry.transforms import yaw_pose
-from workers.robots.description import RobotDescription, RobotLimits, WristExtension, turned_homes
-from workers.robots.franka_hand import FRANKA_HAND
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.robots.description import RobotDescription, RobotLimits, WristExtension, turned_homes
+from datagen.workers.robots.franka_hand import FRANKA_HAND
 
 PANDA = RobotDescription(
     name="panda",

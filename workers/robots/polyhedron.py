@@ -7,7 +7,7 @@ from typing import Any
 import coal as _library
 import numpy as np
 
-from workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.mesh import F32, F64
 
 # coal's module fills itself at import time, which type checkers do not see.
 coal: Any = _library

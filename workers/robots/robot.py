@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.geometry.mesh import F32, F64, Mesh
 
 Parts = tuple[F32, ...]  # convex parts, each (V, 3)
 _Y = np.array([0.0, 1.0, 0.0], np.float32)

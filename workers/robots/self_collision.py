@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from workers.geometry.mesh import F64
-from workers.robots.polyhedron import polyhedron
-from workers.robots.robot import Parts
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.robots.polyhedron import polyhedron
+from datagen.workers.robots.robot import Parts
 
 # Its binary modules have no types.
 pin: Any = pinocchio

@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from schemas.errors import InputError
-from schemas.foreign_files import read_regular
-from workers.geometry.mesh import F64
+from datagen.schemas.errors import InputError
+from datagen.schemas.foreign_files import read_regular
+from datagen.workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20
 _MAX_LINKS = 1000

@@ -13,14 +13,14 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from schemas.identity import digest_of
-from schemas.whole_files import whole_file
-from workers.content_cache import alone_in, cache_folder, drop_unused, refresh
-from workers.geometry.mesh import F32, F64
-from workers.robots.assembly import Assembly, Body
-from workers.robots.hulls import hull_faces
-from workers.robots.robot import Parts
-from workers.robots.urdf import Inertial, Joint, rotation_rpy
+from datagen.schemas.identity import digest_of
+from datagen.schemas.whole_files import whole_file
+from datagen.workers.content_cache import alone_in, cache_folder, drop_unused, refresh
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.robots.assembly import Assembly, Body
+from datagen.workers.robots.hulls import hull_faces
+from datagen.workers.robots.robot import Parts
+from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 
 # Files of the cache's folder; a robot has two of its own and shares the others with its family.
 _MOST_FILES = 8192

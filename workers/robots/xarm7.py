@@ -6,8 +6,8 @@ from math import pi
 
 import numpy as np
 
-from workers.robots.description import RobotDescription, RobotLimits, turned_homes
-from workers.robots.franka_hand import FRANKA_HAND
+from datagen.workers.robots.description import RobotDescription, RobotLimits, turned_homes
+from datagen.workers.robots.franka_hand import FRANKA_HAND
 
 XARM7 = RobotDescription(
     name="xarm7",

@@ -6,27 +6,27 @@ from collections import Counter
 
 import numpy as np
 
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.identity import Stream, generator
-from schemas.specification import ObservationParams, SettleParams
-from workers.bases.candidates import Candidates, draw_candidates
-from workers.geometry.mesh import F64
-from workers.houses.house import Surface
-from workers.objects.model import ObjectModel
-from workers.redraw import Redraw
-from workers.rendering import load_renderer
-from workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
-from workers.rendering.embree_renderer import cast_pixels
-from workers.rendering.frame import Camera, Frame, Stage
-from workers.rendering.noise import add_noise
-from workers.rendering.rays import RayStage
-from workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
-from workers.scenes.scene import Scene
-from workers.scenes.viewpoint import draw_viewpoint
-from workers.settling import load_settler
-from workers.settling.settler import SettleResult
-from workers.world import PreparedHouse, World
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import ObservationParams, SettleParams
+from datagen.workers.bases.candidates import Candidates, draw_candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses.house import Surface
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.redraw import Redraw
+from datagen.workers.rendering import load_renderer
+from datagen.workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
+from datagen.workers.rendering.embree_renderer import cast_pixels
+from datagen.workers.rendering.frame import Camera, Frame, Stage
+from datagen.workers.rendering.noise import add_noise
+from datagen.workers.rendering.rays import RayStage
+from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
+from datagen.workers.scenes.scene import Scene
+from datagen.workers.scenes.viewpoint import draw_viewpoint
+from datagen.workers.settling import load_settler
+from datagen.workers.settling.settler import SettleResult
+from datagen.workers.world import PreparedHouse, World
 
 # Static parts this far from the support can be touched by what rolls off; farther ones cannot.
 _SURROUNDINGS_M = 0.3

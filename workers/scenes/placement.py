@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from schemas.specification import SceneParams
-from workers.geometry.mesh import F32, F64
-from workers.geometry.planar import convex_hull
-from workers.geometry.transforms import yaw_pose
-from workers.houses.house import House, Surface
-from workers.objects.model import ObjectModel
-from workers.redraw import Redraw
+from datagen.schemas.specification import SceneParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.planar import convex_hull
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.houses.house import House, Surface
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.redraw import Redraw
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from schemas.errors import InputError
-from workers.bases.candidates import Candidates
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import is_pose
-from workers.objects.model import ObjectModel
-from workers.rendering.frame import Camera, Stage
-from workers.rendering.rays import RayStage
-from workers.world import PreparedHouse, World
+from datagen.schemas.errors import InputError
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import is_pose
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.frame import Camera, Stage
+from datagen.workers.rendering.rays import RayStage
+from datagen.workers.world import PreparedHouse, World
 
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from workers.geometry.mesh import F64
-from workers.houses.house import Surface
-from workers.objects.model import ObjectModel
-from workers.rendering.cloud import Cloud
-from workers.rendering.frame import Camera
-from workers.rendering.rays import RayStage
-from workers.settling.settler import SettleResult
-from workers.world import PreparedHouse
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.houses.house import Surface
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.cloud import Cloud
+from datagen.workers.rendering.frame import Camera
+from datagen.workers.rendering.rays import RayStage
+from datagen.workers.settling.settler import SettleResult
+from datagen.workers.world import PreparedHouse
 
 
 class SettledScene(Protocol):

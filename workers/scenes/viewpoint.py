@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.specification import CandidateParams, ObservationParams
-from workers.bases.clearance import Obstacles, base_clearance_m
-from workers.geometry.mesh import F64
-from workers.geometry.planar import inside_polygon
-from workers.geometry.transforms import look_at
-from workers.houses.house import Room
-from workers.redraw import Redraw
-from workers.rendering.frame import Camera
-from workers.rendering.rays import RayStage
-from workers.rendering.visibility import visible_pixels
+from datagen.schemas.specification import CandidateParams, ObservationParams
+from datagen.workers.bases.clearance import Obstacles, base_clearance_m
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.geometry.transforms import look_at
+from datagen.workers.houses.house import Room
+from datagen.workers.redraw import Redraw
+from datagen.workers.rendering.frame import Camera
+from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.visibility import visible_pixels
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
 _BLOCK = 8

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from schemas.errors import InputError
-from workers.registry import can_import, entry
-from workers.settling.settler import Settler
+from datagen.schemas.errors import InputError
+from datagen.workers.registry import can_import, entry
+from datagen.workers.settling.settler import Settler
 
 SETTLERS: dict[str, str] = {
-    "sapien": "workers.settling.sapien_settler:settle_sapien",
-    "pybullet": "workers.settling.pybullet_settler:settle_pybullet",
+    "sapien": "datagen.workers.settling.sapien_settler:settle_sapien",
+    "pybullet": "datagen.workers.settling.pybullet_settler:settle_pybullet",
 }
 
 

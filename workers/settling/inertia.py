@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.errors import InputError
-from workers.geometry.mesh import F32, F64
+from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F32, F64
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from schemas.errors import InputError
-from schemas.specification import SettleParams
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import inverse, pose, quaternion_wxyz
-from workers.objects.model import ObjectModel
-from workers.settling.inertia import mass_properties
-from workers.settling.settler import SettleResult
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import SettleParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import inverse, pose, quaternion_wxyz
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.settling.inertia import mass_properties
+from datagen.workers.settling.settler import SettleResult
 
 _LOOK_EVERY = 5  # steps between looks at the speeds, as with PhysX: the same counts come out
 _GRAVITY_MPS2 = 9.81

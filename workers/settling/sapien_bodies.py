@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import pose, quaternion_wxyz
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import pose, quaternion_wxyz
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.specification import SettleParams
-from workers.geometry.mesh import F32, F64
-from workers.objects.model import ObjectModel
-from workers.settling.sapien_bodies import add_object, add_static, pose_of
-from workers.settling.settler import SettleResult
+from datagen.schemas.specification import SettleParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.settling.sapien_bodies import add_object, add_static, pose_of
+from datagen.workers.settling.settler import SettleResult
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from schemas.specification import SettleParams
-from workers.geometry.mesh import F32, F64
-from workers.objects.model import ObjectModel
+from datagen.schemas.specification import SettleParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.objects.model import ObjectModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import translation
-from workers.robots.robot import Robot
-from workers.robots.urdf import Joint, Tree, read_urdf
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.urdf import Joint, Tree, read_urdf
 
 # Bodies that carry no mass of their own still need some: a speck at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6

@@ -18,17 +18,17 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Link, Pose
 from sapien import physx
 
-from schemas.errors import InputError
-from schemas.specification import TrialParams
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse
-from workers.motion.plan import MotionPlan
-from workers.robots.robot import Robot
-from workers.robots.urdf import read_urdf
-from workers.settling.sapien_bodies import sapien_pose
-from workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
-from workers.trials.maniskill_agent import agent_of
-from workers.trials.physics import (
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.robots.robot import Robot
+from datagen.workers.robots.urdf import read_urdf
+from datagen.workers.settling.sapien_bodies import sapien_pose
+from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
+from datagen.workers.trials.maniskill_agent import agent_of
+from datagen.workers.trials.physics import (
     ARM,
     CARRIER,
     CONTACT_OFFSET_M,
@@ -43,9 +43,9 @@ from workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
-from workers.trials.script import Tick, planned_rise_m, pressing_target_m, script_of
-from workers.trials.trial import Disturbance
+from datagen.workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
+from datagen.workers.trials.script import Tick, planned_rise_m, pressing_target_m, script_of
+from datagen.workers.trials.trial import Disturbance
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000

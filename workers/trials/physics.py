@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.specification import TrialParams
-from workers.geometry.mesh import F32, F64
-from workers.robots.robot import Robot
-from workers.settling.sapien_bodies import (
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.robots.robot import Robot
+from datagen.workers.settling.sapien_bodies import (
     convex_shape,
     object_body,
     pad_material,
@@ -18,9 +18,9 @@ from workers.settling.sapien_bodies import (
     sapien_pose,
     static_body,
 )
-from workers.trials.articulation import Articulation
-from workers.trials.prepared import Things
-from workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.articulation import Articulation
+from datagen.workers.trials.prepared import Things
+from datagen.workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

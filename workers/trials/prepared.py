@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.specification import TrialParams
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import translation
-from workers.objects.merging import merge_parts
-from workers.robots.robot import Robot
-from workers.scenes.scene import SettledScene
-from workers.trials.articulation import Articulation, articulation_of
-from workers.trials.trial import Disturbance
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.objects.merging import merge_parts
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.articulation import Articulation, articulation_of
+from datagen.workers.trials.trial import Disturbance
 
 # What stands still takes part where the arm, or a thing that it knocks over, can come: metres.
 _BEYOND_REACH_M = 0.4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 # From rest to that speed. A joint's speed may jump by what it gains in a control period.
 SPEED_UP_S = 0.25

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.specification import TrialParams
-from workers.geometry.mesh import F64
-from workers.motion.plan import MotionPlan
-from workers.robots.robot import Robot
-from workers.trials.schedule import led, timed
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.robots.robot import Robot
+from datagen.workers.trials.schedule import led, timed
 
 PHASES = ("reach", "approach", "close", "lift", "hold")
 # Share of the joints' speed limits at which the arm travels: what arms are run at beside people and things.

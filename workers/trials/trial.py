@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F64
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from datagen.assets.unpack import Limits, unpack
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 
 def long_list() -> bytes:

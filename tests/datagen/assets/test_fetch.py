@@ -18,7 +18,7 @@ from datagen.assets.catalogue import CATALOGUE, Asset, select
 from datagen.assets.download import Policy, download
 from datagen.assets.fetch import fetch
 from datagen.assets.lock import read_lock, verify
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 from tests.datagen.assets.flaky_server import Site, serve
 
 BODY = np.random.default_rng(0).bytes(700_000)

@@ -15,7 +15,7 @@ import pytest
 
 from datagen.assets.lock import LOCK_NAME, lock, read_lock, verify
 from datagen.assets.unpack import Limits, unpack
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
 
 LIMITS = Limits(total_bytes=100_000, files=20)
 

@@ -11,10 +11,10 @@ import pytest
 from datagen import cli
 from datagen.console.printing import print_lines, print_rows
 from datagen.evaluating.page import escape
-from schemas.jobs import JobRecord, Jobs, JobState, StopOrder
-from schemas.lineage import LINEAGE, Origin, encode_lineage
-from schemas.record_files import encode_record
-from schemas.run_records import LedgerEntry, QuarantineRecord
+from datagen.schemas.jobs import JobRecord, Jobs, JobState, StopOrder
+from datagen.schemas.lineage import LINEAGE, Origin, encode_lineage
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run_records import LedgerEntry, QuarantineRecord
 from tests.made_runs import make_run
 
 # A colour, the clipboard (OSC 52), a bell, a carriage return, C1 controls, text that runs backwards, markup.

@@ -12,12 +12,12 @@ from PIL import Image, ImageSequence
 from datagen.drawing.film import Film, film_of, pictures, told_moments
 from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
+from datagen.workers.rendering.embree_renderer import cast_pixels
+from datagen.workers.rendering.rays import RayStage
+from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.trials.trial import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, table_house
-from workers.rendering.embree_renderer import cast_pixels
-from workers.rendering.rays import RayStage
-from workers.scenes.recall import RecalledScene
-from workers.trials.trial import Recording
 
 pytest.importorskip("pinocchio", reason="needs the extra `sim`")
 SIZES = ((160, 120), (160, 96))

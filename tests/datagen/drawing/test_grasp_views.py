@@ -8,11 +8,11 @@ import pytest
 from datagen.drawing.arm_picture import best_success, reach_radius_m
 from datagen.drawing.grasp_views import hand_outline, used_grasps
 from datagen.drawing.posed_robot import robot_bodies
-from schemas.outcomes import OUTCOMES
-from workers.geometry.transforms import inverse, translation, yaw_pose
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
 
 pytest.importorskip("pinocchio", reason="needs the extra `sim`")
-from workers.robots import open_robot
+from datagen.workers.robots import open_robot
 
 SUCCESS = tuple(OUTCOMES).index("success")
 

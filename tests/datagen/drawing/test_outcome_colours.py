@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from datagen.drawing.outcome_colours import LOOKS
-from schemas.outcomes import OUTCOMES
+from datagen.schemas.outcomes import OUTCOMES
 
 # What dichromats see, on linear RGB, at full severity (Machado, Oliveira, Fernandes 2009).
 EYES = {

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, yaw_pose
+from datagen.workers.houses.house import House
+from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.robots import open_robot
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.trials.trial import Recording
+from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_model, camera_at, stage_with
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, yaw_pose
-from workers.houses.house import House
-from workers.rendering.embree_renderer import ray_stage
-from workers.robots import open_robot
-from workers.robots.robot import Robot
-from workers.scenes.recall import RecalledScene
-from workers.trials.trial import Recording
-from workers.world import PreparedHouse
 
 _PHASES = (("reach", 12), ("approach", 6), ("close", 4), ("lift", 6), ("hold", 3))
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.ray_head import running_head, state_folder, stop_head
 from datagen import cli
-from schemas.jobs import Jobs
-from schemas.run import Run
-from schemas.storage import open_storage
+from datagen.cluster.ray_head import running_head, state_folder, stop_head
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
 from tests.refusals import refused
 from tests.small_runs import (
     PER_SCENE,

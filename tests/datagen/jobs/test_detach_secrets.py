@@ -14,13 +14,13 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from cluster.environment import JOB_ENVIRONMENT
-from cluster.ray_head import Head, running_head, state_folder, stop_head
-from cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen import cli
+from datagen.cluster.environment import JOB_ENVIRONMENT
+from datagen.cluster.ray_head import Head, running_head, state_folder, stop_head
+from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.jobs.detach import hand_over
-from schemas.jobs import Jobs
-from schemas.storage import open_storage
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.storage import open_storage
 from tests.other_user import as_another_user, needs_root, traces_of
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, submit_arguments
@@ -31,8 +31,8 @@ SECRET = "AWS_SECRET_ACCESS_KEY"
 PROGRAM = f"""
 import hashlib, json, os, sys, time
 from pathlib import Path
-from cluster.environment import job_environment
-from cluster.ray_cluster import RaySettings, ray_cluster
+from datagen.cluster.environment import job_environment
+from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 def seen():
     return hashlib.sha256(os.environ["{SECRET}"].encode()).hexdigest()
 with job_environment(), ray_cluster(RaySettings(address="auto")) as ray:

@@ -12,9 +12,9 @@ import pytest
 from datagen import cli
 from datagen.remaking.deep import deep_findings
 from datagen.remaking.shards import open_origin
-from schemas.checking.finding import Finding
-from schemas.record_files import encode_record
-from schemas.run import Run
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run import Run
 from tests.datagen.forged import forge
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, PER_SCENE, json_of, make_small_run

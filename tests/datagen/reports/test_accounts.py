@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datagen.audit import audit_report
+from datagen.commands.audit import audit_report
 from datagen.reports.accounts import account_for
 from datagen.reports.standing import status_report
-from schemas.run import Run
-from schemas.run_records import LedgerEntry
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import LedgerEntry
 from tests.made_runs import make_run, write
 
 

@@ -19,8 +19,8 @@ from datagen.reports.agreement import (
     outcome_report,
 )
 from datagen.reports.labelled import join_labelled
-from schemas.outcomes import OUTCOMES
-from workers.bases.candidate_sets import CANDIDATE_SETS, DISTANCE_EDGES_M, VISIBILITY_EDGES, bands
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, DISTANCE_EDGES_M, VISIBILITY_EDGES, bands
 
 CODES = {name: code for code, name in enumerate(OUTCOMES)}
 

@@ -9,6 +9,16 @@ from typing import Any
 import pytest
 
 from datagen import cli
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    Specification,
+    TrialParams,
+)
+from datagen.schemas.storage import open_storage
 from datagen.specifying import arms
 from datagen.specifying.arms import (
     complete_arm,
@@ -20,13 +30,9 @@ from datagen.specifying.arms import (
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
 from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
-from schemas.errors import InputError
-from schemas.run import Run
-from schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Specification, TrialParams
-from schemas.storage import open_storage
-from workers.houses import open_houses
-from workers.objects import open_objects
-from workers.robots import ROBOTS, robot_limits
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.robots import ROBOTS, robot_limits
 
 SOURCES = {"houses": {"kind": "a", "digest": "1" * 64}, "objects": {"kind": "b", "digest": "2" * 64}}
 

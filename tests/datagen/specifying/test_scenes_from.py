@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from schemas.run import Run
-from schemas.run_records import QuarantineRecord
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import QuarantineRecord
 from tests.refusals import refused
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
 from tests.workers.objects.toy_set import write_bundle

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from datagen.specifying.specify import specify
-from workers.houses import open_houses
-from workers.objects import open_objects
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
 
 
 @pytest.mark.parametrize(

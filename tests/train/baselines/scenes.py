@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from train.inputs import Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Batch, Candidates, Clouds, Robots
 
 PER_CANDIDATE = ("base_is_clear", "base_clearance_m")
 

@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from schemas.specification import HeuristicParams
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
+from datagen.train.baselines.analytic import Analytic
+from datagen.train.baselines.baseline import best_cut, is_feasible, observed_rho, planar_distance_m
+from datagen.train.baselines.detection import ThresholdDetector, spoken_name
+from datagen.train.baselines.distance import DistanceBand
+from datagen.train.baselines.proximity import Proximity
+from datagen.train.baselines.scalars import FEATURES, Scalars, features
+from datagen.train.dataset import SampleStream
+from datagen.train.inputs import is_clear
+from datagen.workers.labels.heuristic import heuristic
 from tests.train.baselines.scenes import make_batch, moved, take
-from train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
-from train.baselines.analytic import Analytic
-from train.baselines.baseline import best_cut, is_feasible, observed_rho, planar_distance_m
-from train.baselines.detection import ThresholdDetector, spoken_name
-from train.baselines.distance import DistanceBand
-from train.baselines.proximity import Proximity
-from train.baselines.scalars import FEATURES, Scalars, features
-from train.dataset import SampleStream
-from train.inputs import is_clear
-from workers.labels.heuristic import heuristic
 
 
 def balanced(said: np.ndarray, label: np.ndarray) -> float:

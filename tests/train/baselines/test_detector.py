@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.baselines import make_baselines
+from datagen.train.baselines.baseline import is_feasible
+from datagen.train.baselines.detector import Detections, ZeroShotDetector
+from datagen.train.baselines.views import render_views
 from tests.train.baselines.scenes import make_batch
-from train.baselines import make_baselines
-from train.baselines.baseline import is_feasible
-from train.baselines.detector import Detections, ZeroShotDetector
-from train.baselines.views import render_views
 
 
 @pytest.fixture(scope="module")

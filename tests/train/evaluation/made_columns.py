@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from schemas.outcomes import OUTCOMES
-from train.evaluation.columns import Columns
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.train.evaluation.columns import Columns
 
 
 def make_columns(

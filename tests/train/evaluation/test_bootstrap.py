@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.evaluation import metrics
-from train.evaluation.bootstrap import (
+from datagen.train.evaluation import metrics
+from datagen.train.evaluation.bootstrap import (
     Estimate,
     are_disjoint,
     resample_weights,

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation.columns import gather
+from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.columns import gather
-from train.inputs import Array, Batch, Candidates, Clouds, Robots
 
 CELLS = 4
 

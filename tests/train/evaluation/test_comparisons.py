@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.train.evaluation.comparisons import Estimates, TrainedBy, comparisons
+from datagen.train.evaluation.evaluation import Method, evaluate_set, weights_for
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.comparisons import Estimates, TrainedBy, comparisons
-from train.evaluation.evaluation import Method, evaluate_set, weights_for
 
 METRICS = ("accuracy", "balanced_accuracy", "mean_average_precision")
 

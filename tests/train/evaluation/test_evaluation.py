@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.evaluation.columns import Columns
+from datagen.train.evaluation.comparisons import TrainedBy
+from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
 from tests.train.evaluation.made_columns import make_columns
-from train.evaluation.columns import Columns
-from train.evaluation.comparisons import TrainedBy
-from train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
 
 METHODS = [
     Method("truth", 0.5),

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.evaluation.grids import picks, select
-from train.evaluation.metrics import average_precision
+from datagen.train.evaluation.grids import picks, select
+from datagen.train.evaluation.metrics import average_precision
 
 
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))

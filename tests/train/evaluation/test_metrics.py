@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.evaluation import metrics
+from datagen.train.evaluation import metrics
 
 # Few distinct scores, so that ties are common; infinities as of methods that rule candidates out.
 SCORES = st.sampled_from([-np.inf, 0.0, 0.25, 0.5, 0.500001, 1.0, 3.0])

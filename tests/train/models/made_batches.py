@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from train.inputs import Candidates, Clouds, Robots
-from train.models import Model, build_model
+from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.models import Model, build_model
 
 SMALL: dict[str, dict[str, Any]] = {
     "paper": {

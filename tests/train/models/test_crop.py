@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from datagen.train.models.crop import crop_clouds
 from tests.train.models.made_batches import drawn_tables
-from train.models.crop import crop_clouds
 
 
 def test_the_crop_is_that_of_a_plain_loop():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from train.models.grouping import ball_query, farthest_points, first_true, gather_rows
-from workers.rendering.cloud import farthest_points as stored_order
+from datagen.train.models.grouping import ball_query, farthest_points, first_true, gather_rows
+from datagen.workers.rendering.cloud import farthest_points as stored_order
 
 
 def test_first_true_lists_the_first_true_entries():

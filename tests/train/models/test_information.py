@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from datagen.train.models import MODELS, Model
 from tests.train.models.made_batches import REACH_M, SMALL, Tables, drawn_tables, small_model
-from train.models import MODELS, Model
 
 # `paper` cannot be told where the camera is: given the same, `shared` has to do without, too.
 ALIKE: dict[str, dict[str, str]] = {"paper": {}, "shared": {"camera": "unknown"}}

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from datagen.train.dataset import SampleStream
+from datagen.train.models import MODELS, build_model
+from datagen.train.tensors import to_torch
 from tests.train.models.made_batches import SMALL
-from train.dataset import SampleStream
-from train.models import MODELS, build_model
-from train.tensors import to_torch
 
 STEPS = 300
 

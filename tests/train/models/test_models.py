@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Candidates
+from datagen.train.models import MODELS, build_model, fast
 from tests.train.models.made_batches import drawn_tables, small_model
-from train.inputs import Candidates
-from train.models import MODELS, build_model, fast
 
 NAMES = sorted(MODELS)
 

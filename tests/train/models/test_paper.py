@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from datagen.train.models.crop import crop_clouds
+from datagen.train.models.grouping import ball_query
+from datagen.train.models.paper import CANDIDATE_POINTS, PaperModel
 from tests.train.models.made_batches import drawn_tables, small_model
-from train.models.crop import crop_clouds
-from train.models.grouping import ball_query
-from train.models.paper import CANDIDATE_POINTS, PaperModel
 
 
 @torch.no_grad()

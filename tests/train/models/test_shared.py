@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from datagen.train.models import Model
+from datagen.train.models.frames import frames_of, pair_features
+from datagen.train.models.tiles import tiles
 from tests.train.models.made_batches import Tables, drawn_tables, small_model
-from train.models import Model
-from train.models.frames import frames_of, pair_features
-from train.models.tiles import tiles
 
 
 def turned_about_z(tables: Tables, angle: float) -> Tables:

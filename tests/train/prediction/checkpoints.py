@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from train.models import build_model
-from train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 
 
 def write_untrained(file: Path, config: Mapping[str, Any]) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from datagen.train.scorers import ModelScorer
 from tests.train.prediction.seen_scenes import Seen, draw_seen, untrained_scorer
-from train.scorers import ModelScorer
 
 
 @pytest.fixture(scope="session")

@@ -10,21 +10,21 @@ import numpy as np
 import torch
 from PIL import Image
 
-from schemas.cost import StageClock
-from schemas.specification import NoiseParams, ObservationParams, Source, Specification
-from train.models import build_model
-from train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
-from train.scorers import ModelScorer
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import look_at
-from workers.houses import open_houses
-from workers.objects import open_objects
-from workers.rendering.embree_renderer import render_rays
-from workers.rendering.frame import Camera, Frame
-from workers.rendering.noise import add_noise
-from workers.scenes.draw import draw_scene
-from workers.scenes.scene import Scene
-from workers.world import assemble_world
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import NoiseParams, ObservationParams, Source, Specification
+from datagen.train.models import build_model
+from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
+from datagen.train.scorers import ModelScorer
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import look_at
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering.noise import add_noise
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.scene import Scene
+from datagen.workers.world import assemble_world
 
 MODEL = {"n_points": 2048, "tokens": [32, 64, 64], "width": 16, "embedding": 32, "head": [32]}
 OBSERVATION = ObservationParams(width_px=320, height_px=240, fx_px=307.5, fy_px=307.5)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
-from train.prediction.npz import read_arrays
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.npz import read_arrays
 
 DEPTH = np.arange(6, dtype=np.float32).reshape(2, 3)
 

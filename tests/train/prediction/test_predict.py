@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.specification import CandidateParams
+from datagen.schemas.specification import CandidateParams
+from datagen.train.baselines.analytic import Analytic
+from datagen.train.inputs import Array, Batch
+from datagen.train.prediction import RobotSize, load_scorer, predict, read_place
+from datagen.train.prediction.candidates import STATES
+from datagen.train.prediction.ground import level_pose
+from datagen.train.prediction.predict import Prediction
+from datagen.train.scorers import ModelScorer, Scorer
+from datagen.workers.bases.clearance import base_clearance_m
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, yaw_pose
 from tests.train.prediction.seen_scenes import Seen, draw_seen, sensor_frame, write_frame
-from train.baselines.analytic import Analytic
-from train.inputs import Array, Batch
-from train.prediction import RobotSize, load_scorer, predict, read_place
-from train.prediction.candidates import STATES
-from train.prediction.ground import level_pose
-from train.prediction.predict import Prediction
-from train.scorers import ModelScorer, Scorer
-from workers.bases.clearance import base_clearance_m
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, yaw_pose
 
 ROBOT = RobotSize(camera_height_m=1.2, base_height_m=0.7, arm_reach_m=0.9)
 GRID = 9

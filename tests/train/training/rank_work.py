@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from schemas.errors import InputError
-from train.inputs import Array, Batch, Candidates, Clouds, Robots
-from train.training.loop import run
-from train.training.ranks import Ranks
-from train.training.stages import Job, keep, prepare
-from train.training.watching import Watchers
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.training.loop import run
+from datagen.train.training.ranks import Ranks
+from datagen.train.training.stages import Job, keep, prepare
+from datagen.train.training.watching import Watchers
 
 
 def train_and_tell(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:

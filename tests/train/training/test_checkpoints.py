@@ -17,11 +17,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from tests.train.training.small import TINY, equal
-from train.dataset import Origin
-from train.models import build_model
-from train.training.checkpoints import (
+from datagen.schemas.errors import InputError
+from datagen.train.dataset import Origin
+from datagen.train.models import build_model
+from datagen.train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
     EpochRecord,
@@ -30,7 +29,8 @@ from train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from train.training.inert import MAX_BYTES
+from datagen.train.training.inert import MAX_BYTES
+from tests.train.training.small import TINY, equal
 
 ORIGIN: Origin = {
     "spec_hashes": ["b"], "schema": "sim", "schema_version": 2, "n_samples": 3, "n_scenes": 1,

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from schemas.errors import InputError
-from schemas.progress import Progress
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import Progress
+from datagen.train.training.display import TrainingProgress
+from datagen.train.training.watching import Step, TensorBoard
 from tests.cluster.simulated import FakeClock
-from train.training.display import TrainingProgress
-from train.training.watching import Step, TensorBoard
 
 RECORD: dict[str, Any] = {
     "epoch": 3, "step": 30, "loss": 0.5, "accuracy": 0.7, "val_loss": 0.25, "val_accuracy": 0.875,

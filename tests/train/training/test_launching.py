@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.training.checkpoints import read_checkpoint
+from datagen.train.training.launching import interruptible, train_in_processes
+from datagen.train.training.loop import run
+from datagen.train.training.ranks import Ranks
+from datagen.train.training.stages import Job, prepare
 from tests.train.training.rank_work import Union, told_by, train_and_tell
 from tests.train.training.small import TINY, Recorder, equal, job_of
-from train.training.checkpoints import read_checkpoint
-from train.training.launching import interruptible, train_in_processes
-from train.training.loop import run
-from train.training.ranks import Ranks
-from train.training.stages import Job, prepare
 
 # Without dropout, whose draws are each rank's own.
 STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
@@ -65,7 +65,7 @@ WAITING = """
 import sys
 from pathlib import Path
 from tests.train.training.rank_work import wait_for_stop
-from train.training.launching import train_in_processes
+from datagen.train.training.launching import train_in_processes
 job = sys.argv[1]
 assert train_in_processes(wait_for_stop, job, 1, "cpu", lambda: Path(job + ".stop").exists())
 """

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.train.inputs import Array, Batch
+from datagen.train.training.checkpoints import load_model, read_checkpoint
+from datagen.train.training.loop import Batches, run
+from datagen.train.training.ranks import Ranks
+from datagen.train.training.stages import keep, prepare
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
-from train.inputs import Array, Batch
-from train.training.checkpoints import load_model, read_checkpoint
-from train.training.loop import Batches, run
-from train.training.ranks import Ranks
-from train.training.stages import keep, prepare
 
 
 @pytest.fixture(scope="module")

@@ -7,16 +7,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from tests.train.training.small import TINY, equal
-from train.models import Model, build_model
-from train.training.optimising import (
+from datagen.schemas.errors import InputError
+from datagen.train.models import Model, build_model
+from datagen.train.training.optimising import (
     make_optimiser,
     optimiser_tensors,
     put_optimiser_tensors,
     rate_at,
     set_rate,
 )
+from tests.train.training.small import TINY, equal
 
 
 @given(st.integers(1, 500), st.floats(1e-6, 1.0), st.floats(0, 1))

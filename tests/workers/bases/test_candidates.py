@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.specification import CandidateParams
+from datagen.schemas.specification import CandidateParams
+from datagen.workers.bases.candidates import Candidates, distances, draw_candidates, grid_offsets
+from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
+from datagen.workers.redraw import Redraw
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, table_house
-from workers.bases.candidates import Candidates, distances, draw_candidates, grid_offsets
-from workers.bases.clearance import base_clearance_m, obstacles_of
-from workers.redraw import Redraw
 
 TARGET = np.array([ROOM_M[0] / 2 - 0.35, ROOM_M[1] / 2 - 0.2, TABLE_TOP_M + 0.05])  # near a corner
 OBSTACLES = obstacles_of(table_house())

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.specification import CandidateParams
+from datagen.schemas.specification import CandidateParams
+from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
 from tests.workers.worlds import ROOM_M, TABLE_SIZE_M, box_body, table_house
-from workers.bases.clearance import base_clearance_m, obstacles_of
 
 PARAMS = CandidateParams()
 OBSTACLES = obstacles_of(table_house())

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from workers.geometry.planar import (
+from datagen.workers.geometry.planar import (
     convex_hull,
     inside_any,
     inside_polygon,

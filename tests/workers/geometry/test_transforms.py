@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from workers.geometry.transforms import inverse, look_at, pose, quaternion_wxyz, rotation_of, yaw_pose
+from datagen.workers.geometry.transforms import inverse, look_at, pose, quaternion_wxyz, rotation_of, yaw_pose
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 1e-3)
 

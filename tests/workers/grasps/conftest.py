@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-import workers.grasps.keep
+import datagen.workers.grasps.keep
 
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A fresh cache folder, and nothing in memory."""
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
-    workers.grasps.keep.forget()
+    datagen.workers.grasps.keep.forget()
     return tmp_path / "cache"

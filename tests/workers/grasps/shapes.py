@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.robot import Gripper
 from tests.workers.worlds import box_vertices, coloured, model_of
-from workers.objects.model import ObjectModel
-from workers.robots.robot import Gripper
 
 TIP_M = 0.009  # from the pads' middle to the end of the fingers
 PALM_M = 0.037

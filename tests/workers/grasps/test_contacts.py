@@ -8,11 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from tests.workers.grasps.shapes import bowl_model
-from tests.workers.worlds import ball_model, box_vertices
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import pose
-from workers.grasps.contacts import (
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import pose
+from datagen.workers.grasps.contacts import (
     CONE_RAD,
     Contacts,
     cone_directions,
@@ -20,6 +18,8 @@ from workers.grasps.contacts import (
     solid_of,
     surface_points,
 )
+from tests.workers.grasps.shapes import bowl_model
+from tests.workers.worlds import ball_model, box_vertices
 
 NEAR_M = 2e-5  # the surface's own tolerance, and a little
 

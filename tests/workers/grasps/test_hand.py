@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.geometry.transforms import pose
+from datagen.workers.grasps.contacts import Contacts
+from datagen.workers.grasps.floating_hand import PULLS, HandTest, held_trials
+from datagen.workers.grasps.hand_clearance import APPROACH_M, HandClearance, lowest_m
+from datagen.workers.grasps.hand_poses import flipped, hand_poses, varied
 from tests.workers.grasps.shapes import TIP_M, bowl_model, box_gripper
 from tests.workers.worlds import box_model, box_vertices
-from workers.geometry.mesh import F32, F64
-from workers.geometry.transforms import pose
-from workers.grasps.contacts import Contacts
-from workers.grasps.floating_hand import PULLS, HandTest, held_trials
-from workers.grasps.hand_clearance import APPROACH_M, HandClearance, lowest_m
-from workers.grasps.hand_poses import flipped, hand_poses, varied
 
 GRIPPER = box_gripper()
 FROM_ABOVE = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.specification import GraspParams
+from datagen.schemas.specification import GraspParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
+from datagen.workers.grasps.keep import content_digest, forget, grasps_of, scored_grasps
+from datagen.workers.grasps.search import TABLE_GAP_M
+from datagen.workers.objects.model import ObjectModel
 from tests.workers.grasps.shapes import bowl_model, box_gripper
 from tests.workers.worlds import box_model, box_vertices, cylinder_model, model_of
-from workers.geometry.mesh import F64
-from workers.grasps.grasp import GraspSet
-from workers.grasps.hand_clearance import HandClearance, lowest_m
-from workers.grasps.keep import content_digest, forget, grasps_of, scored_grasps
-from workers.grasps.search import TABLE_GAP_M
-from workers.objects.model import ObjectModel
 
 GRIPPER = box_gripper()
 FEW = GraspParams(per_object=24)
@@ -170,7 +170,7 @@ def test_what_is_kept_is_what_was_found(own_cache: Path, monkeypatch: pytest.Mon
     box = box_model("box", (0.05, 0.04, 0.1))
     first = grasps_of(box, GRIPPER, FEW)
     forget()
-    monkeypatch.setattr("workers.grasps.keep.search_grasps", lambda *_: pytest.fail("searched again"))
+    monkeypatch.setattr("datagen.workers.grasps.keep.search_grasps", lambda *_: pytest.fail("searched again"))
     assert same(first, grasps_of(box, GRIPPER, FEW))
     assert [file.suffix for file in (own_cache / "grasps").iterdir()] == [".npz"]
 

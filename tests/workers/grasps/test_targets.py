@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.specification import GraspParams
+from datagen.schemas.specification import GraspParams
+from datagen.workers.grasps.targets import Targets, graspability
+from datagen.workers.objects import open_objects
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots import gripper_of
+from datagen.workers.robots.robot import Gripper
 from tests.workers.grasps.shapes import box_gripper
 from tests.workers.worlds import box_model, cylinder_model
-from workers.grasps.targets import Targets, graspability
-from workers.objects import open_objects
-from workers.objects.model import ObjectModel
-from workers.robots import gripper_of
-from workers.robots.robot import Gripper
 
 GRIPPER = box_gripper()
 FEW = GraspParams(per_object=12)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from workers.geometry.planar import inside_polygon
-from workers.houses.house import Body, House
+from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.houses.house import Body, House
 
 
 def check_house(house: House) -> None:

@@ -10,10 +10,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.house import House
 from tests.workers.houses.house_checks import check_house, covers
-from workers.houses import open_houses
-from workers.houses.house import House
 
 HALF = float(np.sqrt(0.5))
 
@@ -281,7 +281,7 @@ def test_damaged_meshes_are_named(root: Path, case: str):
 
 
 def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.MonkeyPatch):
-    from workers.houses import glb
+    from datagen.workers.houses import glb
 
     monkeypatch.setattr(glb, "MAX_FACES", 11)
     with pytest.raises(InputError, match="triangles, more than 11"):

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.houses import furnishing, line_index, open_houses
+from datagen.workers.houses.asset_table import Asset
+from datagen.workers.houses.loader import build_house
+from datagen.workers.houses.reading import Node
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
-from workers.houses import furnishing, line_index, open_houses
-from workers.houses.asset_table import Asset
-from workers.houses.loader import build_house
-from workers.houses.reading import Node
 
 NAN, INFINITY = float("nan"), float("inf")
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from schemas.errors import InputError
-from schemas.identity import digest_of
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.workers.geometry.planar import inside_any
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.builtin import house_document
+from datagen.workers.houses.house import House
 from tests.workers.houses.house_checks import check_house, top_below_m
-from workers.geometry.planar import inside_any
-from workers.houses import open_houses
-from workers.houses.builtin import house_document
-from workers.houses.house import House
 
 NUMBERS = range(0, 400, 13)
 
@@ -127,8 +127,8 @@ def test_chairs_face_their_table_or_desk(houses: list[House]):
 
 def test_the_same_house_in_another_process_and_a_longer_collection():
     code = (
-        "from workers.houses.builtin import house_document\n"
-        "from schemas.identity import digest_of\n"
+        "from datagen.workers.houses.builtin import house_document\n"
+        "from datagen.schemas.identity import digest_of\n"
         "print(digest_of(house_document(7)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

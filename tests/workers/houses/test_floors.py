@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workers.geometry.planar import inside_polygon
-from workers.houses.floors import clean_polygon, triangles
+from datagen.workers.geometry.planar import inside_polygon
+from datagen.workers.houses.floors import clean_polygon, triangles
 
 
 def area(p: np.ndarray) -> float:

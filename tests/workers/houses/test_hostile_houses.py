@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from schemas.errors import InputError
-from schemas.specification import Source, Specification
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import Source, Specification
+from datagen.workers import content_cache
+from datagen.workers.houses import line_index, open_houses
+from datagen.workers.houses.reading import parse_json
+from datagen.workers.world import World
 from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
-from workers import content_cache
-from workers.houses import line_index, open_houses
-from workers.houses.reading import parse_json
-from workers.world import World
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +80,7 @@ def test_a_document_of_empty_objects_is_refused_in_little_memory(tmp_path: Path)
 
 
 def test_houses_of_all_files_are_counted_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from workers.houses import procthor
+    from datagen.workers.houses import procthor
 
     write_houses(tmp_path, [two_rooms()] * 2, name="a.jsonl")
     write_houses(tmp_path, [two_rooms()] * 2, name="b.jsonl")

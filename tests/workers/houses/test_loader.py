@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.furnishing import unity_rotation
+from datagen.workers.houses.house import House
 from tests.workers.houses.house_checks import check_house, covers, top_below_m
 from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz
-from workers.houses import open_houses
-from workers.houses.furnishing import unity_rotation
-from workers.houses.house import House
 
 
 def load(folder: Path, document: dict) -> House:

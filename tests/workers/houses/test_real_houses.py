@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.workers.geometry.planar import inside_any
+from datagen.workers.houses import open_houses
+from datagen.workers.houses.house import House, HouseSource
 from tests.workers.houses.house_checks import check_house, top_below_m
-from workers.geometry.planar import inside_any
-from workers.houses import open_houses
-from workers.houses.house import House, HouseSource
 
 
 @pytest.fixture(scope="module")

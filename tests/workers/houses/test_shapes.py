@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.workers.houses.asset_table import Asset
+from datagen.workers.houses.builtin_assets import BUILTIN_ASSETS
+from datagen.workers.houses.house import Body
+from datagen.workers.houses.layout import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
+from datagen.workers.houses.shapes import SHAPES, asset_geometry
 from tests.workers.houses.house_checks import check_body, hull_volume, is_convex, signed_volume
-from workers.houses.asset_table import Asset
-from workers.houses.builtin_assets import BUILTIN_ASSETS
-from workers.houses.house import Body
-from workers.houses.layout import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
-from workers.houses.shapes import SHAPES, asset_geometry
 
 SIDE = st.floats(0.02, 2.5)
 

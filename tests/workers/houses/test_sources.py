@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
+from datagen.workers.houses.line_index import houses_cache, open_lines
 from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
-from workers.houses import HOUSE_SOURCES, ids_of_split, open_houses, split_of
-from workers.houses.line_index import houses_cache, open_lines
 
 
 def named(name: str, **more: object) -> dict:

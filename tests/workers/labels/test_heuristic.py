@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.specification import HeuristicParams
-from workers.labels.heuristic import distance_score, heuristic, visibility_score
+from datagen.schemas.specification import HeuristicParams
+from datagen.workers.labels.heuristic import distance_score, heuristic, visibility_score
 
 PARAMS = HeuristicParams()
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.fields import SCHEMAS
-from schemas.outcomes import OUTCOMES
-from schemas.specification import (
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,
     DisturbanceParams,
@@ -21,14 +21,14 @@ from schemas.specification import (
     TrialParams,
     VisibilityParams,
 )
+from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.clearance import base_clearance_m
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.labels import load_label_source, plan
+from datagen.workers.labels.trials import arm_in_scene, try_candidate
+from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import box_model, on_table, table_house
-from workers.bases.candidates import Candidates
-from workers.bases.clearance import base_clearance_m
-from workers.geometry.transforms import translation
-from workers.labels import load_label_source, plan
-from workers.labels.trials import arm_in_scene, try_candidate
-from workers.scenes.scene import SettledScene
 
 NAMES = tuple(OUTCOMES)
 REACH_M, HEIGHT_M = 0.85, 0.75

@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.identity import Stream, generator
-from schemas.specification import DisturbanceParams
-from workers.geometry.transforms import pose
-from workers.labels.trials import draw_disturbances
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.specification import DisturbanceParams
+from datagen.workers.geometry.transforms import pose
+from datagen.workers.labels.trials import draw_disturbances
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 positions = st.tuples(*[st.floats(-20, 20)] * 3)

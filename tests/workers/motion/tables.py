@@ -8,22 +8,22 @@ from functools import cache
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from schemas.specification import MotionParams
+from datagen.schemas.specification import MotionParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.houses.house import Body, House
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.frame import Stage
+from datagen.workers.robots import open_robot
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse
-from workers.grasps.grasp import GraspSet
-from workers.houses.house import Body, House
-from workers.motion.plan import MotionPlan
-from workers.motion.scene import PlanningScene, pose_of_base, prepare
-from workers.objects.model import ObjectModel
-from workers.rendering.embree_renderer import ray_stage
-from workers.rendering.frame import Stage
-from workers.robots import open_robot
-from workers.robots.robot import Robot
-from workers.scenes.recall import RecalledScene
-from workers.scenes.scene import SettledScene
-from workers.world import PreparedHouse
 
 BOX_M = (0.05, 0.05, 0.12)
 TARGET_XY_M = (0.0, -0.2)  # off the table's middle: 20 cm from its front edge

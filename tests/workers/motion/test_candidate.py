@@ -7,7 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from schemas.outcomes import OUTCOMES
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.houses.house import Body, House
+from datagen.workers.motion.candidate import STAGES, plan_candidate
+from datagen.workers.motion.plan import MotionPlan, PlanReport
+from datagen.workers.motion.scene import prepare
+from datagen.workers.motion.surroundings import surroundings
+from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
     PARAMS,
@@ -22,15 +31,6 @@ from tests.workers.motion.tables import (
     table_scene,
 )
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import yaw_pose
-from workers.grasps.grasp import GraspSet
-from workers.houses.house import Body, House
-from workers.motion.candidate import STAGES, plan_candidate
-from workers.motion.plan import MotionPlan, PlanReport
-from workers.motion.scene import prepare
-from workers.motion.surroundings import surroundings
-from workers.scenes.scene import SettledScene
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 CLUTTER = [

@@ -8,10 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.workers.worlds import ball_model, box_model, box_vertices
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import pose, translation
-from workers.motion.collision import (
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import pose, translation
+from datagen.workers.motion.collision import (
     Hulls,
     hits,
     hulls_of,
@@ -21,6 +20,7 @@ from workers.motion.collision import (
     place_object,
     smallest_gap_m,
 )
+from tests.workers.worlds import ball_model, box_model, box_vertices
 
 CUBE = box_vertices((0.2, 0.2, 0.2))
 

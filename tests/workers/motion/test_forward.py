@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datagen.workers.motion.forward import forward_kinematics
+from datagen.workers.motion.reach_table import order_by_distance, reach_table
+from datagen.workers.motion.scene import moving_of
+from datagen.workers.robots import ROBOTS, open_robot, robot_limits
+from datagen.workers.robots.robot import Robot
 from tests.workers.motion.tables import arm
-from workers.motion.forward import forward_kinematics
-from workers.motion.reach_table import order_by_distance, reach_table
-from workers.motion.scene import moving_of
-from workers.robots import ROBOTS, open_robot, robot_limits
-from workers.robots.robot import Robot
 
 
 def robots() -> list[Robot]:

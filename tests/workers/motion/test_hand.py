@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.specification import MotionParams
+from datagen.schemas.specification import MotionParams
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.motion.collision import object_hulls, place, place_object
+from datagen.workers.motion.hand import best_different, can_be_lifted, free_grasps, hand_of, line_offsets_m
 from tests.workers.motion.tables import BOX_M, arm, box_grasps
 from tests.workers.worlds import box_model, box_vertices
-from workers.geometry.transforms import translation
-from workers.motion.collision import object_hulls, place, place_object
-from workers.motion.hand import best_different, can_be_lifted, free_grasps, hand_of, line_offsets_m
 
 PARAMS = MotionParams()
 NOTHING = place([])

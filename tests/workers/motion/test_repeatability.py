@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.workers.motion.candidate import plan_candidate
+from datagen.workers.motion.plan import PlanReport
+from datagen.workers.motion.scene import PlanningScene
+from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import arm, deepest_in_plan_m, front_base, prepared, table_scene
 from tests.workers.worlds import ROOM_M, box_body
-from workers.motion.candidate import plan_candidate
-from workers.motion.plan import PlanReport
-from workers.motion.scene import PlanningScene
-from workers.scenes.scene import SettledScene
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 PLACES = ((0.2, 0.6), (0.0, 0.6), (-0.2, 0.45), (0.3, 0.75))  # dx and distance of bases

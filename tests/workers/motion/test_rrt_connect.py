@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workers.geometry.mesh import F64
-from workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
 LOWER, UPPER = np.full(3, -1.0), np.full(3, 1.0)
 START, GOAL = np.array([-0.8, 0.0, 0.0]), np.array([0.8, 0.0, 0.0])

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from workers.geometry.mesh import F32, F64
-from workers.objects import merging, open_objects
-from workers.objects.convex import opening_depth
-from workers.objects.hulls import distances_m, few_vertices, hull_of, surface_points_m
-from workers.objects.merging import MAX_VERTICES, MergedParts, merge_parts
-from workers.objects.scan import read_scan
+from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.objects import merging, open_objects
+from datagen.workers.objects.convex import opening_depth
+from datagen.workers.objects.hulls import distances_m, few_vertices, hull_of, surface_points_m
+from datagen.workers.objects.merging import MAX_VERTICES, MergedParts, merge_parts
+from datagen.workers.objects.scan import read_scan
 
 
 def box(low: F64, high: F64) -> F32:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
-from workers.objects import obj_file
-from workers.objects.obj_file import read_obj
+from datagen.schemas.errors import InputError
+from datagen.workers.objects import obj_file
+from datagen.workers.objects.obj_file import read_obj
 
 
 @settings(max_examples=60, deadline=None)

@@ -13,12 +13,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
-from schemas.errors import InputError
-from workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
-from workers.objects.builtin_table import RECIPES
-from workers.objects.credibility import EXCLUDED, MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
-from workers.objects.obj_file import read_obj
-from workers.objects.ycb_masses import PUBLISHED_MASS_KG
+from datagen.schemas.errors import InputError
+from datagen.workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
+from datagen.workers.objects.builtin_table import RECIPES
+from datagen.workers.objects.credibility import EXCLUDED, MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
+from datagen.workers.objects.obj_file import read_obj
+from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 # How far a visual vertex may lie outside the convex parts: scans are decomposed to about 2 mm,
 # the wood block's parts are a shrunken box; built-in parts are exact up to float32.

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.objects import convex, open_objects, texture
 from tests.workers.objects.toy_set import COLLISION_OBJ, CUBE_OBJ, write_bundle, write_maniskill
-from workers.objects import convex, open_objects, texture
 
 
 def test_bundle_layout(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_the_cache_changes_nothing_and_heals(
     fresh = open_objects(f"ycb:{folder}").load("001_cube")
     (entry,) = (own_cache / "objects").iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr("workers.objects.scan.read_scan", lambda *_: pytest.fail("read again"))
+        patch.setattr("datagen.workers.objects.scan.read_scan", lambda *_: pytest.fail("read again"))
         again = open_objects(f"ycb:{folder}").load("001_cube")
     entry.write_bytes(entry.read_bytes()[:500])
     healed = open_objects(f"ycb:{folder}").load("001_cube")

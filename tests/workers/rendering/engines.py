@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from datagen.workers.geometry.mesh import Mesh, Texture
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.frame import Camera, Frame, Stage
 from tests.workers.worlds import ball_model, box_model, camera_at, cylinder_model, stage_with
-from workers.geometry.mesh import Mesh, Texture
-from workers.objects.model import ObjectModel
-from workers.rendering.frame import Camera, Frame, Stage
 
 QUADRANTS = {"low_u_low_v": (200, 20, 20), "high_u_low_v": (20, 200, 20), "low_u_high_v": (20, 20, 200)}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from schemas.specification import ObservationParams
+from datagen.schemas.specification import ObservationParams
+from datagen.workers.rendering.cloud import Cloud, caster_of, farthest_points, observe_cloud, target_pixels
+from datagen.workers.rendering.embree_renderer import cast_pixels, ray_stage, render_rays
 from tests.workers.worlds import ball_model, box_model, camera_at, stage_with
-from workers.rendering.cloud import Cloud, caster_of, farthest_points, observe_cloud, target_pixels
-from workers.rendering.embree_renderer import cast_pixels, ray_stage, render_rays
 
 STAGE = stage_with([box_model("target", (0.06, 0.06, 0.1)), ball_model("ball", 0.05)], [(0, 0), (0.15, 0.05)])
 RAYS = ray_stage(STAGE)

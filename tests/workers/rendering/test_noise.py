@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.specification import NoiseParams
+from datagen.schemas.specification import NoiseParams
+from datagen.workers.geometry.mesh import F32
+from datagen.workers.rendering.embree_renderer import render_embree
+from datagen.workers.rendering.frame import Camera, Frame
+from datagen.workers.rendering.noise import add_noise
 from tests.workers.worlds import box_model, camera_at, stage_with
-from workers.geometry.mesh import F32
-from workers.rendering.embree_renderer import render_embree
-from workers.rendering.frame import Camera, Frame
-from workers.rendering.noise import add_noise
 
 ONLY_MATCHING = NoiseParams(enabled=True, grazing_dropout_cos=0.0, edge_dropout=0.0, hole_rate=0.0)
 QUIET = {"disparity_std_px": 0.0, "grazing_dropout_cos": 0.0, "edge_dropout": 0.0, "hole_rate": 0.0}

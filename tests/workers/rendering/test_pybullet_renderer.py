@@ -8,13 +8,13 @@ import numpy as np
 import pybullet
 import pytest
 
+from datagen.workers.geometry.mesh import Mesh
+from datagen.workers.rendering.embree_renderer import ray_stage, render_embree
+from datagen.workers.rendering.frame import Camera, Stage
+from datagen.workers.rendering.pybullet_renderer import PybulletStage, render_pybullet
+from datagen.workers.rendering.visibility import visible_pixels
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
 from tests.workers.worlds import box_body, camera_at, table_house
-from workers.geometry.mesh import Mesh
-from workers.rendering.embree_renderer import ray_stage, render_embree
-from workers.rendering.frame import Camera, Stage
-from workers.rendering.pybullet_renderer import PybulletStage, render_pybullet
-from workers.rendering.visibility import visible_pixels
 
 
 @pytest.mark.parametrize("camera", cameras())

@@ -12,13 +12,13 @@ pytest.importorskip(
     "sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`", exc_type=ImportError
 )
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.rendering.embree_renderer import render_embree
+from datagen.workers.rendering.frame import Camera, Frame, Stage
+from datagen.workers.rendering.sapien_renderer import render_sapien
 from tests.conftest import REPOSITORY
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
 from tests.workers.worlds import camera_at
-from workers.rendering.embree_renderer import render_embree
-from workers.rendering.frame import Camera, Frame, Stage
-from workers.rendering.sapien_renderer import render_sapien
 
 
 def rendered(stage: Stage, camera: Camera) -> Frame:
@@ -52,9 +52,9 @@ def test_what_came_before_leaves_nothing_in_the_kept_scene() -> None:
 
 def test_without_a_render_device_the_error_names_the_mend() -> None:
     program = (
-        "from schemas.errors import InputError\n"
+        "from datagen.schemas.errors import InputError\n"
         "from tests.workers.rendering.engines import cameras, mixed_stage\n"
-        "from workers.rendering.sapien_renderer import render_sapien\n"
+        "from datagen.workers.rendering.sapien_renderer import render_sapien\n"
         "try:\n    render_sapien(mixed_stage(), cameras()[0])\n"
         "except InputError as error:\n    print(error)\n"
     )

@@ -7,6 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.frame import Stage
+from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
 from tests.workers.worlds import (
     ROOM_M,
@@ -17,9 +20,6 @@ from tests.workers.worlds import (
     cylinder_model,
     stage_with,
 )
-from workers.rendering.embree_renderer import ray_stage
-from workers.rendering.frame import Stage
-from workers.rendering.visibility import visible_pixels
 
 CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
 
@@ -123,5 +123,5 @@ def test_blocks_of_rays_do_not_change_counts(monkeypatch: pytest.MonkeyPatch) ->
     )
     eyes = np.random.default_rng(1).uniform((0.2, 0.2, 0.8), (3.8, 2.8, 1.5), (50, 3))
     whole = visible_pixels(stage, 0, eyes, 32)
-    monkeypatch.setattr("workers.rendering.visibility._MAX_RAYS", 32 * 32 * 7)
+    monkeypatch.setattr("datagen.workers.rendering.visibility._MAX_RAYS", 32 * 32 * 7)
     np.testing.assert_array_equal(whole, visible_pixels(stage, 0, eyes, 32))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from workers.robots import ROBOTS, open_robot, robot_limits
-from workers.robots.robot import Robot
+from datagen.workers.robots import ROBOTS, open_robot, robot_limits
+from datagen.workers.robots.robot import Robot
 
 Case = tuple[str, float | None, float]
 

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from schemas.errors import InputError
-from workers.robots.assembly import assemble
-from workers.robots.description import robots_folder
-from workers.robots.franka_hand import FRANKA_HAND
-from workers.robots.panda import PANDA, PANDA_SCALED
-from workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
+from datagen.schemas.errors import InputError
+from datagen.workers.robots.assembly import assemble
+from datagen.workers.robots.description import robots_folder
+from datagen.workers.robots.franka_hand import FRANKA_HAND
+from datagen.workers.robots.panda import PANDA, PANDA_SCALED
+from datagen.workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ from scipy.spatial import ConvexHull
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
-from schemas.fields import SCHEMAS
+from datagen.schemas.fields import SCHEMAS
+from datagen.workers.robots import robot_limits
+from datagen.workers.robots.hulls import MAX_CORNERS
+from datagen.workers.robots.robot import Robot
 from tests.workers.robots.robots_under_test import CASES, IDS, opened
-from workers.robots import robot_limits
-from workers.robots.hulls import MAX_CORNERS
-from workers.robots.robot import Robot
 
 POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.0005, np.radians(0.5)
 

@@ -11,16 +11,16 @@ from scipy.spatial import ConvexHull
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
-from workers.geometry.transforms import inverse
-from workers.robots import open_robot
-from workers.robots.arm import Arm
-from workers.robots.description import RobotDescription, robots_folder
-from workers.robots.fetch import FETCH
-from workers.robots.franka_hand import FRANKA_HAND
-from workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
-from workers.robots.panda import PANDA, PANDA_SCALED
-from workers.robots.urdf import Inertial, Tree, read_urdf, scaled_inertial
-from workers.robots.xarm7 import XARM7
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.robots import open_robot
+from datagen.workers.robots.arm import Arm
+from datagen.workers.robots.description import RobotDescription, robots_folder
+from datagen.workers.robots.fetch import FETCH
+from datagen.workers.robots.franka_hand import FRANKA_HAND
+from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
+from datagen.workers.robots.panda import PANDA, PANDA_SCALED
+from datagen.workers.robots.urdf import Inertial, Tree, read_urdf, scaled_inertial
+from datagen.workers.robots.xarm7 import XARM7
 
 
 def tree_of(description: RobotDescription) -> Tree:

@@ -14,10 +14,10 @@ import trimesh
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
-from workers.robots.arm import Arm
-from workers.robots.panda import PANDA_SCALED
-from workers.robots.urdf import read_urdf
-from workers.robots.written import RobotFiles
+from datagen.workers.robots.arm import Arm
+from datagen.workers.robots.panda import PANDA_SCALED
+from datagen.workers.robots.urdf import read_urdf
+from datagen.workers.robots.written import RobotFiles
 
 
 @pytest.fixture(autouse=True)
@@ -86,8 +86,8 @@ def test_what_is_asked_for_again_is_marked_as_used_and_mended(folder: Path) -> N
 
 
 def test_only_what_is_long_unused_is_dropped(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.robots.written._MOST_FILES", 20)
-    monkeypatch.setattr("workers.robots.written._WRITTEN_BETWEEN_PRUNINGS", 1)
+    monkeypatch.setattr("datagen.workers.robots.written._MOST_FILES", 20)
+    monkeypatch.setattr("datagen.workers.robots.written._WRITTEN_BETWEEN_PRUNINGS", 1)
     robots = [arm(reach_m) for reach_m in np.linspace(0.6, 0.9, 8)]
     for robot in robots:
         assert robot.urdf.is_file()
@@ -104,11 +104,11 @@ def test_only_what_is_long_unused_is_dropped(folder: Path, monkeypatch: pytest.M
 
 _CHILD = """
 import os, sys
-from workers.content_cache import alone_in, drop_unused
-from workers.robots import written
-from workers.robots.arm import Arm
-from workers.robots.panda import PANDA_SCALED
-from workers.robots.urdf import read_urdf
+from datagen.workers.content_cache import alone_in, drop_unused
+from datagen.workers.robots import written
+from datagen.workers.robots.arm import Arm
+from datagen.workers.robots.panda import PANDA_SCALED
+from datagen.workers.robots.urdf import read_urdf
 robots = [Arm(PANDA_SCALED, reach_m, 0.8) for reach_m in (0.6, *map(float, sys.argv[1:]))]
 for k in range(7):
     if k:

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
-from schemas.errors import InputError
-from workers.robots import open_robot, robot_limits
+from datagen.schemas.errors import InputError
+from datagen.workers.robots import open_robot, robot_limits
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_wrong_arguments_name_the_option_and_the_range(
 @pytest.mark.parametrize("module", ["pinocchio", "mani_skill"])
 def test_a_missing_library_is_named_with_the_extra_that_brings_it(module: str) -> None:
     hide = f"import sys; sys.modules['{module}'] = None"
-    ask = "from workers.robots import open_robot, robot_limits; robot_limits('panda')"
+    ask = "from datagen.workers.robots import open_robot, robot_limits; robot_limits('panda')"
     code = f"{hide}\n{ask}\nopen_robot('panda', None, 0.8)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1

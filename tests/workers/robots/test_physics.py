@@ -14,8 +14,8 @@ with warnings.catch_warnings():
     from sapien import physx
     from sapien.wrapper.urdf_loader import URDFLoader
 
+from datagen.workers.robots.robot import Robot
 from tests.workers.robots.robots_under_test import CASES, IDS, opened
-from workers.robots.robot import Robot
 
 STEP_S = 1 / 200
 

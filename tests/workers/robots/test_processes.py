@@ -12,7 +12,7 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 PRINT_DIGEST = """
 import hashlib, sys
 import numpy as np
-from workers.robots import open_robot
+from datagen.workers.robots import open_robot
 order = [("panda-scaled", 0.4), ("panda", None), ("panda-scaled", 0.7), ("xarm7", None)]
 digests = {}
 for name, reach in order if sys.argv[1] == "1" else order[::-1]:

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.specification import SceneParams
+from datagen.schemas.specification import SceneParams
+from datagen.workers.redraw import Redraw
+from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, cylinder_model, table_house
-from workers.redraw import Redraw
-from workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
 
 MODELS = [
     box_model("target", (0.07, 0.05, 0.2)),

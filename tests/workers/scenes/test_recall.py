@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.errors import InputError
-from schemas.fields import SceneRows
-from schemas.run import Run
-from schemas.scene_rows import read_scenes
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
+from datagen.workers.scenes.recall import RecalledScene, recall_candidates, recall_scene
+from datagen.workers.world import World, open_world
 from tests.small_runs import PER_SCENE, make_small_run
-from workers.scenes.recall import RecalledScene, recall_candidates, recall_scene
-from workers.world import World, open_world
 
 Stored = tuple[World, SceneRows]
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.errors import InputError
+from datagen.schemas.errors import InputError
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import pose
+from datagen.workers.settling.inertia import MassProperties, mass_properties
 from tests.workers.worlds import ball_model, box_vertices, cylinder_model
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import pose
-from workers.settling.inertia import MassProperties, mass_properties
 
 edge = st.floats(0.02, 0.4)
 

@@ -8,8 +8,13 @@ import numpy as np
 import pybullet
 import pytest
 
-from schemas.errors import InputError
-from schemas.specification import SettleParams
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import SettleParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import translation, yaw_pose
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.settling.pybullet_settler import settle_pybullet
+from datagen.workers.settling.settler import SettleResult
 from tests.workers.worlds import (
     TABLE_TOP_M,
     ball_model,
@@ -21,11 +26,6 @@ from tests.workers.worlds import (
     on_table,
     table_house,
 )
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import translation, yaw_pose
-from workers.objects.model import ObjectModel
-from workers.settling.pybullet_settler import settle_pybullet
-from workers.settling.settler import SettleResult
 
 PARAMS = SettleParams()
 PARTS = [part for body in table_house().bodies for part in body.convex_parts_m]
@@ -60,7 +60,7 @@ def test_things_rest_at_half_their_height_without_a_margin() -> None:
 
 def test_resting_places_agree_with_physx() -> None:
     pytest.importorskip("sapien", reason="SAPIEN cannot be imported here", exc_type=ImportError)
-    from workers.settling.sapien_settler import settle_sapien
+    from datagen.workers.settling.sapien_settler import settle_sapien
 
     models, poses = three_objects()
     models.append(bent())

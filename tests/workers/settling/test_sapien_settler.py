@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
-from schemas.specification import SettleParams
+from datagen.schemas.specification import SettleParams
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.redraw import Redraw
+from datagen.workers.scenes.draw import check_settled
+from datagen.workers.settling.sapien_settler import settle_sapien
+from datagen.workers.settling.settler import SettleResult
 from tests.workers.worlds import TABLE_TOP_M, ball_model, box_model, cylinder_model, on_table, table_house
-from workers.objects.model import ObjectModel
-from workers.redraw import Redraw
-from workers.scenes.draw import check_settled
-from workers.settling.sapien_settler import settle_sapien
-from workers.settling.settler import SettleResult
 
 PARAMS = SettleParams()
 HOUSE = table_house()

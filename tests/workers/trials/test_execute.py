@@ -9,16 +9,16 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
-from schemas.specification import TrialParams
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import translation, yaw_pose
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.robots import open_robot
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.trials.trial import Disturbance, TrialResult
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import TABLE_TOP_M, box_body, box_model
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import translation, yaw_pose
-from workers.motion.plan import MotionPlan
-from workers.robots import open_robot
-from workers.scenes.scene import SettledScene
-from workers.trials.execute import prepare_trials, run_trial
-from workers.trials.trial import Disturbance, TrialResult
 
 PARAMS = TrialParams()
 ROBOT = open_robot("panda-scaled", 0.8, 0.8)

@@ -13,15 +13,15 @@ import gymnasium as gym
 import torch
 from sapien import physx
 
-from schemas.errors import InputError
-from schemas.specification import TrialParams
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.robots import open_robot
+from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
+from datagen.workers.trials.trial import Disturbance
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import box_model, cylinder_model
-from workers.geometry.transforms import translation
-from workers.robots import open_robot
-from workers.trials.execute import prepare_trials, run_trial
-from workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
-from workers.trials.trial import Disturbance
 
 PARAMS = TrialParams()
 ROBOT = open_robot("panda-scaled", 0.8, 0.8)

@@ -16,19 +16,19 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
+from datagen.schemas.cost import StageClock
 from datagen.specifying.specify import specify
-from schemas.cost import StageClock
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.houses import open_houses
+from datagen.workers.labels.trials import ArmInScene, arm_in_scene, try_candidate
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.scene import pose_of_base
+from datagen.workers.objects import open_objects
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.trials.trial import Recording, TrialResult
+from datagen.workers.world import assemble_world
 from tests.workers.motion.tables import HalfSpaces
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, translation
-from workers.houses import open_houses
-from workers.labels.trials import ArmInScene, arm_in_scene, try_candidate
-from workers.motion.plan import MotionPlan
-from workers.motion.scene import pose_of_base
-from workers.objects import open_objects
-from workers.scenes.draw import draw_scene
-from workers.trials.trial import Recording, TrialResult
-from workers.world import assemble_world
 
 SCENES, SUCCESSES = 12, 3
 # PhysX lets bodies enter one another a little before it pushes them apart.

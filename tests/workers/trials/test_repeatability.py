@@ -12,14 +12,14 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 
 from sapien import physx
 
-from schemas.specification import SettleParams, TrialParams
+from datagen.schemas.specification import SettleParams, TrialParams
+from datagen.workers.geometry.transforms import translation, yaw_pose
+from datagen.workers.robots import open_robot
+from datagen.workers.settling.sapien_settler import settle_sapien
+from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.trials.trial import Disturbance
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import ball_model, box_model, cylinder_model
-from workers.geometry.transforms import translation, yaw_pose
-from workers.robots import open_robot
-from workers.settling.sapien_settler import settle_sapien
-from workers.trials.execute import prepare_trials, run_trial
-from workers.trials.trial import Disturbance
 
 PARAMS = TrialParams()
 COUNT = 6

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from workers.trials.schedule import SPEED_UP_S, led, timed
+from datagen.workers.trials.schedule import SPEED_UP_S, led, timed
 
 PERIOD_S = 0.05
 SPEED = np.array([1.0, 0.5, 2.0])

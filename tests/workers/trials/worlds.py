@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
+from datagen.workers.houses.house import Body
+from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, on_table, table_house
-from workers.geometry.mesh import F64
-from workers.geometry.transforms import inverse, translation, yaw_pose
-from workers.houses.house import Body
-from workers.motion.plan import MotionPlan
-from workers.objects.model import ObjectModel
-from workers.robots.robot import Robot
-from workers.scenes.scene import SettledScene
 
 PREGRASP_M, LIFT_M = 0.08, 0.10
 # The fingers come from above, closing along the world's y.

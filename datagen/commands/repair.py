@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from datagen.commands.verify import finding_row, print_findings
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.verify import finding_row, print_findings
-from schemas.checking.mending import Mended, RemakeShard, mend_place
-from schemas.errors import InputError
-from schemas.progress import counting
-from schemas.run import Run
-from schemas.storage import open_storage
+from datagen.schemas.checking.mending import Mended, RemakeShard, mend_place
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import counting
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
     from datagen.remaking.shards import Origin

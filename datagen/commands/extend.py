@@ -14,11 +14,11 @@ from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
 from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
-from schemas.errors import InputError
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.storage import open_storage
 
 
 def extend(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted, listed, print_rows
-from schemas.merged import open_runs
-from schemas.sealing import SEALED, SealedRoot, sealed_root
-from schemas.sealing import seal as seal_place
-from schemas.sealing import unseal as unseal_place
-from schemas.storage import open_storage
+from datagen.schemas.merged import open_runs
+from datagen.schemas.sealing import SEALED, SealedRoot, sealed_root
+from datagen.schemas.sealing import seal as seal_place
+from datagen.schemas.sealing import unseal as unseal_place
+from datagen.schemas.storage import open_storage
 
 
 def seal(run: RunPlace) -> int:

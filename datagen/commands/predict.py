@@ -18,12 +18,12 @@ from cyclopts import Parameter
 from datagen.console.options import AsJson, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
-from schemas.errors import InputError
-from schemas.whole_files import whole_file
-from workers.geometry.mesh import F64
+from datagen.schemas.errors import InputError
+from datagen.schemas.whole_files import whole_file
+from datagen.workers.geometry.mesh import F64
 
 if TYPE_CHECKING:
-    from train.prediction.frames import SensorFrame
+    from datagen.train.prediction.frames import SensorFrame
 
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
@@ -74,9 +74,9 @@ def predict(
     --camera-height. Exit code 1 when no place was seen to be clear.
     """
     # Imported here: training's libraries take seconds, and other verbs need none of them.
-    from train.prediction import RobotSize, load_scorer
-    from train.prediction import predict as scored
-    from train.prediction.answer import document, told
+    from datagen.train.prediction import RobotSize, load_scorer
+    from datagen.train.prediction import predict as scored
+    from datagen.train.prediction.answer import document, told
 
     lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
@@ -107,12 +107,12 @@ def predict(
         half_width_m=half_width,
     )
     if out is not None:
-        from train.prediction.pictures import draw_prediction
+        from datagen.train.prediction.pictures import draw_prediction
 
         with whole_file(out, alone=True) as file:
             draw_prediction(answer, file)
     if html is not None:
-        from train.prediction.page import page_of
+        from datagen.train.prediction.page import page_of
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(answer).encode())
@@ -135,8 +135,8 @@ def _frames(
     depth_scale_m: float,
 ) -> list[SensorFrame]:
     """The frames that the options name, the first with the pose that is given apart."""
-    from train.prediction.files import read_pose
-    from train.prediction.frames import read_frame, read_place
+    from datagen.train.prediction.files import read_pose
+    from datagen.train.prediction.frames import read_frame, read_place
 
     named = list(places or [])
     if folder is not None:
@@ -200,7 +200,7 @@ def _direction(text: str) -> F64:
 def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
     """What is written must be new, or an older picture or page; never one of the inputs."""
     if html is not None:
-        import_module("train.prediction.page")  # a missing library is named before anything is scored
+        import_module("datagen.train.prediction.page")  # a missing library is named before anything is scored
     read = {path.resolve() for path in inputs if path is not None}
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from cluster.books import refresh_index
+from datagen.cluster.books import refresh_index
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import print_json, print_rows, size
-from schemas.errors import InputError
-from schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
-from schemas.merged import open_runs
-from schemas.progress import counting
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
+from datagen.schemas.merged import open_runs
+from datagen.schemas.progress import counting
+from datagen.schemas.storage import Storage, open_storage
 
 _AGE = re.compile(r"([0-9]{1,9})(s|m|h|d)")
 _UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}

@@ -15,12 +15,12 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.remaking.sources import AS_FOUND, Sources
-from schemas.checking.finding import Finding
-from schemas.checking.place import Checked, check_place
-from schemas.errors import InputError, printable
-from schemas.progress import counting
-from schemas.run import Run
-from schemas.storage import Storage, open_storage
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.errors import InputError, printable
+from datagen.schemas.progress import counting
+from datagen.schemas.run import Run
+from datagen.schemas.storage import Storage, open_storage
 
 _KEPT = 10_000  # findings that are told one by one; all are counted
 _SHOWN = 50  # of them on a terminal

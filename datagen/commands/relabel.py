@@ -14,9 +14,9 @@ from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
-from schemas.errors import InputError
-from schemas.merged import open_runs
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged import open_runs
+from datagen.schemas.storage import Storage, open_storage
 
 
 def relabel(

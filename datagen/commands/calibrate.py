@@ -15,15 +15,15 @@ from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, r
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.reports.specified import specification_record
-from schemas.errors import InputError, one_line, printable
-from schemas.merged import open_runs
-from schemas.progress import steps
-from schemas.specification import HeuristicParams, Specification
-from workers.bases.candidate_sets import CANDIDATE_SETS, in_set
+from datagen.schemas.errors import InputError, one_line, printable
+from datagen.schemas.merged import open_runs
+from datagen.schemas.progress import steps
+from datagen.schemas.specification import HeuristicParams, Specification
+from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 
 if TYPE_CHECKING:
-    from train.calibration import Agreement, Trials
-    from train.evaluation.bootstrap import Estimate
+    from datagen.train.calibration import Agreement, Trials
+    from datagen.train.evaluation.bootstrap import Estimate
 
 Sets = Literal["grid", "clear", "in-range"]
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
@@ -75,7 +75,7 @@ def calibrate(
     """
     _refuse_odd(out, bootstrap, seed)
     specs, warnings = _specifications(runs, candidates, split_check)
-    from train.calibration import FOLDS, FORMS, refuse_too_little
+    from datagen.train.calibration import FOLDS, FORMS, refuse_too_little
 
     if specs[0].heuristic.alpha == 1 and not fit_alpha:
         problem = "1 in these runs: distance has no weight, and nothing to fit"
@@ -166,8 +166,8 @@ def _read(places: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Tr
     """The labels of all runs over the named set of candidates."""
     import numpy as np
 
-    from train.calibration import Trials
-    from train.reader import SampleReader
+    from datagen.train.calibration import Trials
+    from datagen.train.reader import SampleReader
 
     reader = SampleReader(places, ("house_id",), _SAMPLE_FIELDS, allow_incomplete)
     parts: list[dict[str, Any]] = []
@@ -197,7 +197,7 @@ def _calibrate(
     seed: int,
     step: Any,
 ) -> _Calibrated:
-    from train.calibration import agreements, fit, fit_leaving_houses_out
+    from datagen.train.calibration import agreements, fit, fit_leaving_houses_out
 
     def refit(some: Trials) -> HeuristicParams:
         return fit(some, before, forms, objective, fit_alpha)
@@ -215,7 +215,7 @@ def _calibrate(
 
 
 def _findings(made: _Calibrated) -> dict[str, Any]:
-    from train.evaluation.bootstrap import verdict
+    from datagen.train.evaluation.bootstrap import verdict
 
     def record(agreement: Agreement) -> dict[str, Any]:
         counts = dict(zip(_COUNTS, map(int, agreement.confusion), strict=True))

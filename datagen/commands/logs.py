@@ -14,10 +14,10 @@ from datagen.console.printing import print_json, print_lines
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import jobs_api_of
 from datagen.reports.events import Event, Known, events_of
-from schemas.errors import InputError, printable
-from schemas.jobs import Jobs
-from schemas.merged import open_runs
-from schemas.storage import Storage, open_storage
+from datagen.schemas.errors import InputError, printable
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.merged import open_runs
+from datagen.schemas.storage import Storage, open_storage
 
 _LOOK_S = 2.0
 

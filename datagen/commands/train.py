@@ -13,12 +13,12 @@ from datagen.console.command_lines import say_interrupted
 from datagen.console.options import AllowIncomplete, AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.schemas.errors import InputError
 from datagen.training.options import model_sizes, read_augmentation, share_cores
-from schemas.errors import InputError
 
 if TYPE_CHECKING:
-    from train.training.checkpoints import CheckpointHead, EpochRecord
-    from train.training.stages import Job
+    from datagen.train.training.checkpoints import CheckpointHead, EpochRecord
+    from datagen.train.training.stages import Job
 
 Whole = Annotated[int | None, WHOLE_NUMBER]
 
@@ -79,10 +79,10 @@ def train(
     if not runs:
         raise InputError("datagen train", "RUN", "no run is named", "Name one or more run folders")
     each = share_cores(processes, threads)
-    from train.training.checkpoints import read_checkpoint
-    from train.training.devices import choose_device
-    from train.training.options import STAGES, Options
-    from train.training.stages import Job
+    from datagen.train.training.checkpoints import read_checkpoint
+    from datagen.train.training.devices import choose_device
+    from datagen.train.training.options import STAGES, Options
+    from datagen.train.training.stages import Job
 
     chosen = STAGES[stage]
     _refuse_odd_init(stage, init, chosen.from_checkpoint)
@@ -131,9 +131,9 @@ def _refuse_odd_init(stage: str, init: Path | None, needs_one: bool) -> None:
 
 def _train(job: Job, processes: int) -> bool:
     """Whether it came to its end; else it was interrupted."""
-    from train.training.launching import interruptible, train_in_processes
-    from train.training.ranks import Ranks
-    from train.training.stages import train_job
+    from datagen.train.training.launching import interruptible, train_in_processes
+    from datagen.train.training.ranks import Ranks
+    from datagen.train.training.stages import train_job
 
     with interruptible() as stopping:
         if processes == 1:
@@ -142,7 +142,7 @@ def _train(job: Job, processes: int) -> bool:
 
 
 def _report(out: Path, finished: bool, json: bool) -> int:
-    from train.training.checkpoints import read_checkpoint
+    from datagen.train.training.checkpoints import read_checkpoint
 
     head = read_checkpoint(out).head if out.exists() else None
     best = head.history[head.best_epoch - 1] if head and head.best_epoch else None

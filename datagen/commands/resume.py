@@ -14,9 +14,9 @@ from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import HERE, Placing, absolute_place, opening
 from datagen.remaking.sources import AS_FOUND, Sources
-from schemas.merged import open_runs
-from schemas.quarantine import lift_quarantine
-from schemas.storage import open_storage
+from datagen.schemas.merged import open_runs
+from datagen.schemas.quarantine import lift_quarantine
+from datagen.schemas.storage import open_storage
 
 
 def resume(

@@ -9,17 +9,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from cluster.ray_head import running_head, stop_head
-from cluster.ray_jobs import open_ray_jobs
+from datagen.cluster.ray_head import running_head, stop_head
+from datagen.cluster.ray_jobs import open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
 from datagen.jobs.report import health_line, job_report
-from schemas.errors import InputError
-from schemas.jobs import Job, Jobs
-from schemas.merged import open_runs
-from schemas.storage import open_storage
+from datagen.schemas.errors import InputError
+from datagen.schemas.jobs import Job, Jobs
+from datagen.schemas.merged import open_runs
+from datagen.schemas.storage import open_storage
 
 _LOOK_S = 1.0
 # Its driver looks for requests every few seconds; beyond this one of a detached job has not answered.

@@ -18,15 +18,15 @@ from datagen.remaking.scenes import chosen_rows, open_replayer, what_differs_her
 from datagen.remaking.shards import Origin, open_origin
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.identity import sample_ids
+from datagen.schemas.merged import open_runs
+from datagen.schemas.progress import Step, steps
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
 from datagen.specifying.arms import refuse_missing_packages
-from schemas.errors import InputError
-from schemas.fields import SceneRows
-from schemas.identity import sample_ids
-from schemas.merged import open_runs
-from schemas.progress import Step, steps
-from schemas.run import Run
-from schemas.scene_rows import read_scene
-from workers.scenes.recall import recall_scene
+from datagen.workers.scenes.recall import recall_scene
 
 _PREFIX_AT_LEAST = 6
 _SHOWN = 5

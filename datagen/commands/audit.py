@@ -15,11 +15,11 @@ from datagen.reports.agreement import common_candidates, compare, outcome_report
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
 from datagen.reports.labelled import join_labelled, read_labelled
 from datagen.reports.specified import is_disturbed
-from schemas.cost import STAGES
-from schemas.errors import InputError
-from schemas.merged import open_runs
-from schemas.run import Run
-from schemas.specification import Specification
+from datagen.schemas.cost import STAGES
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged import open_runs
+from datagen.schemas.run import Run
+from datagen.schemas.specification import Specification
 
 # GBPP: 180,000 distance-visibility labels in under three days on one RTX A5000, and over three weeks
 # for as many simulated ones.

@@ -11,8 +11,8 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.jobs.report import health_line, jobs_report
 from datagen.reports.standing import place_report
-from schemas.jobs import Jobs
-from schemas.storage import Storage, open_storage
+from datagen.schemas.jobs import Jobs
+from datagen.schemas.storage import Storage, open_storage
 
 
 def status(

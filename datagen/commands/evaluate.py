@@ -10,9 +10,9 @@ from cyclopts import Parameter
 from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
-from schemas.errors import InputError
-from schemas.progress import counting
-from schemas.whole_files import whole_file
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import counting
+from datagen.schemas.whole_files import whole_file
 
 
 def evaluate(
@@ -68,12 +68,12 @@ def evaluate(
     from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
     from datagen.evaluating.report import evaluation_report
     from datagen.evaluating.tables import print_evaluation
-    from train.evaluation.columns import gather
+    from datagen.train.evaluation.columns import gather
 
     _refuse_odd(bootstrap, seed, threads, html)
     checkpoints, runs = tell_apart(places)
     if threads is not None:
-        from train.scorers import use_threads
+        from datagen.train.scorers import use_threads
 
         use_threads(threads)
     opened = open_places(runs, allow_incomplete)

@@ -13,21 +13,21 @@ from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, refuse_unusable_engines
 from datagen.jobs.job import Work
 from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Layout
+from datagen.schemas.storage import open_storage
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.manifest import manifest_of
 from datagen.specifying.specify import layout_of, specify
 from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
-from schemas.cost import StageClock
-from schemas.errors import InputError
-from schemas.keys import MERGED
-from schemas.run import Run
-from schemas.run_records import Layout
-from schemas.storage import open_storage
-from workers.houses import open_houses
-from workers.labels import load_label_source
-from workers.objects import open_objects
-from workers.scenes.draw import draw_scene
-from workers.world import World, assemble_world, open_world
+from datagen.workers.houses import open_houses
+from datagen.workers.labels import load_label_source
+from datagen.workers.objects import open_objects
+from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.world import World, assemble_world, open_world
 
 # Options that stored scenes have decided.
 _OF_SCENES = (

@@ -13,12 +13,12 @@ from datagen.console.printing import print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
 from datagen.remaking.sources import AS_FOUND, AssetSources
+from datagen.schemas.errors import InputError
+from datagen.schemas.merged import find_scene, open_runs
+from datagen.schemas.scene_rows import read_scene
 from datagen.specifying.arms import refuse_missing_packages
-from schemas.errors import InputError
-from schemas.merged import find_scene, open_runs
-from schemas.scene_rows import read_scene
-from workers.scenes.recall import recall_scene
-from workers.world import open_world
+from datagen.workers.scenes.recall import recall_scene
+from datagen.workers.world import open_world
 
 _BEST = "best"
 

@@ -12,12 +12,12 @@ from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
 from datagen.reports.accounts import account_for
-from schemas.lineage import lineage_summary
-from schemas.merged import open_runs, wanted
-from schemas.merging import Merge, Result, carry_out, plan_merge
-from schemas.merging.writing import Written
-from schemas.progress import steps
-from schemas.run import Run
+from datagen.schemas.lineage import lineage_summary
+from datagen.schemas.merged import open_runs, wanted
+from datagen.schemas.merging import Merge, Result, carry_out, plan_merge
+from datagen.schemas.merging.writing import Written
+from datagen.schemas.progress import steps
+from datagen.schemas.run import Run
 
 
 def merge(

@@ -1,0 +1,129 @@
+"""The built wheel as a stranger has it: one import name, used from a folder full of files with our names."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY
+from tests.sim_extra import needs_sim
+from tests.small_runs import CONFIG
+from tests.train.prediction.seen_scenes import draw_seen, write_frame
+
+# The subpackages, which were import names of their own once, and names that every library has.
+OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
+FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
+MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy of the sources, because a build leaves files beside them."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, source)
+    ignore = shutil.ignore_patterns("__pycache__")
+    for name in ("cluster", "datagen", "schemas", "train", "workers"):
+        shutil.copytree(REPOSITORY / name, source / name, symlinks=True, ignore=ignore)
+    build = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        str(folder),
+    ]
+    subprocess.run([*build, str(source)], check=True, env={**os.environ, "PIP_NO_INDEX": "1"})
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The `bin` folder of a fresh environment with the wheel; libraries are those of this environment."""
+    folder = tmp_path_factory.mktemp("environment") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    python = folder / "bin" / "python"
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        str(python),
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-index",
+    ]
+    subprocess.run([*command, str(wheel)], check=True)
+    ask = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = subprocess.run([python, "-c", ask], check=True, capture_output=True, text=True).stdout.strip()
+    # Plain paths in a .pth file: the editable installation of this checkout that lies there is not followed.
+    libraries = Path(sysconfig.get_path("purelib"))
+    python_name = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    cmeel = libraries / "cmeel.prefix" / "lib" / python_name / "site-packages"  # of coal and pinocchio
+    (Path(site) / "libraries.pth").write_text(f"{libraries}\n{cmeel}\n")
+    return folder / "bin"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder, whose own modules say so when anything imports them."""
+    folder = tmp_path_factory.mktemp("user")
+    for name in OWN_FILES:
+        (folder / f"{name}.py").write_text(f"open({str(folder / 'imported')!r}, 'a').write({name!r} + ' ')\n")
+    return folder
+
+
+def test_a_wheel_adds_one_import_name(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name.split("/")[0] for name in archive.namelist()}
+    assert {name for name in names if not name.endswith(".dist-info")} == {"datagen"}
+
+
+def test_the_folders_of_a_checkout_cannot_be_imported_under_their_own_names() -> None:
+    for name in ("cluster", "schemas", "train", "workers"):
+        command = [sys.executable, "-c", f"import {name}"]
+        run = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=False)
+        assert f"import it as datagen.{name}".encode() in run.stderr
+
+
+@needs_sim
+def test_labels_training_and_prediction_beside_a_users_files(installed: Path, folder: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
+    environment["OMP_NUM_THREADS"] = "1"
+
+    def datagen(*words: str) -> None:
+        command = [installed / "datagen", *words]
+        run = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+        assert run.returncode == 0, f"{' '.join(words)}: {run.stderr}"
+
+    (folder / "small.toml").write_text(CONFIG)
+    (folder / "plan.toml").write_text(CONFIG + FEW_GRASPS)
+    small = ("--n", "16", "--candidates-per-scene", "8")
+    datagen("submit", "heuristic", "--out", "run", "--split", "train", "--config", "small.toml", *small)
+    datagen("submit", "heuristic", "--out", "val", "--split", "val", "--config", "small.toml", *small)
+    plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
+    datagen("submit", "plan", "--out", "plan", *plan, *small)
+    datagen("show", "run", "--scene", "0", "--out", "scene.png")
+    datagen("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL)
+    datagen("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html")
+    write_frame(folder / "frame", draw_seen(0))
+    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
+    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png")
+    assert {"scene.png", "page.html", "heat.png"} <= {path.name for path in folder.iterdir()}
+    assert not (folder / "imported").exists(), (folder / "imported").read_text()
