@@ -180,17 +180,17 @@ def _write(run: Run, rows: Rows) -> str:
     packer = zlib.compressobj(1, wbits=31)
     data = packer.compress(sha256(body).hexdigest().encode() + b"\n" + body) + packer.flush()
     key = f"index/{sha256(data).hexdigest()[:16]}.json.gz"
-    run.storage.put(key, data)
-    run.storage.sync([key])
+    run.storage.put(
+        key, data
+    )  # not made durable: it is a cache, and another driver may have removed it by now
     return key
 
 
 def _read_files(run: Run) -> Iterator[tuple[str, Rows]]:
     """(key, rows) of the index's readable files, one at a time."""
     for key in index_files(run):
-        with suppress(
-            InputError, ValueError, zlib.error
-        ):  # what holds nothing: its records are read themselves
+        # A file that holds nothing costs time: its records are read themselves.
+        with suppress(InputError, ValueError, zlib.error):
             packed = run.storage.get(key, _MAX_FILE_BYTES) or b""
             data = zlib.decompressobj(wbits=31).decompress(packed, _MAX_FILE_BYTES)
             digest, _, body = data.partition(b"\n")
