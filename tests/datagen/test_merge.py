@@ -142,7 +142,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
 def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
     """A real Ctrl-C at the first shard that is written."""
     program = (
-        "import os, signal, sys, schemas.merging.writing as w\n"
+        "import os, signal, sys, datagen.schemas.merging.writing as w\n"
         "from datagen import cli\n"
         # What a shell starts in the background ignores it.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
