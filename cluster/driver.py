@@ -26,6 +26,7 @@ from datagen.cluster.policy import (
     Durations,
     Policy,
     Trouble,
+    at_once,
     deadline_s,
     decide,
     ends_early,
@@ -176,9 +177,7 @@ class _Driver(Generic[T]):
     # Begin ---------------------------------------------------------------------------------
 
     def _fill(self) -> None:
-        # After two rounds of losses one at a time: then it shows whether a shard takes the others along.
-        width = self._at_once()
-        room = (1 if self._lost_in_a_row >= 2 * width else width) - len(self._flights)
+        room = at_once(self._lost_in_a_row, self._width()) - len(self._flights)
         while room > 0 and (shard := self._next_shard()) is not None:
             self._submit(shard)
             room -= 1
@@ -262,11 +261,11 @@ class _Driver(Generic[T]):
             self.kill_all("the job cannot go on")
         self._events.ended(report, decision.action)
 
-    def _at_once(self) -> int:
+    def _width(self) -> int:
         return min(window(self._policy, self._executor.slots), self._tally.shards - self._tally.finished)
 
     def _nothing_runs(self) -> bool:
-        return nothing_runs(self._policy, self._lost_in_a_row, self._at_once())
+        return nothing_runs(self._policy, self._lost_in_a_row, self._width())
 
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
         """A worker may die, or lose its store's answer, after its commit: the commit record decides."""

@@ -109,12 +109,20 @@ def is_suspect(trouble: Trouble) -> bool:
     return trouble.lost >= 2
 
 
-def nothing_runs(policy: Policy, lost_in_a_row: int, at_once: int) -> bool:
-    """Whether the executor rather than a shard is at fault: whatever it is given, `at_once`, is lost.
+def at_once(lost_in_a_row: int, width: int) -> int:
+    """How many of `width` attempts to have in flight.
+
+    After two rounds of losses one at a time: that shows whether one shard ends the machine of all others.
+    """
+    return 1 if lost_in_a_row >= 2 * width else width
+
+
+def nothing_runs(policy: Policy, lost_in_a_row: int, width: int) -> bool:
+    """Whether the executor, not a shard, is at fault: of `width` attempts in flight all are lost, always.
 
     Not before the budget of a shard that is the only one left has decided.
     """
-    return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * at_once)
+    return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * width)
 
 
 def window(policy: Policy, slots: int) -> int:

@@ -105,12 +105,12 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
     environment["OMP_NUM_THREADS"] = "1"
 
-    def datagen(*words: str, codes: tuple[int, ...] = (0,)) -> None:
+    def datagen(*words: str) -> None:
         command = [installed / "datagen", *words]
         run = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
-        assert run.returncode in codes, f"{' '.join(words)}: {run.stderr}"
+        assert run.returncode == 0, f"{' '.join(words)}: {run.stderr}"
 
     (folder / "small.toml").write_text(CONFIG)
     (folder / "plan.toml").write_text(CONFIG + FEW_GRASPS)
@@ -123,8 +123,7 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     datagen("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL)
     datagen("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html")
     write_frame(folder / "frame", draw_seen(0))
-    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
-    # 1 where a model that learned next to nothing finds no good base.
-    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png", codes=(0, 1))
+    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
+    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png")
     assert {"scene.png", "page.html", "heat.png"} <= {path.name for path in folder.iterdir()}
     assert not (folder / "imported").exists(), (folder / "imported").read_text()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from datagen.cluster.driver import Order
-from datagen.cluster.policy import Trouble
+from datagen.cluster.policy import Policy, Trouble
 from datagen.cluster.tally import Tally
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
@@ -16,6 +16,8 @@ from datagen.schemas.shard_ranges import ShardRanges
 
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]
+# Gives no job up, however many of its shards are bad.
+LENIENT = Policy(max_quarantined_share=1.0)
 
 
 class FakeClock:

@@ -12,6 +12,7 @@ from datagen.cluster.policy import (
     Durations,
     Policy,
     Trouble,
+    at_once,
     deadline_s,
     decide,
     ends_early,
@@ -75,14 +76,21 @@ def test_a_loss_counts_where_the_shard_was_alone_or_others_succeeded_since_its_l
 
 
 def test_losses_in_a_row_are_the_executors_fault_and_never_before_a_lone_shards_budget_is_spent() -> None:
-    assert [nothing_runs(POLICY, lost, at_once=4) for lost in (20, 21)] == [False, True]
-    assert [nothing_runs(POLICY, lost, at_once=1) for lost in (11, 12)] == [False, True]
+    assert [nothing_runs(POLICY, lost, width=4) for lost in (20, 21)] == [False, True]
+    assert [nothing_runs(POLICY, lost, width=1) for lost in (11, 12)] == [False, True]
     # The first of its losses may not count.
     trouble, actions = Trouble(), []
     for _ in range(11):
         decision = decide(POLICY, trouble, AttemptReport("a", 0, "lost"), alone=bool(actions))
         trouble, actions = decision.trouble, [*actions, decision.action]
     assert actions == ["retry"] * 10 + ["quarantine"]
+
+
+def test_after_two_rounds_of_losses_shards_are_tried_one_at_a_time() -> None:
+    assert [at_once(lost, width=4) for lost in (0, 7, 8, 100)] == [4, 4, 1, 1]
+    assert at_once(100, width=1) == 1
+    # Early enough that a shard which takes the others along can be told before the job is ended.
+    assert all(not nothing_runs(POLICY, 2 * width, width) for width in range(1, 100))
 
 
 def test_waits_double_up_to_a_limit() -> None:
