@@ -12,9 +12,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 
+from datagen.workers.furniture.solids import box, join
 from datagen.workers.geometry.mesh import F32, F64, U8, Mesh
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.houses.solids import box, join
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.rays import RayStage, ray_mesh

@@ -14,7 +14,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.foreign_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.geometry.transforms import is_pose
-from datagen.workers.houses.reading import Node, parse_json
+from datagen.workers.json_document import Node, parse_json
 
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096

@@ -24,11 +24,11 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.foreign_files import open_regular, read_regular
 from datagen.schemas.identity import digest_of
+from datagen.workers.furniture.support_tops import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon
 from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
 from datagen.workers.houses.house import Body, House, Room, Surface
-from datagen.workers.houses.layout import CARRYING_TYPES
 from datagen.workers.houses.loader import room_ids_at
 from datagen.workers.houses.mesh_geometry import (
     convex_parts,
@@ -37,7 +37,7 @@ from datagen.workers.houses.mesh_geometry import (
     outlines,
     slab_parts,
 )
-from datagen.workers.houses.reading import EXTENT_M, Node, parse_json
+from datagen.workers.json_document import EXTENT_M, Node, parse_json
 
 _SUFFIX = ".scene_instance.json"
 _SCENES = Path("ai2thor-hab/configs/scenes")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from datagen.workers.furniture.solids import Rgb, Solid, prism
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.solids import Rgb, Solid, prism
 
 MAX_CORNERS = 64
 FLOOR_THICKNESS_M = 0.05

@@ -13,16 +13,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import material_rgb
+from datagen.workers.furniture.solids import join
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import material_rgb
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon, floor_solids
-from datagen.workers.houses.furnishing import object_bodies
+from datagen.workers.houses.furniture_bodies import object_bodies
 from datagen.workers.houses.house import Body, House, Room, Surface
-from datagen.workers.houses.reading import EXTENT_M, Node
-from datagen.workers.houses.solids import join
 from datagen.workers.houses.walls import WINDOW_SILL_M, Hole, WallSegment, wall_bodies
+from datagen.workers.json_document import EXTENT_M, Node
 
 MAX_ROOMS = 200
 MAX_WALLS = 2000

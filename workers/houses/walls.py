@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from datagen.workers.furniture.solids import Rgb, Solid, join, prism
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses.house import Body
-from datagen.workers.houses.solids import Rgb, Solid, join, prism
 
 WALL_THICKNESS_M = 0.02
 # A pane that reaches the floor still stops a robot's base.

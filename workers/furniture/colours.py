@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 
-from datagen.workers.houses.reading import Node
-from datagen.workers.houses.solids import Rgb
+from datagen.workers.furniture.solids import Rgb
+from datagen.workers.json_document import Node
 
 _BY_WORD: tuple[tuple[str, Rgb], ...] = (
     ("brick", (150, 84, 66)),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import hash_bytes, pick, shade
-from datagen.workers.houses.solids import Rgb, Solid, ball, box, frustum, profile
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import hash_bytes, pick, shade
+from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum, profile
 
 _DARK: Rgb = (38, 38, 42)
 _STEEL: Rgb = (176, 178, 182)

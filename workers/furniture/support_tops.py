@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from datagen.workers.houses.asset_table import Asset
+from datagen.workers.furniture.asset_table import Asset
 
 # Depth of a run of kitchen counter (24 inches, as all straight ones in the table).
 COUNTER_DEPTH_M = 0.61

@@ -9,15 +9,21 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import canonical_json, digest_of
-from datagen.workers.houses.builtin_assets import BUILTIN_ASSETS
-from datagen.workers.houses.colours import hash_bytes
-from datagen.workers.houses.floorplan import WALL_HEIGHT_M, FloorPlan, Opening, Stretch, draw_floor_plan
-from datagen.workers.houses.furnish import ROOM_FURNISHERS, Furnisher
+from datagen.workers.furniture.colours import hash_bytes
+from datagen.workers.furniture.support_tops import CARRYING_TYPES, top_height_m, top_rectangles
 from datagen.workers.houses.house import House
-from datagen.workers.houses.layout import CARRYING_TYPES, top_height_m, top_rectangles
 from datagen.workers.houses.loader import build_house
-from datagen.workers.houses.reading import Node
-from datagen.workers.houses.room_layout import layout_of
+from datagen.workers.json_document import Node
+from datagen.workers.procedural_houses.floorplan import (
+    WALL_HEIGHT_M,
+    FloorPlan,
+    Opening,
+    Stretch,
+    draw_floor_plan,
+)
+from datagen.workers.procedural_houses.furniture_placement import ROOM_FURNISHERS, Furnisher
+from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
+from datagen.workers.procedural_houses.room_layout import layout_of
 
 # Part of the digest: raise it whenever the same number would give another house.
 GENERATOR_VERSION = 1

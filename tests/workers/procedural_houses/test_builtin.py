@@ -14,8 +14,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.planar import inside_any
 from datagen.workers.houses import open_houses
-from datagen.workers.houses.builtin import house_document
 from datagen.workers.houses.house import House
+from datagen.workers.procedural_houses.builtin import house_document
 from tests.workers.houses.house_checks import check_house, top_below_m
 
 NUMBERS = range(0, 400, 13)
@@ -127,7 +127,7 @@ def test_chairs_face_their_table_or_desk(houses: list[House]):
 
 def test_the_same_house_in_another_process_and_a_longer_collection():
     code = (
-        "from datagen.workers.houses.builtin import house_document\n"
+        "from datagen.workers.procedural_houses.builtin import house_document\n"
         "from datagen.schemas.identity import digest_of\n"
         "print(digest_of(house_document(7)))"
     )

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
+from datagen.workers.furniture import fixture_shapes as x
+from datagen.workers.furniture import furniture_shapes as f
+from datagen.workers.furniture import small_shapes as s
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import pick
+from datagen.workers.furniture.solids import Rgb, Solid, join
 from datagen.workers.geometry.mesh import F32, Mesh
-from datagen.workers.houses import fixture_shapes as x
-from datagen.workers.houses import furniture_shapes as f
-from datagen.workers.houses import small_shapes as s
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import pick
-from datagen.workers.houses.solids import Rgb, Solid, join
 
 Shape = Callable[[Asset, Rgb], list[Solid]]
 

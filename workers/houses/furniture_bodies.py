@@ -8,13 +8,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from datagen.workers.furniture.asset_geometry import asset_geometry
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.solids import placed
+from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.asset_table import Asset
 from datagen.workers.houses.house import Body, BodyKind, Surface
-from datagen.workers.houses.layout import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
-from datagen.workers.houses.reading import Node
-from datagen.workers.houses.shapes import asset_geometry
-from datagen.workers.houses.solids import placed
+from datagen.workers.json_document import Node
 
 MAX_OBJECTS = 5000
 MAX_CHILDREN = 1000

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import shade
-from datagen.workers.houses.solids import Rgb, Solid, ball, box, frustum
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import shade
+from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum
 
 _STEEL: Rgb = (176, 178, 182)
 _DARK: Rgb = (44, 44, 48)

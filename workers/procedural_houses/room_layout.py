@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.support_tops import top_rectangles
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.floorplan import FloorPlan, Opening, PlannedRoom, Rect
-from datagen.workers.houses.layout import top_rectangles
+from datagen.workers.procedural_houses.floorplan import FloorPlan, Opening, PlannedRoom, Rect
 
 _WALL_GAP_M = 0.02
 _CELL_M = 0.1

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.builtin_assets import BUILTIN_ASSETS
+from datagen.workers.furniture.asset_geometry import SHAPES, asset_geometry
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
 from datagen.workers.houses.house import Body
-from datagen.workers.houses.layout import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
-from datagen.workers.houses.shapes import SHAPES, asset_geometry
+from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
 from tests.workers.houses.house_checks import check_body, hull_volume, is_convex, signed_volume
 
 SIDE = st.floats(0.02, 2.5)

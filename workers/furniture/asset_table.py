@@ -8,7 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.foreign_files import read_regular
-from datagen.workers.houses.reading import Node, parse_json
+from datagen.workers.json_document import Node, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
 _LARGEST_TABLE_BYTES = 64 << 20

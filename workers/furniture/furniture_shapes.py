@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import hash_bytes, shade
-from datagen.workers.houses.layout import hutch_depth_m, top_height_m, top_rectangles
-from datagen.workers.houses.solids import Rgb, Solid, ball, box, frustum
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import hash_bytes, shade
+from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum
+from datagen.workers.furniture.support_tops import hutch_depth_m, top_height_m, top_rectangles
 
 _CUSHION_PILLOW: Rgb = (232, 228, 220)
 _DARK: Rgb = (44, 44, 48)

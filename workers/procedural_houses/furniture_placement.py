@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.builtin_assets import BUILTIN_ASSETS, COUNTER_HEIGHT_M, variants_of
-from datagen.workers.houses.floorplan import WALL_HEIGHT_M
-from datagen.workers.houses.furniture_shapes import SOFA_SEAT_SHARE, seat_height_m
-from datagen.workers.houses.layout import top_height_m, top_rectangles
-from datagen.workers.houses.room_layout import RoomLayout, Spot, spot_at
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.furniture_shapes import SOFA_SEAT_SHARE, seat_height_m
+from datagen.workers.furniture.support_tops import top_height_m, top_rectangles
+from datagen.workers.procedural_houses.floorplan import WALL_HEIGHT_M
+from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS, COUNTER_HEIGHT_M, variants_of
+from datagen.workers.procedural_houses.room_layout import RoomLayout, Spot, spot_at
 
 # Small things that stand about, by the room.
 _SMALL: dict[str, tuple[str, ...]] = {

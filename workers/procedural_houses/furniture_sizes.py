@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.workers.houses.asset_table import Asset
+from datagen.workers.furniture.asset_table import Asset
 
 # Type: width, depth, height in metres, and the share by which variants differ from it.
 _SIZES: dict[str, tuple[float, float, float, float]] = {
