@@ -22,7 +22,7 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.specifying.specify import specify
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.labels.trials import ArmInScene, arm_in_scene, arm_of, draw_disturbances, try_candidate
@@ -40,7 +40,7 @@ class Case:
     """A planned candidate."""
 
     at: ArmInScene
-    candidates: Candidates
+    candidates: SceneCandidates
     row: int
     T_world_base: F64
     plan: MotionPlan

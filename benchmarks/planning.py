@@ -27,7 +27,7 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import ArmParams
 from datagen.specifying.specify import specify
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
 from datagen.workers.grasps.keep import grasps_of
@@ -93,7 +93,7 @@ def _world(options: argparse.Namespace) -> World:
 
 
 def _plan_grid(
-    options: argparse.Namespace, scene: Scene, candidates: Candidates, spent: Spent
+    options: argparse.Namespace, scene: Scene, candidates: SceneCandidates, spent: Spent
 ) -> list[dict[str, Any]]:
     """Plan every candidate of a scene; the plans that were found, as problems for the peer."""
     params = ArmParams()

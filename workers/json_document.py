@@ -18,7 +18,7 @@ _MOST_PARTS = 4_000_000
 
 
 @dataclass(frozen=True)
-class Node:
+class JsonNode:
     """A JSON value; `place` is the file (and line), `path` where in the document it stands."""
 
     place: str
@@ -29,19 +29,19 @@ class Node:
         """The error that names this value."""
         return InputError(self.place, self.path, problem, mend)
 
-    def get(self, key: str) -> Node:
+    def get(self, key: str) -> JsonNode:
         """The member of an object; it must be there."""
         members = self._members()
         if key not in members:
             raise self.error(f"key {key!r} is missing")
-        return Node(self.place, f"{self.path}.{key}", members[key])
+        return JsonNode(self.place, f"{self.path}.{key}", members[key])
 
-    def find(self, key: str) -> Node | None:
+    def find(self, key: str) -> JsonNode | None:
         """The member of an object, or None where it is absent or null."""
         value = self._members().get(key)
-        return None if value is None else Node(self.place, f"{self.path}.{key}", value)
+        return None if value is None else JsonNode(self.place, f"{self.path}.{key}", value)
 
-    def items(self, limit: int) -> Iterator[Node]:
+    def items(self, limit: int) -> Iterator[JsonNode]:
         """The elements of a list of at most `limit`."""
         if not isinstance(self.value, list):
             raise self.error(f"{_kind(self.value)} where a list belongs")
@@ -49,7 +49,7 @@ class Node:
         if len(values) > limit:
             raise self.error(f"{len(values)} entries, more than the {limit} allowed")
         for i, value in enumerate(values):
-            yield Node(self.place, f"{self.path}[{i}]", value)
+            yield JsonNode(self.place, f"{self.path}[{i}]", value)
 
     def number(self, low: float, high: float) -> float:
         """A finite number within [low, high]."""
@@ -86,13 +86,13 @@ class Node:
         return cast(dict[str, Any], self.value)
 
 
-def parse_json(text: bytes, place: str) -> Node:
+def parse_json(text: bytes, place: str) -> JsonNode:
     """The document, or an InputError for text that is not JSON or is nested too deeply."""
     mend = "Restore the file from its source."
     if text.count(b"{") + text.count(b"[") > _MOST_PARTS:
         raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", mend)
     try:
-        return Node(place, "$", json.loads(text))
+        return JsonNode(place, "$", json.loads(text))
     except RecursionError:
         raise InputError(place, "$", "lists or objects nested too deeply", mend) from None
     except UnicodeDecodeError as error:

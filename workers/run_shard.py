@@ -23,7 +23,7 @@ from datagen.schemas.fields import SceneRows, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.labels.source import LabelSource
 from datagen.workers.rendering.frame import Camera
@@ -50,7 +50,7 @@ class _Staged:
     """A scene that waits for labels: what is looked at, and the rows that no label decides."""
 
     scene: SettledScene
-    candidates: Candidates
+    candidates: SceneCandidates
     record: Mapping[str, Any]
     redraws: Mapping[str, int]
 
@@ -150,7 +150,7 @@ def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def candidate_columns(
-    scene_index: int, candidates: Candidates, spec_hash: str, source: LabelSource
+    scene_index: int, candidates: SceneCandidates, spec_hash: str, source: LabelSource
 ) -> Columns:
     """The columns that the candidates alone decide, one row a candidate."""
     n = len(candidates)

@@ -17,7 +17,7 @@ from datagen.workers.geometry.mesh import F32, F64, U8, Mesh
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
-from datagen.workers.rendering.rays import RayStage, ray_mesh
+from datagen.workers.rendering.rays import RayScene, ray_mesh
 from datagen.workers.robots.robot import Gripper
 from datagen.workers.scenes.recall import RecalledScene
 
@@ -86,7 +86,7 @@ def draw_grasps(
         "from the observer's side": centre_m + _FAR_M * np.array([*(0.97 * towards), 0.24]),
     }
     rays = recalled.rays
-    stage = RayStage(ray_mesh(support), rays.objects, rays.radii_m, rays.T_world_object)
+    stage = RayScene(ray_mesh(support), rays.objects, rays.radii_m, rays.T_world_object)
     scale = None
     if len(used.count):
         scale = ScalarMappable(Normalize(0, float(used.count.max())), colormaps["plasma"])

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
 from datagen.specifying.specify import label_engines, scene_engines
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.run_shard import Columns, candidate_columns, scene_row
 from datagen.workers.scenes.draw import draw_scene
@@ -63,7 +63,7 @@ class Replayer:
         candidates = recall_candidates(stored.samples, scene)
         return SceneRows(stored.record, self._samples(scene, candidates, rows))
 
-    def _samples(self, scene: SettledScene, candidates: Candidates, rows: Sequence[int]) -> Columns:
+    def _samples(self, scene: SettledScene, candidates: SceneCandidates, rows: Sequence[int]) -> Columns:
         spec = self.run.manifest.spec
         source = load_label_source(spec.label_source)
         common = candidate_columns(scene.index, candidates, self.run.manifest.spec_hash, source)

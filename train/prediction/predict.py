@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.candidates import (
     BLOCKED,
     CLEAR,
@@ -280,13 +280,13 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) ->
             one(target.center_m[2]),
             one(target.radius_m),
         ),
-        Robots(
+        RobotInputs(
             np.zeros(1, np.int64),
             one(robot.camera_height_m),
             one(robot.base_height_m),
             one(robot.arm_reach_m),
         ),
-        Candidates(np.zeros(n, np.int64), places.offset_m),
+        CandidateInputs(np.zeros(n, np.int64), places.offset_m),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
         {"base_is_clear": places.state != STATES.index(BLOCKED)},

@@ -11,10 +11,10 @@ from datagen.workers.furniture import furniture_shapes as f
 from datagen.workers.furniture import small_shapes as s
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import pick
-from datagen.workers.furniture.solids import Rgb, Solid, join
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, join
 from datagen.workers.geometry.mesh import F32, Mesh
 
-Shape = Callable[[Asset, Rgb], list[Solid]]
+Shape = Callable[[Asset, Rgb], list[ColouredSolid]]
 
 _WOOD: tuple[Rgb, ...] = (
     (164, 122, 82), (126, 88, 58), (196, 160, 116), (92, 66, 48), (224, 218, 208), (70, 66, 64),

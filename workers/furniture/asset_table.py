@@ -8,7 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.foreign_files import read_regular
-from datagen.workers.json_document import Node, parse_json
+from datagen.workers.json_document import JsonNode, parse_json
 
 TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
 _LARGEST_TABLE_BYTES = 64 << 20
@@ -55,7 +55,7 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     return {asset.asset_id: asset for asset in assets}, text
 
 
-def _entries(root: Node) -> Iterator[tuple[Node, bool]]:
+def _entries(root: JsonNode) -> Iterator[tuple[JsonNode, bool]]:
     if isinstance(root.value, list):
         for node in root.items(_MAX_ASSETS):
             yield node, False
@@ -66,18 +66,18 @@ def _entries(root: Node) -> Iterator[tuple[Node, bool]]:
     if len(members) > _MAX_ASSETS:
         raise root.error(f"more than {_MAX_ASSETS} entries")
     for key, value in members.items():
-        node = Node(root.place, f"$.{key[:100]}", value)
+        node = JsonNode(root.place, f"$.{key[:100]}", value)
         if isinstance(value, list):
             for item in node.items(_MAX_ASSETS):
                 yield item, False
         else:
-            yield Node(root.place, node.path, (key, value)), True
+            yield JsonNode(root.place, node.path, (key, value)), True
 
 
-def _own_entry(node: Node) -> Asset:
+def _own_entry(node: JsonNode) -> Asset:
     key, value = node.value
-    asset_id = Node(node.place, node.path, key).text()
-    entry = Node(node.place, node.path, value)
+    asset_id = JsonNode(node.place, node.path, key).text()
+    entry = JsonNode(node.place, node.path, value)
     sides = [_side(s) for s in entry.get("size").items(3)]
     if len(sides) != 3:
         raise entry.get("size").error(f"{len(sides)} numbers where 3 belong")
@@ -94,12 +94,12 @@ def _own_entry(node: Node) -> Asset:
     return Asset(asset_id, entry.get("objectType").text(), size_m, rest_height_m, tuple(levels))
 
 
-def _thor_entry(node: Node) -> Asset:
+def _thor_entry(node: JsonNode) -> Asset:
     box = node.get("boundingBox")
     width, height, depth = (_side(box.get(axis)) for axis in "xyz")
     return Asset(node.get("assetId").text(), node.get("objectType").text(), (width, depth, height))
 
 
-def _side(node: Node) -> float:
+def _side(node: JsonNode) -> float:
     # Cards and papers have no thickness in the table; a solid needs some.
     return max(node.number(0.0, _MAX_SIZE_M), _THINNEST_M)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 from datagen.workers.furniture.solids import Rgb
-from datagen.workers.json_document import Node
+from datagen.workers.json_document import JsonNode
 
 _BY_WORD: tuple[tuple[str, Rgb], ...] = (
     ("brick", (150, 84, 66)),
@@ -63,7 +63,7 @@ def shade(rgb: Rgb, factor: float) -> Rgb:
     return (r, g, b)
 
 
-def material_rgb(material: Node | None, of_floor: bool) -> Rgb:
+def material_rgb(material: JsonNode | None, of_floor: bool) -> Rgb:
     """Colour of a wall or floor material `{name, color?: {r, g, b}}` (0 to 1 each), or of its name."""
     if material is None:
         return (176, 172, 164) if of_floor else (218, 214, 206)

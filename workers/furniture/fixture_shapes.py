@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import shade
-from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum
 
 _STEEL: Rgb = (176, 178, 182)
 _DARK: Rgb = (44, 44, 48)
 
 
-def fridge(asset: Asset, rgb: Rgb) -> list[Solid]:
+def fridge(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Two doors with handles in front of a body."""
     x, y, height = asset.halves_m
     split = 0.35 * height
@@ -26,7 +26,7 @@ def fridge(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def toilet(asset: Asset, rgb: Rgb) -> list[Solid]:
+def toilet(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Bowl, seat and cistern."""
     x, y, height = asset.halves_m
     seat = min(0.42, 0.45 * height)
@@ -41,7 +41,7 @@ def toilet(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def sink(asset: Asset, rgb: Rgb) -> list[Solid]:
+def sink(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A basin with a rim, on a pedestal where it stands on the floor."""
     x, y, height = asset.halves_m
     rim = min(height, 0.86) if height > 0.5 else height
@@ -62,7 +62,7 @@ def sink(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def washing_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
+def washing_machine(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A box with a panel and a round door."""
     x, y, height = asset.halves_m
     radius = min(0.7 * x, 0.32 * height)
@@ -73,7 +73,7 @@ def washing_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def stove(asset: Asset, rgb: Rgb) -> list[Solid]:
+def stove(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An oven with a glass door below four plates."""
     x, y, height = asset.halves_m
     radii = (0.28 * x, 0.28 * y)
@@ -90,7 +90,7 @@ def stove(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def wall_cabinet(asset: Asset, rgb: Rgb) -> list[Solid]:
+def wall_cabinet(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A hanging cupboard with two doors."""
     x, y, height = asset.halves_m
     doors = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import hash_bytes, shade
-from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum
 from datagen.workers.furniture.support_tops import hutch_depth_m, top_height_m, top_rectangles
 
 _CUSHION_PILLOW: Rgb = (232, 228, 220)
@@ -14,14 +14,14 @@ _WHITE: Rgb = (236, 236, 234)
 SOFA_SEAT_SHARE = 0.46
 
 
-def _legs(x: float, y: float, z: tuple[float, float], side: float, rgb: Rgb) -> list[Solid]:
+def _legs(x: float, y: float, z: tuple[float, float], side: float, rgb: Rgb) -> list[ColouredSolid]:
     """Four square legs whose outer faces are at +-x and +-y."""
     across = ((-x, side - x), (x - side, x))
     along = ((-y, side - y), (y - side, y))
     return [box(i, j, z, rgb) for i in across for j in along]
 
 
-def table(asset: Asset, rgb: Rgb) -> list[Solid]:
+def table(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A top on four legs."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -32,7 +32,7 @@ def table(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [box((-x, x), (-y, y), (top - slab, top), rgb), *legs]
 
 
-def side_table(asset: Asset, rgb: Rgb) -> list[Solid]:
+def side_table(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A small table with a lower board, or a bedside cabinet, by the hash of the asset."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -44,11 +44,11 @@ def side_table(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [*table(asset, rgb), lower]
 
 
-def counter(asset: Asset, rgb: Rgb) -> list[Solid]:
+def counter(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Cupboards on a plinth below a worktop, along every run of an I, L or U."""
     top = top_height_m(asset)
     cupboard, worktop = rgb, shade((176, 172, 166), 0.8 + 0.4 * hash_bytes(asset.asset_id)[3] / 255)
-    solids: list[Solid] = []
+    solids: list[ColouredSolid] = []
     for k, r in enumerate(top_rectangles(asset)):
         # The toe space is at the side that faces the room: +y for the back run, inwards for wings.
         front = (
@@ -65,7 +65,7 @@ def counter(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[Solid]:
+def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[ColouredSolid]:
     """Door leaves in front of the back run, as far as no wing hides it."""
     runs = top_rectangles(asset)
     low = runs[2].x[1] if len(runs) == 3 else runs[0].x[0]
@@ -84,7 +84,7 @@ def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def desk(asset: Asset, rgb: Rgb) -> list[Solid]:
+def desk(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A top on a side panel, a back panel and drawers, open at the front; a hutch where it is higher."""
     x, y, height = asset.halves_m
     top = top_height_m(asset)
@@ -113,7 +113,7 @@ def desk(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def dresser(asset: Asset, rgb: Rgb) -> list[Solid]:
+def dresser(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A chest with drawer fronts on a plinth."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -135,7 +135,7 @@ def dresser(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def tv_stand(asset: Asset, rgb: Rgb) -> list[Solid]:
+def tv_stand(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A low board with open compartments."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -152,7 +152,7 @@ def tv_stand(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def shelf(asset: Asset, rgb: Rgb) -> list[Solid]:
+def shelf(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Sides, a back and boards: where things were seen to stand, else evenly spaced."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -178,7 +178,7 @@ def shelf(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def cart(asset: Asset, rgb: Rgb) -> list[Solid]:
+def cart(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Three trays between four posts."""
     x, y, height = asset.halves_m
     top = top_height_m(asset)
@@ -192,7 +192,7 @@ def seat_height_m(asset: Asset, share: float) -> float:
     return rest if rest is not None and 0.15 < rest < 0.9 * height else share * height
 
 
-def sofa(asset: Asset, rgb: Rgb) -> list[Solid]:
+def sofa(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Seat, back and arms; also for armchairs."""
     x, y, height = asset.halves_m
     seat = seat_height_m(asset, SOFA_SEAT_SHARE)
@@ -214,7 +214,7 @@ def sofa(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def chair(asset: Asset, rgb: Rgb) -> list[Solid]:
+def chair(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Four legs, a seat and a back at the rear."""
     x, y, height = asset.halves_m
     seat = seat_height_m(asset, 0.5)
@@ -227,7 +227,7 @@ def chair(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [box((-x, x), (-y, y), (seat - 0.04, seat), rgb), back, *posts, *legs]
 
 
-def stool(asset: Asset, rgb: Rgb) -> list[Solid]:
+def stool(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A seat on four legs."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -235,7 +235,7 @@ def stool(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [seat, *_legs(0.75 * x, 0.75 * y, (0.0, top - 0.05), 0.035, shade(rgb, 0.8))]
 
 
-def ottoman(asset: Asset, rgb: Rgb) -> list[Solid]:
+def ottoman(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An upholstered block on a base."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
@@ -243,7 +243,7 @@ def ottoman(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [base, box((-x, x), (-y, y), (0.06, top), rgb)]
 
 
-def bed(asset: Asset, rgb: Rgb) -> list[Solid]:
+def bed(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A mattress on a frame with a headboard and pillows; on posts where it is a loft or bunk bed."""
     x, y, height = asset.halves_m
     top = seat_height_m(asset, 0.6)

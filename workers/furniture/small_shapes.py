@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import hash_bytes, pick, shade
-from datagen.workers.furniture.solids import Rgb, Solid, ball, box, frustum, profile
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, profile
 
 _DARK: Rgb = (38, 38, 42)
 _STEEL: Rgb = (176, 178, 182)
@@ -12,25 +12,25 @@ _LEAF: tuple[Rgb, ...] = ((74, 112, 58), (96, 132, 70), (60, 96, 60))
 _LINEN: Rgb = (236, 226, 200)
 
 
-def block(asset: Asset, rgb: Rgb) -> list[Solid]:
+def block(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A box of the asset's size."""
     x, y, height = asset.halves_m
     return [box((-x, x), (-y, y), (0.0, height), rgb)]
 
 
-def column(asset: Asset, rgb: Rgb) -> list[Solid]:
+def column(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An elliptic cylinder: rolls, tins, candles."""
     x, y, height = asset.halves_m
     return [frustum((0.0, 0.0), (0.0, height), (x, y), (x, y), rgb, 12)]
 
 
-def pebble(asset: Asset, rgb: Rgb) -> list[Solid]:
+def pebble(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An ellipsoid: fruit, balls, pillows."""
     x, y, height = asset.halves_m
     return [ball((0.0, 0.0, height / 2), (x, y, height / 2), rgb)]
 
 
-def plant(asset: Asset, rgb: Rgb) -> list[Solid]:
+def plant(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A pot and a crown of three tufts."""
     x, y, height = asset.halves_m
     pot = 0.3 * height
@@ -47,7 +47,7 @@ def plant(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def lamp(asset: Asset, rgb: Rgb) -> list[Solid]:
+def lamp(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Foot, pole and shade."""
     x, y, height = asset.halves_m
     pole = max(0.008, 0.03 * min(x, y))
@@ -59,7 +59,7 @@ def lamp(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def screen(asset: Asset, rgb: Rgb) -> list[Solid]:
+def screen(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A flat screen that looks to +y, on a foot where it is deep."""
     x, y, height = asset.halves_m
     if y < 0.07:
@@ -76,7 +76,7 @@ def screen(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def painting(asset: Asset, rgb: Rgb) -> list[Solid]:
+def painting(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A frame with a picture of three fields, facing +y."""
     x, y, height = asset.halves_m
     h = hash_bytes(asset.asset_id)
@@ -92,7 +92,7 @@ def painting(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def laptop(asset: Asset, rgb: Rgb) -> list[Solid]:
+def laptop(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An open laptop: keyboard in front, lid leaning back."""
     x, y, height = asset.halves_m
     hinge = -y + 0.35 * 2 * y
@@ -102,7 +102,7 @@ def laptop(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [base, keys, profile(lid, (-x, x), shade(rgb, 0.5))]
 
 
-def container(asset: Asset, rgb: Rgb) -> list[Solid]:
+def container(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An open box: bottom and four sides."""
     x, y, height = asset.halves_m
     t = min(0.012, 0.1 * min(x, y))
@@ -117,7 +117,7 @@ def container(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def bin_(asset: Asset, rgb: Rgb) -> list[Solid]:
+def bin_(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A tapered bucket with a dark mouth."""
     x, y, height = asset.halves_m
     mouth = max(0.9 * height, height - 0.02)
@@ -127,7 +127,7 @@ def bin_(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def bowl(asset: Asset, rgb: Rgb) -> list[Solid]:
+def bowl(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A vessel that opens upwards: bowls and plates."""
     x, y, height = asset.halves_m
     low = 0.75 * height
@@ -137,7 +137,7 @@ def bowl(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def cup(asset: Asset, rgb: Rgb) -> list[Solid]:
+def cup(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A cup; with a handle where it is longer in one direction."""
     x, y, height = asset.halves_m
     radius = min(x, y)
@@ -152,7 +152,7 @@ def cup(asset: Asset, rgb: Rgb) -> list[Solid]:
     return solids
 
 
-def bottle(asset: Asset, rgb: Rgb) -> list[Solid]:
+def bottle(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Body, shoulder and neck."""
     x, y, height = asset.halves_m
     neck = max(0.004, 0.32 * min(x, y))
@@ -163,7 +163,7 @@ def bottle(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def vase(asset: Asset, rgb: Rgb) -> list[Solid]:
+def vase(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A belly that narrows to a mouth."""
     x, y, height = asset.halves_m
     return [
@@ -173,7 +173,7 @@ def vase(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def pan(asset: Asset, rgb: Rgb) -> list[Solid]:
+def pan(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A round pan with a handle along the longer side; two grips where it is nearly round."""
     x, y, height = asset.halves_m
     radius = min(x, y)
@@ -192,7 +192,7 @@ def pan(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def dispenser(asset: Asset, rgb: Rgb) -> list[Solid]:
+def dispenser(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A bottle with a pump or trigger on top."""
     x, y, height = asset.halves_m
     return [
@@ -209,7 +209,7 @@ def dispenser(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def appliance(asset: Asset, rgb: Rgb) -> list[Solid]:
+def appliance(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A box with a dark front window and a panel: microwaves, safes, computers."""
     x, y, height = asset.halves_m
     return [
@@ -219,7 +219,7 @@ def appliance(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def toaster(asset: Asset, rgb: Rgb) -> list[Solid]:
+def toaster(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A rounded block with two slots."""
     x, y, height = asset.halves_m
     slots = [
@@ -229,7 +229,7 @@ def toaster(asset: Asset, rgb: Rgb) -> list[Solid]:
     return [box((-x, x), (-y, y), (0.0, 0.96 * height), rgb), *slots]
 
 
-def coffee_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
+def coffee_machine(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A foot and a head that stands out from a column at the back."""
     x, y, height = asset.halves_m
     return [
@@ -239,7 +239,7 @@ def coffee_machine(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def kettle(asset: Asset, rgb: Rgb) -> list[Solid]:
+def kettle(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Body, spout and handle."""
     x, y, height = asset.halves_m
     return [
@@ -250,7 +250,7 @@ def kettle(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def book(asset: Asset, rgb: Rgb) -> list[Solid]:
+def book(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Covers around pages."""
     x, y, height = asset.halves_m
     t = 0.2 * height
@@ -261,7 +261,7 @@ def book(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def statue(asset: Asset, rgb: Rgb) -> list[Solid]:
+def statue(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A figure on a plinth."""
     x, y, height = asset.halves_m
     return [
@@ -271,7 +271,7 @@ def statue(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def teddy(asset: Asset, rgb: Rgb) -> list[Solid]:
+def teddy(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A sitting bear: body, head, ears, legs."""
     x, y, height = asset.halves_m
     dark = shade(rgb, 0.85)
@@ -285,7 +285,7 @@ def teddy(asset: Asset, rgb: Rgb) -> list[Solid]:
     ]
 
 
-def basket_bed(asset: Asset, rgb: Rgb) -> list[Solid]:
+def basket_bed(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A cushion with a raised border on three sides."""
     x, y, height = asset.halves_m
     t = 0.14 * min(x, y)

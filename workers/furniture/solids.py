@@ -18,7 +18,7 @@ Rgb = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class ColouredSolid:
     """One convex part with a colour."""
 
     vertices_m: F32  # (V, 3)
@@ -45,16 +45,18 @@ def _prism_faces(sides: int) -> I32:
     return faces
 
 
-def prism(bottom_m: F64, top_m: F64, rgb: Rgb) -> Solid:
+def prism(bottom_m: F64, top_m: F64, rgb: Rgb) -> ColouredSolid:
     """A solid between two polygons (K, 3) of equal length, both counter-clockwise from outside above."""
-    return Solid(np.concatenate([bottom_m, top_m]).astype(np.float32), _prism_faces(len(bottom_m)), rgb)
+    return ColouredSolid(
+        np.concatenate([bottom_m, top_m]).astype(np.float32), _prism_faces(len(bottom_m)), rgb
+    )
 
 
-def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], rgb: Rgb) -> Solid:
+def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], rgb: Rgb) -> ColouredSolid:
     """A box by its intervals along x, y and z."""
     ring = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     corners = np.array([(a, b, z[0]) for a, b in ring] + [(a, b, z[1]) for a, b in ring], np.float32)
-    return Solid(corners, _prism_faces(4), rgb)
+    return ColouredSolid(corners, _prism_faces(4), rgb)
 
 
 @lru_cache(maxsize=64)
@@ -72,7 +74,7 @@ def frustum(
     top_m: tuple[float, float],
     rgb: Rgb,
     sides: int = 10,
-) -> Solid:
+) -> ColouredSolid:
     """A (tapered, elliptic) column from the radii (x, y) at its bottom to those at its top."""
     circle = _circle(sides)
     low = np.column_stack([circle * bottom_m + centre_m, np.full(sides, z[0])])
@@ -80,7 +82,7 @@ def frustum(
     return prism(low, high, rgb)
 
 
-def profile(yz_m: Sequence[tuple[float, float]], x: tuple[float, float], rgb: Rgb) -> Solid:
+def profile(yz_m: Sequence[tuple[float, float]], x: tuple[float, float], rgb: Rgb) -> ColouredSolid:
     """A convex side view, points (y, z) counter-clockwise with y right and z up, extruded along x."""
     side = np.array(yz_m, np.float64)
     near = np.column_stack([np.full(len(side), x[0]), side])
@@ -107,13 +109,15 @@ def _unit_ball(sides: int) -> tuple[F64, I32]:
     return vertices, np.concatenate([*quads, south, north]).astype(np.int32)
 
 
-def ball(centre_m: tuple[float, float, float], radii_m: tuple[float, float, float], rgb: Rgb) -> Solid:
+def ball(
+    centre_m: tuple[float, float, float], radii_m: tuple[float, float, float], rgb: Rgb
+) -> ColouredSolid:
     """An ellipsoid of 20 corners that touches its box above, below and about the sides."""
     vertices, faces = _unit_ball(6)
-    return Solid((vertices * radii_m + centre_m).astype(np.float32), faces, rgb)
+    return ColouredSolid((vertices * radii_m + centre_m).astype(np.float32), faces, rgb)
 
 
-def join(solids: Sequence[Solid]) -> tuple[Mesh, tuple[F32, ...]]:
+def join(solids: Sequence[ColouredSolid]) -> tuple[Mesh, tuple[F32, ...]]:
     """One mesh of all solids, in order, and their corners as convex parts (V, 3)."""
     counts = [len(s.vertices_m) for s in solids]
     offsets = np.cumsum([0, *counts[:-1]])

@@ -13,8 +13,8 @@ from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.solids import placed
 from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.house import Body, BodyKind, Surface
-from datagen.workers.json_document import Node
+from datagen.workers.houses.house import BodyKind, StaticBody, Surface
+from datagen.workers.json_document import JsonNode
 
 MAX_OBJECTS = 5000
 MAX_CHILDREN = 1000
@@ -29,13 +29,13 @@ _SWAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 def object_bodies(
-    node: Node, assets: Mapping[str, Asset], skipped: Counter[str]
-) -> tuple[list[tuple[Body, F64]], list[Surface]]:
+    node: JsonNode, assets: Mapping[str, Asset], skipped: Counter[str]
+) -> tuple[list[tuple[StaticBody, F64]], list[Surface]]:
     """Bodies, each with the point (2,) that decides its room, and support surfaces.
 
     `room_id` is still empty in both. A child counts to the room of what it stands on.
     """
-    out: list[tuple[Body, F64]] = []
+    out: list[tuple[StaticBody, F64]] = []
     surfaces: list[Surface] = []
     seen: set[str] = set()
     for entry in node.items(MAX_OBJECTS):
@@ -65,12 +65,12 @@ def object_bodies(
     return out, surfaces
 
 
-def _children(entry: Node) -> Iterator[Node]:
+def _children(entry: JsonNode) -> Iterator[JsonNode]:
     children = entry.find("children")
     return iter(()) if children is None else children.items(MAX_CHILDREN)
 
 
-def _body(node: Node, asset: Asset, T: F64, kind: BodyKind, seen: set[str]) -> Body:
+def _body(node: JsonNode, asset: Asset, T: F64, kind: BodyKind, seen: set[str]) -> StaticBody:
     body_id = node.get("id").text()
     if body_id in seen:
         raise node.get("id").error(f"two objects have the id {body_id!r}")
@@ -78,10 +78,10 @@ def _body(node: Node, asset: Asset, T: F64, kind: BodyKind, seen: set[str]) -> B
         raise node.error(f"more than {MAX_BODIES} objects in one house", "Remove the house.")
     seen.add(body_id)
     mesh, parts_m = placed(*asset_geometry(asset), T)
-    return Body(body_id, kind, asset.object_type, asset.asset_id, "", mesh, parts_m)
+    return StaticBody(body_id, kind, asset.object_type, asset.asset_id, "", mesh, parts_m)
 
 
-def _pose(node: Node, asset: Asset) -> tuple[F64, float]:
+def _pose(node: JsonNode, asset: Asset) -> tuple[F64, float]:
     """`T_world_asset` (4, 4), origin at the base, and the angle from upright in degrees."""
     x, y, z = node.get("position").point()
     turn = node.get("rotation")
@@ -113,12 +113,12 @@ def unity_rotation(x_deg: float, y_deg: float, z_deg: float) -> F64:
     return _SWAP @ about_y @ about_x @ about_z @ _SWAP
 
 
-def _centre_xy(node: Node) -> F64:
+def _centre_xy(node: JsonNode) -> F64:
     x, _, z = node.get("position").point()
     return np.array([x, z])
 
 
-def _is_inside(node: Node, below: Asset, T_below: F64) -> bool:
+def _is_inside(node: JsonNode, below: Asset, T_below: F64) -> bool:
     """Whether a thing's centre lies within a part of what carries it, as food in a closed fridge."""
     x, y, z = node.get("position").point()
     local = (np.array([x, z, y]) - T_below[:3, 3]) @ T_below[:3, :3]

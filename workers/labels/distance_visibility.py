@@ -6,14 +6,16 @@ import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates, distances
+from datagen.workers.bases.candidates import SceneCandidates, distances
 from datagen.workers.labels import heuristic as formula
 from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scenes.scene import SettledScene
 
 
-def label(scene: SettledScene, candidates: Candidates, spec: Specification, clock: StageClock) -> Columns:
+def label(
+    scene: SettledScene, candidates: SceneCandidates, spec: Specification, clock: StageClock
+) -> Columns:
     """Distances, pixel counts, rho, H and the label of every candidate."""
     with clock.stage("visibility"):
         eyes_m = np.column_stack([candidates.base_xy_m, candidates.camera_height_m]).astype(np.float64)

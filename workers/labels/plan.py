@@ -9,7 +9,7 @@ import numpy as np
 from datagen.schemas.cost import StageClock
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.labels import distance_visibility
 from datagen.workers.labels.source import Columns, LabelSource
@@ -23,7 +23,7 @@ _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
 def label(
     scene: SettledScene,
-    candidates: Candidates,
+    candidates: SceneCandidates,
     spec: Specification,
     clock: StageClock,
     rows: Sequence[int] | None = None,
@@ -34,7 +34,7 @@ def label(
 
 def label_with_trials(
     scene: SettledScene,
-    candidates: Candidates,
+    candidates: SceneCandidates,
     spec: Specification,
     clock: StageClock,
     rows: Sequence[int] | None = None,

@@ -8,7 +8,7 @@ import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import plan
 from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.scenes.scene import SettledScene
@@ -18,7 +18,7 @@ VERSION = 1
 
 def label(
     scene: SettledScene,
-    candidates: Candidates,
+    candidates: SceneCandidates,
     spec: Specification,
     clock: StageClock,
     rows: Sequence[int] | None = None,

@@ -17,7 +17,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
@@ -84,7 +84,7 @@ class ArmInScene:
         T = self.scene.T_world_object[0]
         return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
 
-    def base_pose(self, candidates: Candidates, row: int) -> F64:
+    def base_pose(self, candidates: SceneCandidates, row: int) -> F64:
         """World pose (4, 4) of the mount at candidate `row`, facing the target."""
         xy = candidates.base_xy_m[row].astype(np.float64)
         return pose_of_base(xy, self.robot.base_height_m, self.scene.target_center_m)
@@ -97,7 +97,7 @@ class ArmInScene:
 
 
 def arm_in_scene(
-    scene: SettledScene, candidates: Candidates, row: int, spec: Specification, clock: StageClock
+    scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification, clock: StageClock
 ) -> ArmInScene:
     """The robot of candidate `row` in a scene. Raises InputError for an unknown robot or a wrong reach."""
     arm = arm_of(spec)
@@ -117,7 +117,7 @@ def arm_of(spec: Specification) -> ArmParams:
 
 
 def try_candidate(
-    at: ArmInScene, candidates: Candidates, row: int, spec: Specification, record: bool = False
+    at: ArmInScene, candidates: SceneCandidates, row: int, spec: Specification, record: bool = False
 ) -> CandidateTrial:
     """Plan, and where the specification asks for trials execute, one candidate.
 
@@ -225,7 +225,7 @@ def _fits(
     at: ArmInScene,
     T_world_base: F64,
     disturbances: list[Disturbance],
-    candidates: Candidates,
+    candidates: SceneCandidates,
     row: int,
     spec: Specification,
 ) -> Bools:

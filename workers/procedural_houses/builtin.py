@@ -13,7 +13,7 @@ from datagen.workers.furniture.colours import hash_bytes
 from datagen.workers.furniture.support_tops import CARRYING_TYPES, top_height_m, top_rectangles
 from datagen.workers.houses.house import House
 from datagen.workers.houses.loader import build_house
-from datagen.workers.json_document import Node
+from datagen.workers.json_document import JsonNode
 from datagen.workers.procedural_houses.floorplan import (
     WALL_HEIGHT_M,
     FloorPlan,
@@ -55,7 +55,7 @@ class BuiltinHouses:
             raise InputError("builtin", "", f"no house {house_id!r}", mend)
         document = house_document(int(number))
         digest = hash_bytes(canonical_json(document)).hex()
-        return build_house(Node(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
+        return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
 
 
 def open_builtin(text: str) -> BuiltinHouses:

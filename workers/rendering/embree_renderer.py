@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64, U8
-from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
 from datagen.workers.rendering.rays import (
     MISS,
     Hits,
     RayMesh,
-    RayStage,
+    RayScene,
     first_hits,
     house_rays,
     into_frame,
@@ -38,9 +38,9 @@ class Pixels:
     body: I16  # (N,)
 
 
-def ray_stage(stage: Stage) -> RayStage:
+def ray_stage(stage: SceneGeometry) -> RayScene:
     """Hierarchies of a stage, built from scratch; runs keep them in `datagen.workers.world` instead."""
-    return RayStage(
+    return RayScene(
         house_rays(stage.house),
         [object_rays(model) for model in stage.objects],
         np.array([model.radius_m for model in stage.objects]),
@@ -48,12 +48,12 @@ def ray_stage(stage: Stage) -> RayStage:
     )
 
 
-def render_embree(stage: Stage, camera: Camera) -> Frame:
+def render_embree(stage: SceneGeometry, camera: Camera) -> Frame:
     """The whole frame of a stage."""
     return render_rays(ray_stage(stage), camera)
 
 
-def render_rays(stage: RayStage, camera: Camera) -> Frame:
+def render_rays(stage: RayScene, camera: Camera) -> Frame:
     """The whole frame of a stage whose hierarchies exist."""
     h, w = camera.height_px, camera.width_px
     pixels = cast_pixels(stage, camera, np.arange(h * w))
@@ -68,7 +68,7 @@ def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
     return np.stack([x, y, np.ones(len(pixels))], axis=1).astype(np.float32)
 
 
-def cast_pixels(stage: RayStage, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:
+def cast_pixels(stage: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:
     """Colour, depth and body of chosen pixels, given as flat indices (N,) into the frame."""
     n = len(pixels)
     rotation = camera.T_world_camera[:3, :3].astype(np.float32)

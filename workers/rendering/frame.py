@@ -33,7 +33,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class SceneGeometry:
     """What stands in front of the camera: a house and the objects placed in it."""
 
     house: House
@@ -57,4 +57,4 @@ class Frame:
 class Renderer(Protocol):
     """Renders one frame of a stage."""
 
-    def __call__(self, stage: Stage, camera: Camera) -> Frame: ...
+    def __call__(self, stage: SceneGeometry, camera: Camera) -> Frame: ...

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse, look_at, quaternion_wxyz
 from datagen.workers.rendering.face_texture import face_normals, face_texture
-from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
 
 # What is nearer or farther is not drawn. A near plane far off keeps depth sharp; one close to the
 # eye shows the wall that an eye stands in.
@@ -27,16 +27,16 @@ _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
 _AMBIENT, _DIFFUSE = 0.7, 0.3
 
 
-def render_pybullet(stage: Stage, camera: Camera) -> Frame:
+def render_pybullet(stage: SceneGeometry, camera: Camera) -> Frame:
     """The whole frame of a stage, built from scratch. Raises InputError where Bullet cannot."""
-    with PybulletStage(stage) as loaded:
+    with PybulletScene(stage) as loaded:
         return loaded.render(camera)
 
 
-class PybulletStage:
+class PybulletScene:
     """A stage loaded once, for many images; a context manager that frees it at the end."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: SceneGeometry) -> None:
         self._stage = stage
         self._closing = ExitStack()
         self._alone: dict[int, _Drawing] = {}
@@ -49,7 +49,7 @@ class PybulletStage:
                 self._full.add(model.visual, stage.T_world_object[k], 1 + k)
             self._closing = undo.pop_all()
 
-    def __enter__(self) -> PybulletStage:
+    def __enter__(self) -> PybulletScene:
         return self
 
     def __exit__(

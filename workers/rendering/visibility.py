@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
+from datagen.workers.rendering.rays import MISS, RayMesh, RayScene, nearest, occluded
 
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.
@@ -18,7 +18,7 @@ _MAX_RAYS = 1 << 16
 I32 = npt.NDArray[np.int32]
 
 
-def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
+def visible_pixels(stage: RayScene, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
     """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
 
     Each eye (N, 3), world, looks at the centre of object `target` through a window of
@@ -38,7 +38,7 @@ def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tu
     return target_px, visible_px
 
 
-def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
+def _count(stage: RayScene, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
     n = len(eyes_m)
     T_world_target = stage.T_world_object[target]
     axes = np.stack([look_at(eye, T_world_target[:3, 3])[:3, :3] for eye in eyes_m])  # (n, 3, 3)
@@ -112,7 +112,7 @@ def _window_rays(
     return eye, (centres[u] * scale).astype(np.float32), (centres[v] * scale).astype(np.float32)
 
 
-def _may_hide(stage: RayStage, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:
+def _may_hide(stage: RayScene, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:
     """Whether object k's bounding sphere cuts the capsule around the sight line; per eye (N,)."""
     centre_m = stage.T_world_object[target, :3, 3]
     along = (centre_m - eyes_m) / distance_m[:, None]

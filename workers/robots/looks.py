@@ -9,13 +9,13 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F32, Mesh, concatenate
 from datagen.workers.houses.glb import read_glb
-from datagen.workers.robots.assembly import Body
+from datagen.workers.robots.assembly import LinkBody
 from datagen.workers.robots.hulls import hull_faces
 
 _GREY = 190
 
 
-def body_mesh(body: Body) -> Mesh:
+def body_mesh(body: LinkBody) -> Mesh:
     """A body's visual meshes, else its hulls, in the link frame. Raises InputError naming a broken file."""
     meshes: list[Mesh] = []
     for shape in body.visuals:

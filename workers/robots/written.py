@@ -17,7 +17,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.whole_files import whole_file
 from datagen.workers.content_cache import alone_in, cache_folder, drop_unused, refresh
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.robots.assembly import Assembly, Body
+from datagen.workers.robots.assembly import Assembly, LinkBody
 from datagen.workers.robots.hulls import hull_faces
 from datagen.workers.robots.robot import Parts
 from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
@@ -118,7 +118,7 @@ def _part_file(corners_m: F32, folder: Path) -> Path:
     return _place(folder / f"{hashlib.sha256(content).hexdigest()[:16]}.stl", content)
 
 
-def _add_link(root: ElementTree.Element, body: Body, folder: Path) -> list[Path]:
+def _add_link(root: ElementTree.Element, body: LinkBody, folder: Path) -> list[Path]:
     """Adds the link and returns the files of its parts."""
     link = ElementTree.SubElement(root, "link", name=body.name)
     if body.inertial is not None:

@@ -10,7 +10,7 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import ObservationParams, SettleParams
-from datagen.workers.bases.candidates import Candidates, draw_candidates
+from datagen.workers.bases.candidates import SceneCandidates, draw_candidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses.house import Surface
 from datagen.workers.objects.model import ObjectModel
@@ -18,9 +18,9 @@ from datagen.workers.redraw import Redraw
 from datagen.workers.rendering import load_renderer
 from datagen.workers.rendering.cloud import Cloud, PixelCaster, caster_of, observe_cloud
 from datagen.workers.rendering.embree_renderer import cast_pixels
-from datagen.workers.rendering.frame import Camera, Frame, Stage
+from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.rays import RayScene
 from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.scenes.viewpoint import draw_viewpoint
@@ -32,7 +32,7 @@ from datagen.workers.world import PreparedHouse, World
 _SURROUNDINGS_M = 0.3
 
 
-def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, Candidates]:
+def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
     """Scene `index` of the specification's endless sequence and its candidates: the first retry that works.
 
     Raises InputError when `scene.max_retries` redraws were not enough.
@@ -55,7 +55,7 @@ def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, Cand
 
 def _try_scene(
     world: World, index: int, retry: int, redraws: dict[str, int], clock: StageClock
-) -> tuple[Scene, Candidates]:
+) -> tuple[Scene, SceneCandidates]:
     spec = world.spec
     with clock.stage("draw"):
         rng = generator(spec.seed, Stream.SCENE, index, retry)
@@ -86,7 +86,7 @@ def _try_scene(
         camera, share = draw_viewpoint(
             rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
         )
-        stage = Stage(house.house, models, settled.T_world_object)
+        stage = SceneGeometry(house.house, models, settled.T_world_object)
         noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
         cloud = _observe(spec.observation, stage, rays, camera, rng, noise_rng)
     scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
@@ -135,7 +135,7 @@ def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
 
 
 def render_frame(
-    params: ObservationParams, stage: Stage, camera: Camera, noise_rng: np.random.Generator
+    params: ObservationParams, stage: SceneGeometry, camera: Camera, noise_rng: np.random.Generator
 ) -> Frame:
     """The whole frame by the specified renderer, with the specified noise."""
     frame = load_renderer(params.renderer)(stage, camera)
@@ -144,8 +144,8 @@ def render_frame(
 
 def _observe(
     params: ObservationParams,
-    stage: Stage,
-    rays: RayStage,
+    stage: SceneGeometry,
+    rays: RayScene,
     camera: Camera,
     rng: np.random.Generator,
     noise_rng: np.random.Generator,

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.frame import Camera, Stage
-from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.frame import Camera, SceneGeometry
+from datagen.workers.rendering.rays import RayScene
 from datagen.workers.world import PreparedHouse, World
 
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
@@ -41,7 +41,7 @@ class RecalledScene:
     house: PreparedHouse
     models: tuple[ObjectModel, ...]
     T_world_object: F64  # (K, 4, 4)
-    rays: RayStage
+    rays: RayScene
     camera: Camera
 
     @property
@@ -50,8 +50,8 @@ class RecalledScene:
         return self.T_world_object[0, :3, 3]
 
     @property
-    def stage(self) -> Stage:
-        return Stage(self.house.house, self.models, self.T_world_object)
+    def stage(self) -> SceneGeometry:
+        return SceneGeometry(self.house.house, self.models, self.T_world_object)
 
 
 def recall_scene(world: World, record: Record) -> RecalledScene:
@@ -88,7 +88,7 @@ def recall_scene(world: World, record: Record) -> RecalledScene:
     return RecalledScene(index, retry, house, models, T_world_object, rays, camera)
 
 
-def recall_candidates(columns: Record, scene: RecalledScene) -> Candidates:
+def recall_candidates(columns: Record, scene: RecalledScene) -> SceneCandidates:
     """The candidates of a scene from their stored columns, by field name.
 
     Raises InputError for numbers that are not finite, or that no robot around the target can have.
@@ -104,7 +104,7 @@ def recall_candidates(columns: Record, scene: RecalledScene) -> Candidates:
     ):
         if not sound.all():
             raise _senseless(scene.index, name)
-    return Candidates(
+    return SceneCandidates(
         base_xy_m=columns["base_xy_m"],
         robot_index=columns["robot_index"],
         camera_height_m=columns["camera_height_m"],

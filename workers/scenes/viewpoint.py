@@ -12,7 +12,7 @@ from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import Room
 from datagen.workers.redraw import Redraw
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.rays import RayScene
 from datagen.workers.rendering.visibility import visible_pixels
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
@@ -20,7 +20,7 @@ _BLOCK = 8
 
 
 def draw_viewpoint(
-    rays: RayStage,
+    rays: RayScene,
     room: Room,
     obstacles: Obstacles,
     target_center_m: F64,

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.training.loop import run
 from datagen.train.training.ranks import Ranks
 from datagen.train.training.stages import Job, keep, prepare
@@ -79,8 +79,8 @@ def joined(parts: list[Batch[Array]]) -> Batch[Array]:
 
     return Batch(
         clouds=table(Clouds, "clouds"),
-        robots=table(Robots, "robots"),
-        candidates=table(Candidates, "candidates"),
+        robots=table(RobotInputs, "robots"),
+        candidates=table(CandidateInputs, "candidates"),
         label=np.concatenate([p.label for p in parts]),
         sample_id=np.concatenate([p.sample_id for p in parts]),
     )

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from datagen.workers.furniture.asset_geometry import SHAPES, asset_geometry
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
-from datagen.workers.houses.house import Body
+from datagen.workers.houses.house import StaticBody
 from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
 from tests.workers.houses.house_checks import check_body, hull_volume, is_convex, signed_volume
 
 SIDE = st.floats(0.02, 2.5)
 
 
-def body_of(asset: Asset) -> Body:
+def body_of(asset: Asset) -> StaticBody:
     mesh, parts = asset_geometry(asset)
-    return Body("b", "furniture", asset.object_type, asset.asset_id, "", mesh, parts)
+    return StaticBody("b", "furniture", asset.object_type, asset.asset_id, "", mesh, parts)
 
 
 def check_shape(asset: Asset, slack: float = 0.02) -> None:

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.houses import furniture_bodies, line_index, open_houses
 from datagen.workers.houses.loader import build_house
-from datagen.workers.json_document import Node
+from datagen.workers.json_document import JsonNode
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
 
 NAN, INFINITY = float("nan"), float("inf")
@@ -257,7 +257,7 @@ def test_any_value_anywhere_gives_a_house_or_an_input_error(data: st.DataObject)
         except (KeyError, IndexError, TypeError):
             continue  # an earlier change removed what lies on the path
     try:
-        house = build_house(Node("file", "$", document), "h", "0" * 64, ASSETS)
+        house = build_house(JsonNode("file", "$", document), "h", "0" * 64, ASSETS)
     except InputError as error:
         assert str(error).startswith("file: $")
     else:

@@ -21,7 +21,7 @@ from datagen.schemas.specification import (
     TrialParams,
     VisibilityParams,
 )
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.labels import load_label_source, plan
@@ -56,14 +56,16 @@ def scene() -> SettledScene:
     return scene_of(table_house(), objects, poses)
 
 
-def candidates(at: SettledScene) -> Candidates:
+def candidates(at: SettledScene) -> SceneCandidates:
     n = len(OFFSETS_M)
     xy = (at.target_center_m[:2] + np.array(OFFSETS_M)).astype(np.float32)
     ones = np.ones(n, np.float32)
     camera_m, height_m = ones * np.float32(1.2), ones * np.float32(HEIGHT_M)
     params = CandidateParams(base_radius_m=0.2)
     clearance = base_clearance_m(xy, height_m, camera_m, at.house.obstacles, params)
-    return Candidates(xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance)
+    return SceneCandidates(
+        xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
+    )
 
 
 @pytest.fixture(scope="module")

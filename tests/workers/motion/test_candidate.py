@@ -11,7 +11,7 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.houses.house import Body, House
+from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.motion.candidate import STAGES, plan_candidate
 from datagen.workers.motion.plan import MotionPlan, PlanReport
 from datagen.workers.motion.scene import prepare
@@ -154,7 +154,7 @@ def test_a_solid_block_around_the_target_is_seen_although_no_surface_is_cut() ->
     assert plan_at(table_scene([block]), front_base(table_scene())).outcome == "no_grasp"
 
 
-def wall_in_front(height_m: float) -> Body:
+def wall_in_front(height_m: float) -> StaticBody:
     """A thin wall across the room, between the base in front of the table and the table."""
     return box_body(
         "wall|between", "wall", "Wall", (ROOM_M[0], 0.02, height_m), (ROOM_M[0] / 2, 1.07, height_m / 2)
@@ -280,7 +280,7 @@ def moved(scene: SettledScene, T: F64) -> SettledScene:
         return (part @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
     bodies = tuple(
-        Body(
+        StaticBody(
             b.body_id, b.kind, b.object_type, b.asset_id, b.room_id, b.visual.transformed(T),
             tuple(move(p) for p in b.convex_parts_m),
         )

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.workers.rendering.embree_renderer import ray_stage
-from datagen.workers.rendering.frame import Stage
+from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
 from tests.workers.worlds import (
@@ -24,12 +24,12 @@ from tests.workers.worlds import (
 CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
 
 
-def rho(stage: Stage, eye_m: tuple[float, float, float], window: int = 64) -> float:
+def rho(stage: SceneGeometry, eye_m: tuple[float, float, float], window: int = 64) -> float:
     alone, seen = visible_pixels(ray_stage(stage), 0, np.array([eye_m]), window)
     return seen[0] / alone[0]
 
 
-def triangles_of(stage: Stage) -> list[np.ndarray]:
+def triangles_of(stage: SceneGeometry) -> list[np.ndarray]:
     """World triangles (F, 3, 3) of each object and, last, of the house."""
     placed = [m.visual.transformed(T) for m, T in zip(stage.objects, stage.T_world_object, strict=True)]
     bodies = [b.visual for b in stage.house.bodies]
