@@ -11,13 +11,13 @@ import tempfile
 import time
 from pathlib import Path
 
+from datagen.cluster.attempt_guard import Meter, utc_now
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, utc_now
-from datagen.cluster.policy import Policy
+from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import Product
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.cluster.bad_cluster import Silent, simulate

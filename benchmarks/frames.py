@@ -21,14 +21,14 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import NoiseParams, Source, Specification
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.ground import find_ground, floor_points
-from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import locate
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import draw_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 

@@ -29,6 +29,8 @@ from typing import Any
 import numpy as np
 import zarr
 
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
 from datagen.jobs.job import JobPlan, Work, make_missing, open_board
 from datagen.jobs.options import Placing
 from datagen.schemas.errors import InputError
@@ -36,8 +38,6 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.specify import layout_of, specify
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 

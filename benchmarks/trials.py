@@ -21,11 +21,11 @@ import numpy as np
 from benchmarks.physical_sense import Case, plan_options, planned_cases
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
-from datagen.workers.labels.trials import arm_of, draw_disturbances
+from datagen.workers.labels.arm_labelling import arm_of, draw_disturbances
 from datagen.workers.trials import physics
 from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
-from datagen.workers.trials.prepared import Things, pedestal_below, still_parts_near
 from datagen.workers.trials.trial import Disturbance, TrialResult
+from datagen.workers.trials.trial_scene import Things, pedestal_below, still_parts_near
 
 
 @dataclass(frozen=True)

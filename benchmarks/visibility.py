@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.options import scene_options
+from datagen.configuration.specify import specify
 from datagen.schemas.cost import StageClock
-from datagen.specifying.specify import specify
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
@@ -27,7 +27,7 @@ from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.rendering.pybullet_renderer import PybulletScene
 from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
 from datagen.workers.rendering.visibility import visible_pixels
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import draw_scene
 from datagen.workers.world import assemble_world
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02

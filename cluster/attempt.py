@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
-from datagen.cluster.guard import Meter, this_host, utc_now
+from datagen.cluster.attempt_guard import Meter, this_host, utc_now
 from datagen.cluster.task import JobCannotGoOn, Product, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key

@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from datagen.cluster.executor import Executor
+from datagen.cluster.job_totals import End, JobSummary, Tally
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.policy import (
+from datagen.cluster.retry_policy import (
     Durations,
     Policy,
     Trouble,
@@ -34,8 +35,7 @@ from datagen.cluster.policy import (
     too_many_quarantined,
     window,
 )
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import End, JobSummary, Tally
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges

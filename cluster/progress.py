@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.cluster.tally import Tally
+from datagen.cluster.job_totals import Tally
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Pace, Progress, clock_text, whole
 

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.guard import (
+from datagen.cluster.attempt_guard import (
     Meter,
     Remains,
     clear_notes,

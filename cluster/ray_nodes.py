@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.guard import Remains, collect_remains, read_note
+from datagen.cluster.attempt_guard import Remains, collect_remains, read_note
 
 _MUTE_S = 30.0  # a machine that did not answer is left alone for so long
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0

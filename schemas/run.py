@@ -252,7 +252,7 @@ class Run:
             raise
 
     def remove_attempt(self, shard: int, attempt: str) -> Removal:
-        """Remove an attempt's files, unless its shard's commit may name it (schemas/garbage.py says how)."""
+        """Remove an attempt's files, unless its shard's commit may name it (as `garbage_collection` says)."""
         folder = shard_folder(shard, attempt)
         mark = f"{folder}/{REMOVING}"
         self.storage.put(mark, b"")
@@ -277,8 +277,8 @@ class Run:
     def commit(self, commit: Commit) -> bool:
         """Publish a shard. False when another attempt has won; its files then are garbage.
 
-        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit
-        of an attempt whose files are removed as garbage meanwhile is taken back (schemas/garbage.py).
+        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit of
+        an attempt whose files are removed as garbage meanwhile is withdrawn (as `garbage_collection` says).
         """
         if (problem := self._lack(commit, committing=True)) is not None:
             raise problem

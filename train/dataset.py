@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from datagen.schemas.at_once import in_order
+from datagen.schemas.concurrent_map import in_order
 from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation
 from datagen.train.batching import (
@@ -25,8 +25,8 @@ from datagen.train.batching import (
 )
 from datagen.train.epoch_plan import EpochPlan, batches_of, plan_epoch
 from datagen.train.inputs import Array, Batch
-from datagen.train.opening import open_parts
 from datagen.train.reader import JOIN_FIELDS, load_shard
+from datagen.train.run_parts import open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.opening import Part
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
+from datagen.train.run_parts import Part
 
 I64 = npt.NDArray[np.int64]
 

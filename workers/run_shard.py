@@ -27,8 +27,8 @@ from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.labels.source import LabelSource
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.scenes.draw import draw_scene
-from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.generate import draw_scene
+from datagen.workers.scenes.reconstruct import recall_candidates, recall_scene
 from datagen.workers.scenes.scene import Scene, SettledScene
 from datagen.workers.world import World
 

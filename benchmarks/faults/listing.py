@@ -26,8 +26,8 @@ from tests.made_runs import commit_of, make_run, rows_of
 
 _ANSWERS = {
     "open + missing": ("from datagen.schemas.run import Run", "len(Run.open(place).missing())"),
-    "status": ("from datagen.reports.standing import status_report", "status_report(Run.open(place))"),
-    "audit": ("from datagen.reports.accounts import account_for", "account_for([Run.open(place)])"),
+    "status": ("from datagen.reports.run_status import status_report", "status_report(Run.open(place))"),
+    "audit": ("from datagen.reports.spending import account_for", "account_for([Run.open(place)])"),
 }
 _TIMED = """
 import json, sys, time

@@ -10,14 +10,14 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.reports.accounts import Account, Books, account_for
 from datagen.reports.agreement import common_candidates, compare, outcome_report
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
-from datagen.reports.labelled import join_labelled, read_labelled
-from datagen.reports.specified import is_disturbed
+from datagen.reports.label_arrays import join_labelled, read_labelled
+from datagen.reports.specification_summary import is_disturbed
+from datagen.reports.spending import Account, Books, account_for
 from datagen.schemas.cost import STAGES
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 

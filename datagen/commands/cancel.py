@@ -15,10 +15,10 @@ from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
-from datagen.jobs.report import health_line, job_report
+from datagen.jobs.job_report import health_line, job_report
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import Job, Jobs
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import open_storage
 
 _LOOK_S = 1.0

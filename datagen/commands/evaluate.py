@@ -63,11 +63,11 @@ def evaluate(
     # Imported here: other verbs wait neither for these nor for torch.
     import numpy as np
 
-    from datagen.evaluating.contestants import open_models
-    from datagen.evaluating.lineup import line_up, read_heuristic
-    from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
-    from datagen.evaluating.report import evaluation_report
-    from datagen.evaluating.tables import print_evaluation
+    from datagen.evaluation_report.baseline_methods import line_up, read_heuristic
+    from datagen.evaluation_report.evaluated_runs import open_places, refuse_seen_houses, sets_of, tell_apart
+    from datagen.evaluation_report.methods import open_models
+    from datagen.evaluation_report.report import evaluation_report
+    from datagen.evaluation_report.terminal import print_evaluation
     from datagen.train.evaluation.columns import gather
 
     _refuse_odd(bootstrap, seed, threads, html)
@@ -113,7 +113,7 @@ def evaluate(
         seed=seed,
     )
     if html is not None:
-        from datagen.evaluating.page import page_of
+        from datagen.evaluation_report.page import page_of
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(report, gathered).encode())

@@ -8,17 +8,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.jobs.continue_runs import go_on, open_work, source_words
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
-from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
-from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 
 
 def extend(

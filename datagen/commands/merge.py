@@ -11,9 +11,9 @@ from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
-from datagen.reports.accounts import account_for
+from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
-from datagen.schemas.merged import open_runs, wanted
+from datagen.schemas.merged_runs import open_runs, wanted
 from datagen.schemas.merging import Merge, Result, carry_out, plan_merge
 from datagen.schemas.merging.writing import Written
 from datagen.schemas.progress import steps

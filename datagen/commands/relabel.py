@@ -15,7 +15,7 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import Storage, open_storage
 
 

@@ -16,15 +16,15 @@ from datagen.commands.verify import finding_row, print_findings
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.schemas.checking.mending import Mended, RemakeShard, mend_place
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.checking.repair import Mended, RemakeShard, mend_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.remaking.shards import Origin
+    from datagen.regeneration.shards import Origin
 
 
 def repair(
@@ -81,14 +81,14 @@ def _leave_signals() -> None:
 def _remake(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed here."""
     # Simulators are imported only where a shard is bad.
-    from datagen.remaking.shards import remade_files, remake
+    from datagen.regeneration.shards import remade_files, remake
 
     return remade_files(run, remake(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
 def _origin(place: str, given: Sources) -> Origin:
-    from datagen.remaking.shards import open_origin
+    from datagen.regeneration.shards import open_origin
 
     return open_origin(Run.open(place), given)
 
@@ -114,7 +114,7 @@ def _apart(mended: Mended) -> list[str]:
     """In what this machine is not the one that made the run, where remade bytes were not the committed."""
     if not any("other bytes" in finding.mend for finding in mended.left):
         return []
-    from datagen.remaking.scenes import what_differs_here
+    from datagen.regeneration.scenes import what_differs_here
 
     texts = [text for run in mended.checked.runs for text in what_differs_here(run)]
     return list(dict.fromkeys(texts))

@@ -9,24 +9,24 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
+from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AsJson, RunPlace, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
-from datagen.remaking.alone import replay_shard
-from datagen.remaking.scenes import chosen_rows, open_replayer, what_differs_here
-from datagen.remaking.shards import Origin, open_origin
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
+from datagen.regeneration.shards import Origin, open_origin
+from datagen.regeneration.single_shard import replay_shard
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.regeneration.stage_comparison import RECOMPUTED, StageComparison, compare_stages
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import Step, steps
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.specifying.arms import refuse_missing_packages
-from datagen.workers.scenes.recall import recall_scene
+from datagen.workers.scenes.reconstruct import recall_scene
 
 _PREFIX_AT_LEAST = 6
 _SHOWN = 5

@@ -10,11 +10,11 @@ from cyclopts import Parameter
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
+from datagen.jobs.continue_runs import go_on, open_work, source_words
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
 from datagen.jobs.options import HERE, Placing, absolute_place, opening
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.schemas.merged import open_runs
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.storage import open_storage
 

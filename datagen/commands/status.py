@@ -9,8 +9,8 @@ from cyclopts import Parameter
 from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.jobs.report import health_line, jobs_report
-from datagen.reports.standing import place_report
+from datagen.jobs.job_report import health_line, jobs_report
+from datagen.reports.run_status import place_report
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 

@@ -7,10 +7,19 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from datagen.configuration.arms import refuse_missing_packages
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
+from datagen.configuration.stored_scenes import (
+    layout_again,
+    open_stored_scenes,
+    refuse_too_few,
+    specify_again,
+)
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.jobs.continue_runs import go_on, refuse_unusable_engines
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, refuse_unusable_engines
 from datagen.jobs.job import Work
 from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
 from datagen.schemas.cost import StageClock
@@ -19,14 +28,10 @@ from datagen.schemas.keys import MERGED
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.storage import open_storage
-from datagen.specifying.arms import refuse_missing_packages
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.specify import layout_of, specify
-from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import draw_scene
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that stored scenes have decided.

@@ -14,9 +14,9 @@ from cyclopts import Parameter
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.place import Checked, check_place
 from datagen.schemas.errors import InputError, printable
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
@@ -87,8 +87,8 @@ class Found:
 def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
-    from datagen.remaking.deep import deep_findings
-    from datagen.remaking.shards import open_origin
+    from datagen.regeneration.deep_check import deep_findings
+    from datagen.regeneration.shards import open_origin
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))

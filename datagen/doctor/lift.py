@@ -14,7 +14,7 @@ import numpy as np
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import translation
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
 from datagen.workers.trials.articulation import articulation_of

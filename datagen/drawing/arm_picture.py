@@ -20,7 +20,7 @@ from datagen.drawing.scene_picture import best_clear, draw_frame, object_outline
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import RecalledScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")

@@ -14,7 +14,7 @@ from datagen.workers.geometry.mesh import F64, U8
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera
 from datagen.workers.rendering.rays import RayMesh, RayScene
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import RecalledScene
 from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]

@@ -15,8 +15,8 @@ from datagen.drawing.scene_picture import draw_frame, object_outlines
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
-from datagen.workers.scenes.draw import render_frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.generate import render_frame
+from datagen.workers.scenes.reconstruct import RecalledScene
 
 Side = tuple[RecalledScene, SceneRows]
 

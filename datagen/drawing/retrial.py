@@ -12,10 +12,10 @@ from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.labels.arm_labelling import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
+from datagen.workers.motion.arm_collision import surroundings
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.rrt_connect import dense
-from datagen.workers.motion.surroundings import surroundings
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.trial import Recording, TrialResult

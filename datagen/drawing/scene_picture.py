@@ -23,7 +23,7 @@ from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.rendering.frame import Frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import RecalledScene
 
 Columns = Mapping[str, Any]
 

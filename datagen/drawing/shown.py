@@ -12,8 +12,8 @@ from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots import open_robot
-from datagen.workers.scenes.draw import render_frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.generate import render_frame
+from datagen.workers.scenes.reconstruct import RecalledScene
 
 Lines = list[tuple[str, str]]
 

@@ -21,8 +21,8 @@ from datagen.drawing.retrial import Retrial, try_again
 from datagen.drawing.shown import Lines, Shown
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.workers.labels.trials import arm_of
-from datagen.workers.scenes.recall import recall_candidates
+from datagen.workers.labels.arm_labelling import arm_of
+from datagen.workers.scenes.reconstruct import recall_candidates
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:

@@ -10,8 +10,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from datagen.cluster.cluster_folders import write_private
 from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
-from datagen.cluster.private_folder import write_private
 from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line

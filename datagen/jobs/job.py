@@ -12,23 +12,23 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.executor import Executor
-from datagen.cluster.fitness import refuse_unfit_machines
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.inprocess import InProcessExecutor
-from datagen.cluster.policy import Policy, too_many_quarantined
+from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.job_monitor import Watch
+from datagen.cluster.job_totals import JobSummary, Tally, no_work
+from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import RayExecutor, ray_executor
-from datagen.cluster.stop import StopRequest, stop_on_signals
-from datagen.cluster.tally import JobSummary, Tally, no_work
+from datagen.cluster.retry_policy import Policy, too_many_quarantined
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import ShardTask
-from datagen.cluster.watch import Watch
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
-from datagen.jobs.board import JobBoard
+from datagen.jobs.job_recorder import JobBoard
 from datagen.jobs.options import Placing
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id

@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter
-from datagen.cluster.inprocess import InProcessExecutor
-from datagen.cluster.policy import Policy
+from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.job_totals import JobSummary, no_work
 from datagen.cluster.progress import JobProgress
-from datagen.cluster.stop import StopRequest, stop_on_signals
-from datagen.cluster.tally import JobSummary, no_work
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import Product
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
@@ -28,8 +30,6 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from datagen.workers.labels import load_label_source
 
 

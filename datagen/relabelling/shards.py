@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from datagen.cluster.attempt import ends_job
-from datagen.cluster.guard import Meter, this_host, utc_now
+from datagen.cluster.attempt_guard import Meter, this_host, utc_now
 from datagen.cluster.task import Product
 from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import sample_ids
@@ -18,7 +18,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
 from datagen.schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
 from datagen.schemas.shard_reading import read_committed
-from datagen.workers.labels import heuristic as formula
+from datagen.workers.labels import distance_visibility_score as formula
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

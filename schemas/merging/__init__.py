@@ -8,7 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged import open_runs, wanted
+from datagen.schemas.merged_runs import open_runs, wanted
 from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
 from datagen.schemas.merging.resharding import common_layout
 from datagen.schemas.merging.writing import Written, begin_union, replace_record, write_union

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from datagen.schemas.at_once import in_order
+from datagen.schemas.concurrent_map import in_order
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.storage.errors import FileTooLarge, storage_error
 from datagen.schemas.storage.local_files import LocalFiles

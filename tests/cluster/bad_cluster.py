@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy, Trouble
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.job_totals import JobSummary, Tally
+from datagen.cluster.retry_policy import Policy, Trouble
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, Host
 from datagen.schemas.shard_ranges import ShardRanges

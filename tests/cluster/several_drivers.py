@@ -6,9 +6,9 @@ import threading
 from typing import TypeVar
 
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
+from datagen.cluster.job_totals import JobSummary
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from datagen.cluster.driver import Order
-from datagen.cluster.policy import Trouble
-from datagen.cluster.tally import Tally
+from datagen.cluster.job_totals import Tally
+from datagen.cluster.retry_policy import Trouble
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
 from datagen.schemas.shard_ranges import ShardRanges

@@ -13,7 +13,7 @@ import pytest
 
 from datagen.cluster import attempt
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.guard import Meter, guarded
+from datagen.cluster.attempt_guard import Meter, guarded
 from datagen.cluster.task import JobCannotGoOn, ShardTask
 from datagen.schemas.keys import commit_copy_key, commit_key, shard_folder
 from datagen.schemas.run import Run

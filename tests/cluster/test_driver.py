@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.cluster.driver import Order, drive
+from datagen.cluster.job_totals import JobSummary, Tally
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry

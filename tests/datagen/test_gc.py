@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.reports.accounts import account_for
+from datagen.reports.spending import account_for
 from datagen.schemas.errors import InputError
-from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
 from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal

@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from datagen import cli
-from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.checking.repair import mend_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.record_files import encode_record, signed_json

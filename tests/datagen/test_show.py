@@ -14,7 +14,7 @@ from datagen.drawing.outcome_colours import LOOKS
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.reconstruct import recall_candidates, recall_scene
 from datagen.workers.world import open_world
 from tests.refusals import refused
 from tests.sim_extra import needs_sim

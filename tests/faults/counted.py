@@ -16,14 +16,14 @@ from math import fsum, isclose
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import Meter, this_host
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, this_host
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import Product
-from datagen.reports.accounts import account_for
+from datagen.reports.spending import account_for
 from datagen.schemas.cost import StageClock
 from datagen.schemas.keys import commit_key
 from datagen.schemas.run import Run

@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
-from datagen.cluster.books import close_lost_attempts, refresh_index
+from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
 from datagen.commands.gc import remove
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from datagen.schemas.checking.mending import mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_place
+from datagen.schemas.checking.repair import mend_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
-from datagen.schemas.garbage import find_garbage
+from datagen.schemas.garbage_collection import find_garbage
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import carry_out, plan_merge
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.root_records import publish

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.mending import Mended, mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.repair import Mended, mend_place
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry

@@ -10,14 +10,14 @@ import sys
 import time
 from dataclasses import dataclass
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import Meter, notes_of_a_job
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, notes_of_a_job
-from datagen.cluster.policy import Policy
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.stop import StopRequest, stop_on_signals
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import Product
 from datagen.schemas.progress import Progress
 from datagen.schemas.run import Run

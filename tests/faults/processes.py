@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.guard import Meter, guarded, obituary, read_note
+from datagen.cluster.attempt_guard import Meter, guarded, obituary, read_note
 from datagen.cluster.task import AttemptReport, Product, Task
 
 T = TypeVar("T", bound=Task)

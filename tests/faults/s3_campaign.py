@@ -11,12 +11,12 @@ import zarr
 from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter
-from datagen.cluster.inprocess import InProcessExecutor
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import Product
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_copy_key, shard_folder

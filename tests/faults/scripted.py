@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.cluster.guard import Meter
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.task import JobCannotGoOn, Product
 from datagen.schemas.fields import sized_schema
 from datagen.schemas.run_records import Layout

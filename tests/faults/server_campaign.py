@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import psutil
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.job_totals import JobSummary, Tally
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
-from datagen.reports.accounts import account_for
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
+from datagen.reports.spending import account_for
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from tests.cluster.simulated import Heard

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.storage import open_storage

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
+from datagen.cluster.job_totals import JobSummary, Tally
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.stop_request import StopRequest
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.scripted import ScriptedTask, perform
 

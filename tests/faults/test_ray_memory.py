@@ -8,12 +8,12 @@ from pathlib import Path
 import psutil
 import pytest
 
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.stop_request import StopRequest
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 

@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
+from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.fitness import refuse_unfit_machines
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.job_totals import Tally
+from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import Tally
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run

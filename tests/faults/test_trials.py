@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.cluster.books import RunBooks, close_lost_attempts
 from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.retry_policy import Policy
+from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.trials import FaultyTrials, attempt_with_faults

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import datagen.workers.labels.trials as label_trials
+import datagen.workers.labels.arm_labelling as label_trials
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.guard import Meter
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.task import Product, ShardTask
 from tests.faults.scripted import misbehave
 

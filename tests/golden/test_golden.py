@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.remaking.deep import deep_findings
-from datagen.remaking.scenes import what_differs_here
-from datagen.remaking.shards import open_origin
+from datagen.regeneration.deep_check import deep_findings
+from datagen.regeneration.scenes import what_differs_here
+from datagen.regeneration.shards import open_origin
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION
 from datagen.schemas.scene_rows import read_scene

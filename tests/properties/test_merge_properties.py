@@ -17,12 +17,12 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from datagen.reports.accounts import Books, account_for
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.reports.spending import Books, account_for
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import shard_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import carry_out, plan_merge
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry, QuarantineRecord

@@ -20,15 +20,15 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from datagen.cluster.books import close_lost_attempts
+from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from datagen.schemas.checking.mending import mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_place
+from datagen.schemas.checking.repair import mend_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.keys import commit_key, shard_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import carry_out, plan_merge
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.record_files import now

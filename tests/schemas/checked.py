@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.place import Checked, check_place
 from datagen.schemas.record_files import signed_json
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry

@@ -12,7 +12,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
-from datagen.schemas.merged import find_scene, open_runs, wanted
+from datagen.schemas.merged_runs import find_scene, open_runs, wanted
 from datagen.schemas.merging import Result, carry_out, plan_merge
 from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from datagen.schemas.record_files import read_record

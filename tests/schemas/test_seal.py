@@ -16,7 +16,7 @@ import xarray
 import zarr
 
 from datagen.schemas import shard_files
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_place
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import SEALED, seal

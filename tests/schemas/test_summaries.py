@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import datagen.schemas.summaries
-from datagen.reports.accounts import Books, account_for
+from datagen.reports.spending import Books, account_for
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.record_files import encode_record, signed_json

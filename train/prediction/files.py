@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.json_document import JsonNode, parse_json

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
-from datagen.train.prediction.candidates import (
+from datagen.train.prediction.base_cells import (
     BLOCKED,
     CLEAR,
     STATES,
@@ -26,7 +26,7 @@ from datagen.train.prediction.candidates import (
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
-from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.geometry.mesh import F64

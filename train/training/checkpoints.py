@@ -23,11 +23,11 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.schemas.whole_files import whole_file
 from datagen.train.dataset import Origin
 from datagen.train.models import Model, build_model
-from datagen.train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
+from datagen.train.training.torch_file_check import MAX_BYTES, refuse_foreign, refuse_odd_values
 from datagen.train.training.validation import Measured
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.schemas.progress import Pace, Progress, clock_text, whole
-from datagen.train.training.watching import Step
+from datagen.train.training.callbacks import Step
 
 
 class TrainingProgress:

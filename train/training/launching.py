@@ -17,7 +17,7 @@ import torch
 import torch.distributed as dist
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.private_folders import locked_folder
+from datagen.schemas.locked_folders import locked_folder
 from datagen.train.training.ranks import Ranks
 
 Stopping = Callable[[], bool]

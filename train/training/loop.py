@@ -21,12 +21,12 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
 from datagen.train.tensors import to_torch
+from datagen.train.training.callbacks import Step, Watcher
 from datagen.train.training.checkpoints import EpochRecord
-from datagen.train.training.optimising import rate_at, set_rate
+from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
 from datagen.train.training.validation import validate
-from datagen.train.training.watching import Step, Watcher
 
 _STEP_STREAM = 0x57E9  # keeps the draws of steps apart from those of batches
 _IDS_NAMED = 4

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import Redraw
 
 Bools = npt.NDArray[np.bool_]
 

@@ -22,8 +22,8 @@ from typing import Any, cast
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular, read_regular
 from datagen.schemas.identity import digest_of
+from datagen.schemas.untrusted_files import open_regular, read_regular
 from datagen.workers.furniture.support_tops import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon

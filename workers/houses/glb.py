@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F64, U8, Mesh
 from datagen.workers.json_document import parse_json
 

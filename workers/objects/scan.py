@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular
 from datagen.schemas.identity import digest_of
+from datagen.schemas.untrusted_files import open_regular
 from datagen.workers.content_cache import Arrays, Shelf
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
 from datagen.workers.objects.convex import ConvexParts, read_convex_parts

@@ -13,7 +13,7 @@ from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import Redraw
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40

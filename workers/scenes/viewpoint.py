@@ -10,10 +10,10 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import Room
-from datagen.workers.redraw import Redraw
 from datagen.workers.rendering.frame import Camera
 from datagen.workers.rendering.rays import RayScene
 from datagen.workers.rendering.visibility import visible_pixels
+from datagen.workers.scene_rejected import Redraw
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
 _BLOCK = 8

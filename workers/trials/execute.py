@@ -9,17 +9,17 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.trials.drive_targets import PHASES, Tick, planned_rise_m, pressing_target_m, script_of
 from datagen.workers.trials.physics import TrialWorld
-from datagen.workers.trials.prepared import (
+from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
+from datagen.workers.trials.trial_scene import (
     TrialScene,
     disturbed_things,
     pedestal_below,
     prepare_trials,
     still_parts_near,
 )
-from datagen.workers.trials.script import PHASES, Tick, planned_rise_m, pressing_target_m, script_of
-from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
 
 __all__ = ["TrialScene", "prepare_trials", "run_trial"]
 

@@ -22,10 +22,11 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
 from datagen.workers.settling.sapien_bodies import sapien_pose
+from datagen.workers.trials.drive_targets import Tick, planned_rise_m, pressing_target_m, script_of
 from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
 from datagen.workers.trials.maniskill_agent import agent_of
 from datagen.workers.trials.physics import (
@@ -43,9 +44,8 @@ from datagen.workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from datagen.workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
-from datagen.workers.trials.script import Tick, planned_rise_m, pressing_target_m, script_of
 from datagen.workers.trials.trial import Disturbance
+from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, pedestal_below, still_parts_near
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000

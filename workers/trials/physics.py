@@ -19,8 +19,8 @@ from datagen.workers.settling.sapien_bodies import (
     static_body,
 )
 from datagen.workers.trials.articulation import Articulation
-from datagen.workers.trials.prepared import Things
-from datagen.workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.trial_scene import Things
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.

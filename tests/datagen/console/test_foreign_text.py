@@ -10,7 +10,7 @@ import pytest
 
 from datagen import cli
 from datagen.console.printing import print_lines, print_rows
-from datagen.evaluating.page import escape
+from datagen.evaluation_report.page import escape
 from datagen.schemas.jobs import JobRecord, Jobs, JobState, StopOrder
 from datagen.schemas.lineage import LINEAGE, Origin, encode_lineage
 from datagen.schemas.record_files import encode_record

@@ -10,7 +10,7 @@ from datagen.workers.houses.house import House
 from datagen.workers.rendering.embree_renderer import ray_stage
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import RecalledScene
 from datagen.workers.trials.trial import Recording
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_model, camera_at, stage_with

@@ -22,7 +22,7 @@ from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import draw_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 

@@ -13,10 +13,10 @@ import torch
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.training.callbacks import Watchers
 from datagen.train.training.loop import run
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import Job, keep, prepare
-from datagen.train.training.watching import Watchers
+from datagen.train.training.training_setup import Job, keep, prepare
 
 
 def train_and_tell(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:

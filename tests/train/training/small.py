@@ -8,11 +8,11 @@ from typing import Any
 
 from torch import Tensor
 
+from datagen.train.training.callbacks import Step, Watchers
 from datagen.train.training.loop import run
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import Job, keep, prepare
-from datagen.train.training.watching import Step, Watchers
+from datagen.train.training.training_setup import Job, keep, prepare
 
 TINY: dict[str, Any] = {
     "n_points": 64,

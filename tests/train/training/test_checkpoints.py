@@ -29,7 +29,7 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.inert import MAX_BYTES
+from datagen.train.training.torch_file_check import MAX_BYTES
 from tests.train.training.small import TINY, equal
 
 ORIGIN: Origin = {

@@ -13,8 +13,8 @@ from rich.console import Console
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import Progress
+from datagen.train.training.callbacks import Step, TensorBoard
 from datagen.train.training.display import TrainingProgress
-from datagen.train.training.watching import Step, TensorBoard
 from tests.cluster.simulated import FakeClock
 
 RECORD: dict[str, Any] = {

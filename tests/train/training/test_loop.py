@@ -16,7 +16,7 @@ from datagen.train.inputs import Array, Batch
 from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.train.training.loop import Batches, run
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import keep, prepare
+from datagen.train.training.training_setup import keep, prepare
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
 
 

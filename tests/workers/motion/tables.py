@@ -13,14 +13,14 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.houses.house import House, StaticBody
-from datagen.workers.motion.plan import MotionPlan
-from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering.embree_renderer import ray_stage
 from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import RecalledScene
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house

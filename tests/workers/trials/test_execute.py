@@ -12,7 +12,7 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation, yaw_pose
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots import open_robot
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.execute import prepare_trials, run_trial
