@@ -35,7 +35,7 @@ from datagen.workers.labels.arm_labelling import (
 from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.generate import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.trials.execute import prepare_trials, run_trial
 from datagen.workers.trials.trial import Disturbance
 from datagen.workers.world import assemble_world
@@ -88,7 +88,7 @@ def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case
     world = assemble_world(spec, houses, objects, options.houses, options.objects)
     cases: list[Case] = []
     for index in range(options.scenes):
-        scene, candidates = draw_scene(world, index, StageClock())
+        scene, candidates = generate_scene(world, index, StageClock())
         at = arm_in_scene(scene, candidates, 0, plan_only, StageClock())
         found = 0
         for row in range(len(candidates)):

@@ -37,7 +37,7 @@ from datagen.workers.motion.plan_candidate import plan_candidate
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
-from datagen.workers.scenes.generate import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import World, assemble_world
 
@@ -72,7 +72,7 @@ def main() -> None:
     spent, problems = Spent(), []
     world = _world(options)
     for index in range(options.scenes):
-        with_scene = draw_scene(world, index, StageClock())
+        with_scene = generate_scene(world, index, StageClock())
         problems += _plan_grid(options, *with_scene, spent)
     _print_split(spent)
     if options.peer and problems:

@@ -27,7 +27,7 @@ from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.rendering.pybullet_renderer import PybulletScene
 from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
 from datagen.workers.rendering.visibility import visible_pixels
-from datagen.workers.scenes.generate import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import assemble_world
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
@@ -77,7 +77,7 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
     embree, tiny = Spent(), Spent()
     rho, target_px, clear, in_surface = [], [], [], []
     for index in range(options.scenes):
-        scene, candidates = draw_scene(world, index, StageClock())
+        scene, candidates = generate_scene(world, index, StageClock())
         eyes_m = np.column_stack([candidates.base_xy_m, candidates.camera_height_m]).astype(np.float64)
         stage = SceneGeometry(scene.house.house, scene.models, scene.T_world_object)
 

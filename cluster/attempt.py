@@ -6,10 +6,11 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
-from datagen.cluster.attempt_guard import Meter, this_host, utc_now
-from datagen.cluster.task import JobCannotGoOn, Product, ShardTask
+from datagen.cluster.attempt_guard import Meter, this_host
+from datagen.cluster.task import AttemptResult, JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.scene_rows import read_scenes
@@ -20,10 +21,10 @@ from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
 
 
-def run_attempt(task: ShardTask, meter: Meter) -> Product:
+def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     """Make the shard's arrays, write them, and commit them unless another attempt was first.
 
-    Raises JobCannotGoOn where the run or its sources cannot be opened or its disk is full; what
+    Raises JobCannotContinue where the run or its sources cannot be opened or its disk is full; what
     else goes wrong is raised as it is, and concerns this attempt alone unless a disk is full (`guarded`).
     """
     spec_hash = task.spec.hash()
@@ -31,7 +32,7 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
-            return Product(False, 0, 0, meter.cost())
+            return AttemptResult(False, 0, 0, meter.cost())
     stored = None if source is None else read_scenes(source, task.scene_indices)
     made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
@@ -55,13 +56,13 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     )
     with ends_job():
         won = run.commit(commit)
-    return Product(won, len(labels), positives, cost)
+    return AttemptResult(won, len(labels), positives, cost)
 
 
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     """The run, the world of its sources, and the run whose scenes are labelled again, if there is one.
 
-    They are opened once a process. Raises JobCannotGoOn where that cannot be done here.
+    They are opened once a process. Raises JobCannotContinue where that cannot be done here.
     """
     with ends_job(every_input_error=True):
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
@@ -71,14 +72,14 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
 
 @contextmanager
 def ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
+    """Raise JobCannotContinue for a full or forbidden disk or, where asked, for any InputError."""
     try:
         yield
     except (InputError, OSError) as error:
         known = machine_error(error, (*FULL, *FORBIDDEN))
         if known is None and not (every_input_error and isinstance(error, InputError)):
             raise
-        raise JobCannotGoOn(str(known or error)) from error
+        raise JobCannotContinue(str(known or error)) from error
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large

@@ -24,14 +24,15 @@ import traceback
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
-from datagen.cluster.task import AttemptReport, JobCannotGoOn, Product, Task
+from datagen.cluster.task import AttemptReport, AttemptResult, JobCannotContinue, Task
 from datagen.schemas.cost import StageClock
 from datagen.schemas.locked_folders import is_private
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, Host, Outcome
 from datagen.schemas.storage.errors import FULL, StoreFailure, machine_error
 from datagen.schemas.whole_files import whole_file
@@ -40,11 +41,6 @@ T = TypeVar("T", bound=Task)
 # What a ledger entry keeps of a stack, from its end, where the failing frame is.
 STACK_LIMIT = 16_000
 _CAUSE_LIMIT = 300  # a cause is read in a table and on a progress line; the stack has the whole text
-
-
-def utc_now() -> str:
-    """The time, UTC, ISO 8601 with milliseconds."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def short_line(text: str) -> str:
@@ -73,7 +69,7 @@ class Meter:
         )
 
 
-def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = True) -> AttemptReport:
+def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bool = True) -> AttemptReport:
     """Run one attempt and tell how it ended. Exceptions become failed reports with their stack.
 
     With `deadline`, the process ends itself when the task takes longer than `task.deadline_s`,
@@ -86,7 +82,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
                 return _failure(task, started, meter, error)
-    except (OSError, JobCannotGoOn) as error:  # of the note itself
+    except (OSError, JobCannotContinue) as error:  # of the note itself
         return _failure(task, started, meter, error)
     return AttemptReport(
         attempt=task.attempt,
@@ -103,7 +99,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
 
 def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
     # A store that gives no answer gives none to the next shard either, and a full disk stays full.
-    final = error if isinstance(error, JobCannotGoOn | StoreFailure) else machine_error(error, FULL)
+    final = error if isinstance(error, JobCannotContinue | StoreFailure) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
     return AttemptReport(
         attempt=task.attempt,
@@ -129,7 +125,7 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
     note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not is_private(note.parent.lstat()):
         problem = f"{note.parent}: another user's folder, or others can write to it"
-        raise JobCannotGoOn(f"{problem}. Name a folder of your own as TMPDIR")
+        raise JobCannotContinue(f"{problem}. Name a folder of your own as TMPDIR")
     with whole_file(note, alone=True) as file:
         file.write(json.dumps({"host": this_host().model_dump(), "started": started}).encode())
     if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
@@ -212,7 +208,7 @@ def collect_remains(notes: str, attempt: str) -> Remains:
     return Remains(note, stack)
 
 
-def obituary(task: Task, outcome: Outcome, cause: str, remains: Remains | None = None) -> AttemptReport:
+def failure_report(task: Task, outcome: Outcome, cause: str, remains: Remains | None = None) -> AttemptReport:
     """The report of an attempt whose worker is gone, from what it left behind: here, or `remains`.
 
     A cause of many lines is cut to one; where the worker left no stack, its whole text stands there.

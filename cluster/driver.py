@@ -5,7 +5,7 @@
         wait a moment for reports, and settle each: ledger, then done, retry or quarantine
         look after attempts that are silent beyond their deadline
         look for what other drivers have committed, once there was a sign of one
-        heed a request to stop
+        handle a request to stop
 
 The driver alone owns attempts: executors never repeat one by themselves.
 """
@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from datagen.cluster.executor import Executor
-from datagen.cluster.job_totals import End, JobSummary, Tally
+from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import (
     Durations,
-    Policy,
+    RetryPolicy,
     Trouble,
     deadline_s,
     decide,
@@ -41,7 +41,7 @@ from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
-# Upper bound of one wait, so that a request to stop is heeded soon.
+# Upper bound of one wait, so that a request to stop is handled soon.
 _POLL_S = 0.25
 
 
@@ -54,7 +54,7 @@ class Order:
     deadline_s: float
 
 
-class Books(Protocol):
+class Recorder(Protocol):
     """Where the driver writes down how attempts and shards ended."""
 
     def close(self, entry: LedgerEntry) -> None: ...
@@ -77,8 +77,8 @@ class Events(Protocol):
         """An attempt was settled; `action` is the policy's decision."""
         ...
 
-    def tick(self, tally: Tally) -> None:
-        """Called often; the tally is the driver's own and changes."""
+    def tick(self, totals: JobTotals) -> None:
+        """Called often; the totals is the driver's own and changes."""
         ...
 
     def stopping(self, reason: str) -> None:
@@ -101,18 +101,18 @@ def drive(
     shards: Sequence[int],
     make_task: Callable[[Order], T],
     executor: Executor[T],
-    books: Books,
-    policy: Policy,
+    recorder: Recorder,
+    policy: RetryPolicy,
     events: Events,
     stop: StopRequest,
     clock: Callable[[], float] = time.monotonic,
 ) -> JobSummary:
     """Run every shard to its commit, or give it up; return how the job ended.
 
-    `clock` gives seconds and only grows. Raises InputError when the books cannot be written; then,
+    `clock` gives seconds and only grows. Raises InputError when the recorder cannot be written; then,
     and on any other exception, what is in flight is ended by force first.
     """
-    driver = _Driver(shards, make_task, executor, books, policy, events, stop, clock)
+    driver = _Driver(shards, make_task, executor, recorder, policy, events, stop, clock)
     try:
         return driver.run()
     finally:
@@ -125,15 +125,15 @@ class _Driver(Generic[T]):
         shards: Sequence[int],
         make_task: Callable[[Order], T],
         executor: Executor[T],
-        books: Books,
-        policy: Policy,
+        recorder: Recorder,
+        policy: RetryPolicy,
         events: Events,
         stop: StopRequest,
         clock: Callable[[], float],
     ) -> None:
-        self._make_task, self._executor, self._books = make_task, executor, books
+        self._make_task, self._executor, self._books = make_task, executor, recorder
         self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
-        self._tally = Tally(len(shards))
+        self._tally = JobTotals(len(shards))
         self._flights: dict[str, _Flight] = {}
         self._troubled: dict[int, Trouble] = {}
         self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
@@ -155,7 +155,7 @@ class _Driver(Generic[T]):
     def run(self) -> JobSummary:
         start_s = self._clock()
         while True:
-            self._heed_stop()
+            self._handle_stop()
             if self._end is None:
                 self._fill()
             if not self._flights and (self._end is not None or not self._due):
@@ -339,7 +339,7 @@ class _Driver(Generic[T]):
 
     # Stop ----------------------------------------------------------------------------------
 
-    def _heed_stop(self) -> None:
+    def _handle_stop(self) -> None:
         if self._stop.drain and self._end is None:
             self._begin_end("interrupted", "asked to stop")
         if self._stop.force or self._clock() >= self._drain_until_s:

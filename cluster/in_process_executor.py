@@ -7,8 +7,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from datagen.cluster.attempt_guard import Meter, guarded, utc_now
-from datagen.cluster.task import AttemptReport, Product, Task
+from datagen.cluster.attempt_guard import Meter, guarded
+from datagen.cluster.task import AttemptReport, AttemptResult, Task
+from datagen.schemas.record_files import utc_now
 
 T = TypeVar("T", bound=Task)
 
@@ -18,7 +19,7 @@ class InProcessExecutor(Generic[T]):
 
     slots = 1
 
-    def __init__(self, function: Callable[[T, Meter], Product]) -> None:
+    def __init__(self, function: Callable[[T, Meter], AttemptResult]) -> None:
         self._function = function
         self._queue: deque[T] = deque()
         self._cancelled: list[AttemptReport] = []

@@ -14,7 +14,7 @@ _NAMED = 20  # quarantined shards that the summary lists by number
 
 
 @dataclass
-class Tally:
+class JobTotals:
     """What happened since this driver began. Seconds are sums over attempts."""
 
     shards: int  # of this job, without those that were done before it began
@@ -58,11 +58,11 @@ class Tally:
         if len(self.quarantined_shards) < _NAMED:
             self.quarantined_shards.append(shard)
 
-    def plus(self, other: Tally) -> Tally:
-        """Both together, as the tally of one job over several runs."""
-        sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(Tally)}
+    def plus(self, other: JobTotals) -> JobTotals:
+        """Both together, as the totals of one job over several runs."""
+        sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(JobTotals)}
         sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
-        return Tally(**sums)
+        return JobTotals(**sums)
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ class JobSummary:
 
     end: End
     cause: str
-    tally: Tally
+    totals: JobTotals
     elapsed_s: float
     start_s: float = 0.0  # before the driver began
 
     @property
     def remaining(self) -> int:
         """Shards that a resumed job would still have to make."""
-        return self.tally.shards - self.tally.finished
+        return self.totals.shards - self.totals.finished
 
     @property
     def exit_code(self) -> int:
@@ -93,10 +93,10 @@ class JobSummary:
     def plus(self, later: JobSummary) -> JobSummary:
         """Both as one job over several runs, in the worse end, by the cause of the first that ended so."""
         worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))
-        tally = self.tally.plus(later.tally)
-        return JobSummary(worst.end, worst.cause, tally, self.elapsed_s + later.elapsed_s)
+        totals = self.totals.plus(later.totals)
+        return JobSummary(worst.end, worst.cause, totals, self.elapsed_s + later.elapsed_s)
 
 
-def no_work() -> JobSummary:
+def empty_summary() -> JobSummary:
     """How a job ends that has nothing to do."""
-    return JobSummary("complete", "", Tally(0), 0.0)
+    return JobSummary("complete", "", JobTotals(0), 0.0)

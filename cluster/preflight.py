@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from datagen.cluster.attempt import open_task
-from datagen.cluster.task import JobCannotGoOn, ShardTask
+from datagen.cluster.task import JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 
@@ -18,7 +18,7 @@ _SHARED = "Put the run and its sources where every machine has them under the sa
 
 
 @dataclass(frozen=True)
-class Fitness:
+class MachineReport:
     """Why a machine cannot make shards of the run ("" when it can), and its versions of what matters."""
 
     problem: str
@@ -35,7 +35,7 @@ def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: Sh
     names, probe = sorted(task.spec.engines), f".probe-{secrets.token_hex(8)}"
     run.storage.put_new(probe, b"driver")
     try:
-        found: dict[str, Fitness] = ask(look_at, task, probe, names, patience_s=_PATIENCE_S)
+        found: dict[str, MachineReport] = ask(inspect_machine, task, probe, names, patience_s=_PATIENCE_S)
     finally:
         run.storage.delete([probe])
     here = versions_of(names)
@@ -49,19 +49,19 @@ def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: Sh
             raise InputError(place, name, problem, "Install the versions of constraints.txt on every machine")
 
 
-def look_at(task: ShardTask, probe: str, names: Iterable[str]) -> Fitness:
+def inspect_machine(task: ShardTask, probe: str, names: Iterable[str]) -> MachineReport:
     """What this machine, asked by another, can say of itself."""
     versions = versions_of(names)
     try:
         run, _, _ = open_task(task)
         if not run.storage.exists(probe):
-            return Fitness(f"{task.run}: another folder has this name there", versions)
+            return MachineReport(f"{task.run}: another folder has this name there", versions)
         answer = f"{probe}-{secrets.token_hex(8)}"
         run.storage.put_new(answer, b"seen")
         run.storage.delete([answer])
-    except (JobCannotGoOn, InputError) as error:
-        return Fitness(" ".join(str(error).split()), versions)
-    return Fitness("", versions)
+    except (JobCannotContinue, InputError) as error:
+        return MachineReport(" ".join(str(error).split()), versions)
+    return MachineReport("", versions)
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:

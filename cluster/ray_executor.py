@@ -19,13 +19,13 @@ from datagen.cluster.attempt_guard import (
     Remains,
     clear_notes,
     collect_remains,
+    failure_report,
     guarded,
-    obituary,
     resident_bytes,
 )
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
 from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, remains_of
-from datagen.cluster.task import AttemptReport, Product, Task
+from datagen.cluster.task import AttemptReport, AttemptResult, Task
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Outcome
 
@@ -57,7 +57,9 @@ class _Inquest(Generic[T]):
 
 
 @contextmanager
-def ray_executor(function: Callable[[T, Meter], Product], settings: RaySettings) -> Generator[RayExecutor[T]]:
+def ray_executor(
+    function: Callable[[T, Meter], AttemptResult], settings: RaySettings
+) -> Generator[RayExecutor[T]]:
     """An executor over `ray_cluster(settings)`; a local cluster that dies is started anew."""
     with ExitStack() as stack:
 
@@ -82,7 +84,7 @@ class RayExecutor(Generic[T]):
 
     def __init__(
         self,
-        function: Callable[[T, Meter], Product],
+        function: Callable[[T, Meter], AttemptResult],
         settings: RaySettings,
         ray: Any,
         restart: Callable[[], Any] | None = None,
@@ -210,7 +212,7 @@ class RayExecutor(Generic[T]):
                 ends_job, cause = True, f"{cause}, and Ray cannot be started anew: {error}"
         for death in deaths:
             end_attempts(death.task.notes, [death.task.attempt])  # a worker may outlive its raylet
-            report = obituary(death.task, death.outcome, death.cause)
+            report = failure_report(death.task, death.outcome, death.cause)
             reports.append(replace(report, cause=cause, ends_job=True) if ends_job else report)
         return reports
 
@@ -244,7 +246,7 @@ class RayExecutor(Generic[T]):
             if has_others and is_elsewhere:
                 unknown[death.task.notes].append(death)
             else:
-                reports.append(obituary(death.task, death.outcome, death.cause, remains))
+                reports.append(failure_report(death.task, death.outcome, death.cause, remains))
         for notes, found in unknown.items():
             attempts = [death.task.attempt for death in found]
             question = self.others.put(remains_of, notes, attempts, patience_s=_REMAINS_WITHIN_S)
@@ -267,7 +269,7 @@ class RayExecutor(Generic[T]):
                 # A worker that died left its note on its machine. Where none has it, the machine went too.
                 if remains is None and outcome == "crashed":
                     outcome, cause = "lost", "its worker is gone, and the machine that had it does not answer"
-                reports.append(obituary(death.task, outcome, cause, remains or Remains()))
+                reports.append(failure_report(death.task, outcome, cause, remains or Remains()))
         return reports
 
     @staticmethod

@@ -17,7 +17,7 @@ Action = Literal["done", "retry", "quarantine", "drop", "abort"]
 
 
 @dataclass(frozen=True)
-class Policy:
+class RetryPolicy:
     """The budgets of a job. Seconds unless a name says otherwise."""
 
     max_failures: int = 3  # crash, hang, exception or bad output; then the shard is given up
@@ -66,7 +66,7 @@ class Decision:
 
 
 def decide(
-    policy: Policy, trouble: Trouble, report: AttemptReport, successes: int = 0, alone: bool = False
+    policy: RetryPolicy, trouble: Trouble, report: AttemptReport, successes: int = 0, alone: bool = False
 ) -> Decision:
     """What to do with a shard after this report.
 
@@ -109,7 +109,7 @@ def is_suspect(trouble: Trouble) -> bool:
     return trouble.lost >= 2
 
 
-def nothing_runs(policy: Policy, lost_in_a_row: int, at_once: int) -> bool:
+def nothing_runs(policy: RetryPolicy, lost_in_a_row: int, at_once: int) -> bool:
     """Whether the executor rather than a shard is at fault: whatever it is given, `at_once`, is lost.
 
     Not before the budget of a shard that is the only one left has decided.
@@ -117,7 +117,7 @@ def nothing_runs(policy: Policy, lost_in_a_row: int, at_once: int) -> bool:
     return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * at_once)
 
 
-def window(policy: Policy, slots: int) -> int:
+def window(policy: RetryPolicy, slots: int) -> int:
     """How many attempts to keep in flight."""
     return max(1, math.ceil(policy.window_factor * slots))
 
@@ -152,7 +152,7 @@ def percentile_95(values: Sequence[float] | deque[float]) -> float:
     return ordered[math.ceil(0.95 * len(ordered)) - 1]
 
 
-def deadline_s(policy: Policy, durations: Durations, trouble: Trouble) -> float:
+def deadline_s(policy: RetryPolicy, durations: Durations, trouble: Trouble) -> float:
     """How long an attempt may run: well above what others took, doubled after each hang."""
     if durations.seen < policy.deadlines_known_after:
         base = policy.initial_deadline_s
@@ -161,11 +161,11 @@ def deadline_s(policy: Policy, durations: Durations, trouble: Trouble) -> float:
     return base * 2**trouble.hangs
 
 
-def too_many_quarantined(policy: Policy, quarantined: int, shards: int) -> bool:
+def too_many_quarantined(policy: RetryPolicy, quarantined: int, shards: int) -> bool:
     """Whether the job has failed as a whole."""
     return quarantined > policy.max_quarantined_share * shards
 
 
-def ends_early(policy: Policy, quarantined: int, shards: int) -> bool:
+def ends_early(policy: RetryPolicy, quarantined: int, shards: int) -> bool:
     """Whether going on would only burn money: so many shards are bad that the job has failed."""
     return quarantined >= policy.give_up_after and too_many_quarantined(policy, quarantined, shards)

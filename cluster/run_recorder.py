@@ -1,14 +1,14 @@
-"""The driver's records in a run: how attempts ended, which shards were given up, what was lost; its index."""
+"""Records how the attempts of a run ended, its quarantined shards and lost attempts; keeps its index."""
 
 from __future__ import annotations
 
 import time
 
-from datagen.cluster.attempt_guard import utc_now
 from datagen.cluster.retry_policy import Trouble
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_from_commit, lost_end
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from datagen.schemas.shard_ranges import ShardRanges
@@ -20,7 +20,7 @@ _INDEX_EVERY = 500
 _INDEX_FACTOR = 30.0
 
 
-class RunBooks:
+class RunRecorder:
     """Writes the ledger and the quarantine of one run, and now and then its index."""
 
     def __init__(self, run: Run) -> None:
@@ -80,15 +80,15 @@ def close_lost_attempts(run: Run) -> int:
     driver lives after all, its own note replaces this one. Where the shard is still open they stay
     open, for the job that resumes.
     """
-    books, quarantined, closed = RunBooks(run), run.quarantined(), 0
+    recorder, quarantined, closed = RunRecorder(run), run.quarantined(), 0
     for start in run.ledger.unfinished():
-        commit = books.commit_of(start.shard)
+        commit = recorder.commit_of(start.shard)
         if commit is None and start.shard not in quarantined:
             continue
         if commit is not None and commit.attempt == start.attempt:
-            books.close(end_from_commit(commit, start.started))
+            recorder.close(end_from_commit(commit, start.started))
         else:
-            books.close(lost_end(start, utc_now()))
+            recorder.close(lost_end(start, utc_now()))
         closed += 1
     refresh_index(run)
     return closed

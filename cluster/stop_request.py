@@ -1,4 +1,4 @@
-"""The wish to stop: once to finish what is in flight, twice to end at once."""
+"""A request to stop a job: once to finish what is in flight, twice to end at once."""
 
 from __future__ import annotations
 

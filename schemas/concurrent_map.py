@@ -11,7 +11,7 @@ Result = TypeVar("Result")
 Item = TypeVar("Item")
 
 
-def in_order(
+def concurrent_map(
     pool: ThreadPoolExecutor, most: int, do: Callable[[Item], Result], items: Iterable[Item]
 ) -> Generator[Result]:
     """What `do` gives for each item, in their order, with at most so many begun that are not yet taken.

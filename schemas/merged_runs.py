@@ -38,7 +38,7 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class LabelCounts:
     """What runs together want and have: labels, and planned shards without a commit."""
 
     n: int
@@ -46,7 +46,7 @@ class Wanted:
     missing: int
 
 
-def wanted(runs: Iterable[Run]) -> Wanted:
+def label_counts(runs: Iterable[Run]) -> LabelCounts:
     """Sums over the runs of a place. Shards beyond a run's n do not count, and the last one is cut."""
     n = labels = missing = 0
     for run in runs:
@@ -56,7 +56,7 @@ def wanted(runs: Iterable[Run]) -> Wanted:
         n += run_n
         labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
         missing += shards - len(done)
-    return Wanted(n, labels, missing)
+    return LabelCounts(n, labels, missing)
 
 
 def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:

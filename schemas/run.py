@@ -19,7 +19,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
 from datagen.schemas.root_records import publish, refuse_foreign, refuse_other
 from datagen.schemas.run_records import (
     FORMAT_VERSION,
@@ -143,7 +143,7 @@ class Run:
                 place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
                 raise InputError(place, "", problem, "Move it away")
             number, spec_hash = number + 1, self.manifest.spec_hash
-            plan = Plan(n=n, created=created or now(), spec_hash=spec_hash, number=number)
+            plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
             # Losing this race means that another plan appeared: look again.
             publish(self.storage, f"plans/{number}.json", encode_record(plan))
 

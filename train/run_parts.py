@@ -16,7 +16,7 @@ from datagen.train.sealed import is_sealed_store, open_sealed
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class RunPart:
     """One run's shards and arrays, or those of a sealed store that came without its run.
 
     `spec_hashes` has several where such a store was merged. `cost` adds up the commits' wall and CPU
@@ -34,7 +34,7 @@ class Part:
 
 def open_parts(
     places: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
-) -> list[Part]:
+) -> list[RunPart]:
     """The runs of all places, in order, with the named arrays, which are alike in all of them.
 
     InputError where a place is no run, of a schema that this program does not know, without such a field,
@@ -57,12 +57,12 @@ def _words(array: StoredArray) -> str:
     return f"{array.dtype} {array.shape[1:]} a {array.dims[0]}"
 
 
-def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[Part]:
+def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[RunPart]:
     """The run, each of the merged ones, or the sealed store."""
     if is_sealed_store(place):
         sealed = open_sealed(place, names)
         return [
-            Part(
+            RunPart(
                 str(place),
                 sealed.spec_hashes,
                 sealed.schema,
@@ -80,7 +80,7 @@ def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> li
     return opened
 
 
-def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> Part | None:
+def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart | None:
     _ = run.schema  # refuses a version that this program does not know
     n, url = run.n, run.storage.url
     paths = {f"{name}/zarr.json" for name in names}
@@ -111,7 +111,7 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> Part | 
         return None
     manifest = run.manifest
     version = manifest.schema_version
-    return Part(url, (manifest.spec_hash,), manifest.schema_name, version, shards, arrays, cost)
+    return RunPart(url, (manifest.spec_hash,), manifest.schema_name, version, shards, arrays, cost)
 
 
 def _refuse_unknown(url: str, names: Sequence[str], commit: Commit) -> None:

@@ -27,8 +27,8 @@ from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.labels.source import LabelSource
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.scenes.generate import draw_scene
-from datagen.workers.scenes.reconstruct import recall_candidates, recall_scene
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import Scene, SettledScene
 from datagen.workers.world import World
 
@@ -96,17 +96,17 @@ def run_shard(
 
 
 def _draw(world: World, index: int, clock: StageClock) -> _Staged:
-    scene, candidates = draw_scene(world, index, clock)
+    scene, candidates = generate_scene(world, index, clock)
     return _Staged(scene, candidates, scene_row(scene), scene.redraws)
 
 
 def _recall(world: World, index: int, rows: SceneRows, clock: StageClock) -> _Staged:
     with clock.stage("draw"):
-        scene = recall_scene(world, rows.record)
+        scene = reconstruct_scene(world, rows.record)
     if scene.index != index:
         problem = f"scene {scene.index} is stored where scene {index} belongs"
         raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
-    return _Staged(scene, recall_candidates(rows.samples, scene), rows.record, {})
+    return _Staged(scene, reconstruct_candidates(rows.samples, scene), rows.record, {})
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datagen.schemas.outcomes import REDRAW_CAUSES
 
 
-class Redraw(Exception):
+class SceneRejected(Exception):
     """This try gives no scene; `cause` is one of REDRAW_CAUSES, `detail` says more where there is more."""
 
     def __init__(self, cause: str, detail: str = "") -> None:

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from datagen.schemas.keys import commit_key
-from datagen.schemas.record_files import encode_record, now
+from datagen.schemas.record_files import encode_record, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
 from datagen.schemas.shard_files import encode_shard
@@ -72,12 +72,12 @@ def make_large(folder: Path, commits: int) -> Run:
             attempt=attempt,
             shard=shard,
             outcome="committed",
-            started=now(),
-            ended=now(),
+            started=utc_now(),
+            ended=utc_now(),
             cost=cost,
             host=host,
         )
-        start = AttemptStart(attempt=attempt, shard=shard, started=now(), host="node")
+        start = AttemptStart(attempt=attempt, shard=shard, started=utc_now(), host="node")
         (folder / commit_key(shard)).write_bytes(encode_record(commit))
         (folder / f"ledger/{attempt}.start.json").write_bytes(encode_record(start))
         (folder / f"ledger/{attempt}.json").write_bytes(encode_record(end))

@@ -63,26 +63,31 @@ def evaluate(
     # Imported here: other verbs wait neither for these nor for torch.
     import numpy as np
 
-    from datagen.evaluation_report.baseline_methods import line_up, read_heuristic
-    from datagen.evaluation_report.evaluated_runs import open_places, refuse_seen_houses, sets_of, tell_apart
+    from datagen.evaluation_report.baseline_methods import baseline_methods, read_heuristic
+    from datagen.evaluation_report.evaluated_runs import (
+        candidate_sets_of,
+        open_evaluated_runs,
+        refuse_seen_houses,
+        split_paths,
+    )
     from datagen.evaluation_report.methods import open_models
     from datagen.evaluation_report.report import evaluation_report
     from datagen.evaluation_report.terminal import print_evaluation
     from datagen.train.evaluation.columns import gather
 
     _refuse_odd(bootstrap, seed, threads, html)
-    checkpoints, runs = tell_apart(places)
+    checkpoints, runs = split_paths(places)
     if threads is not None:
         from datagen.train.scorers import use_threads
 
         use_threads(threads)
-    opened = open_places(runs, allow_incomplete)
-    sets = sets_of(opened, candidates or [])
+    opened = open_evaluated_runs(runs, allow_incomplete)
+    sets = candidate_sets_of(opened, candidates or [])
     models = open_models(checkpoints)
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    lineup = line_up(
+    lineup = baseline_methods(
         baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
     )
     contestants = [*lineup.baselines, *models]

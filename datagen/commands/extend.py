@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.jobs.continue_runs import go_on, open_work, source_words
+from datagen.jobs.continue_runs import continue_runs, open_work, source_words
 from datagen.jobs.detach import detach_job
 from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
 from datagen.regeneration.sources import AS_FOUND, Sources
@@ -50,7 +50,7 @@ def extend(
             part.grow(more)
     if placing.detach:
         return detach_job(words, run, placing)
-    return go_on(place, run, works, placing, began_s, given)
+    return continue_runs(place, run, works, placing, began_s, given)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

@@ -64,7 +64,7 @@ def relabel(
 
 
 def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
-    summary, labels, positives = done.summary, done.summary.tally.labels, done.summary.tally.positives
+    summary, labels, positives = done.summary, done.summary.totals.labels, done.summary.totals.positives
     report = {
         "run": place.url,
         "source": run,

@@ -17,14 +17,14 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.regeneration.sources import AS_FOUND, Sources
-from datagen.schemas.checking.repair import Mended, RemakeShard, mend_place
+from datagen.schemas.checking.repair import RemakeShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.regeneration.shards import Origin
+    from datagen.regeneration.shards import OpenedSources
 
 
 def repair(
@@ -47,9 +47,9 @@ def repair(
     place = open_storage(run, probe=False, create=False)
     with (
         counting("shards checked", as_json=json) as seen,
-        _remaking(given, workers) as remake,
+        _remaking(given, workers) as regenerate_shard,
     ):
-        mended = mend_place(place, remake, max(1, workers), seen)
+        mended = repair_runs(place, regenerate_shard, max(1, workers), seen)
     left = [finding for finding in mended.left if finding.is_damage]
     report = _report(run, mended)
     if json:
@@ -81,19 +81,19 @@ def _leave_signals() -> None:
 def _remake(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed here."""
     # Simulators are imported only where a shard is bad.
-    from datagen.regeneration.shards import remade_files, remake
+    from datagen.regeneration.shards import regenerate_shard, regenerated_files
 
-    return remade_files(run, remake(run, shard, _origin(run.storage.url, given)))
+    return regenerated_files(run, regenerate_shard(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
-def _origin(place: str, given: Sources) -> Origin:
-    from datagen.regeneration.shards import open_origin
+def _origin(place: str, given: Sources) -> OpenedSources:
+    from datagen.regeneration.shards import open_sources
 
-    return open_origin(Run.open(place), given)
+    return open_sources(Run.open(place), given)
 
 
-def _report(run: str, mended: Mended) -> dict[str, Any]:
+def _report(run: str, mended: Repaired) -> dict[str, Any]:
     return {
         "run": run,
         "clean": not any(finding.is_damage for finding in mended.left),
@@ -110,7 +110,7 @@ def _report(run: str, mended: Mended) -> dict[str, Any]:
     }
 
 
-def _apart(mended: Mended) -> list[str]:
+def _apart(mended: Repaired) -> list[str]:
     """In what this machine is not the one that made the run, where remade bytes were not the committed."""
     if not any("other bytes" in finding.mend for finding in mended.left):
         return []
@@ -120,7 +120,7 @@ def _apart(mended: Mended) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def _print(report: dict[str, Any], mended: Mended) -> None:
+def _print(report: dict[str, Any], mended: Repaired) -> None:
     made, of_shards = len(report["files_made_again"]), report["shards_made_again"]
     rows = [
         ("records", f"{len(report['records'])} put back from copies and other records"),

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
-from datagen.jobs.continue_runs import go_on, open_work, source_words
+from datagen.jobs.continue_runs import continue_runs, open_work, source_words
 from datagen.jobs.detach import detach_job
 from datagen.jobs.options import HERE, Placing, absolute_place, opening
 from datagen.regeneration.sources import AS_FOUND, Sources
@@ -47,4 +47,4 @@ def resume(
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
             sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return go_on(place, run, works, placing, began_s, given)
+    return continue_runs(place, run, works, placing, began_s, given)

@@ -18,7 +18,7 @@ from datagen.configuration.stored_scenes import (
 )
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.jobs.continue_runs import go_on, refuse_unusable_engines
+from datagen.jobs.continue_runs import continue_runs, refuse_unusable_engines
 from datagen.jobs.detach import detach_job
 from datagen.jobs.job import Work
 from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
@@ -31,7 +31,7 @@ from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.generate import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that stored scenes have decided.
@@ -165,7 +165,7 @@ def submit(
     if placing.detach:
         return detach_job(words, out, placing)
     work = Work(run, sources["houses"], sources["objects"], source_url)
-    return go_on(run.storage, out, [work], placing, began_s)
+    return continue_runs(run.storage, out, [work], placing, began_s)
 
 
 def _layout_there(out: str) -> Layout | None:
@@ -183,7 +183,7 @@ def _layout_there(out: str) -> Layout | None:
 def _refuse_no_scene(world: World, houses: str) -> None:
     """Draw a new run's first scene here: sources that give none are refused before anything is written."""
     try:
-        draw_scene(world, 0, StageClock())
+        generate_scene(world, 0, StageClock())
     except InputError as error:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from datagen import __version__
 from datagen.configuration.arms import arm_versions
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.record_files import now
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Layout, Manifest
 from datagen.schemas.specification import Specification
 from datagen.workers.labels import load_label_source
@@ -34,6 +34,6 @@ def manifest_of(
         code_version=__version__,
         libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
         platform=platform.platform(),
-        created=now(),
+        created=utc_now(),
         sources=sources,
     )

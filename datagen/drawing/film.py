@@ -14,7 +14,7 @@ from datagen.workers.geometry.mesh import F64, U8
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera
 from datagen.workers.rendering.rays import RayMesh, RayScene
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
@@ -50,7 +50,7 @@ _PHASE_WORDS = {
 class Film:
     """A trial that is ready to be looked at."""
 
-    recalled: RecalledScene
+    recalled: ReconstructedScene
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
@@ -73,7 +73,7 @@ class Film:
 
 
 def film_of(
-    recalled: RecalledScene,
+    recalled: ReconstructedScene,
     bodies: RobotBodies,
     T_world_base: F64,
     recording: Recording,
@@ -179,7 +179,7 @@ def pictures(film: Film, moments: Sequence[int], sharpness: int) -> Iterator[tup
 
 
 def _stage(
-    recalled: RecalledScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
+    recalled: ReconstructedScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
 ) -> RayScene:
     robot = bodies.poses(T_world_base, recording.q_rad[moment], float(recording.opening_m[moment]))
     return RayScene(

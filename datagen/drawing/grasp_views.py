@@ -19,7 +19,7 @@ from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.rays import RayScene, ray_mesh
 from datagen.workers.robots.robot import Gripper
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles meet a grasp to 0.5 mm and 0.5 degrees only
 _FAR_M = 6.0  # so far away that the view is nearly parallel
@@ -71,7 +71,7 @@ def hand_outline(gripper: Gripper) -> F64:
 
 
 def draw_grasps(
-    views: tuple[Axes, Axes], recalled: RecalledScene, support: Mesh, gripper: Gripper, used: UsedGrasps
+    views: tuple[Axes, Axes], recalled: ReconstructedScene, support: Mesh, gripper: Gripper, used: UsedGrasps
 ) -> ScalarMappable | None:
     """Draw the grasps from above and from the observer's side; returns the scale of the counts.
 

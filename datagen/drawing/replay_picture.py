@@ -16,9 +16,9 @@ from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
 from datagen.workers.scenes.generate import render_frame
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
-Side = tuple[RecalledScene, SceneRows]
+Side = tuple[ReconstructedScene, SceneRows]
 
 
 def draw_replay(
@@ -47,7 +47,9 @@ def draw_replay(
     figure.savefig(out)
 
 
-def _draw_plan(axes: Axes, recalled: RecalledScene, rows: SceneRows, centre: Any, row: int | None) -> None:
+def _draw_plan(
+    axes: Axes, recalled: ReconstructedScene, rows: SceneRows, centre: Any, row: int | None
+) -> None:
     xy = np.asarray(rows.samples["base_xy_m"], np.float64)
     draw_house(axes, recalled.house.house)
     draw_objects(axes, object_outlines(recalled))
@@ -62,7 +64,7 @@ def _draw_plan(axes: Axes, recalled: RecalledScene, rows: SceneRows, centre: Any
     )
 
 
-def _draw_over(axes: Axes, stored: RecalledScene, made: RecalledScene, centre: Any) -> None:
+def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene, centre: Any) -> None:
     """Both on one plan: where they are equal, no blue is to be seen under the dashes."""
     for recalled, style, colour, name in (
         (stored, "-", "#2f6fdd", "stored"),

@@ -13,7 +13,7 @@ from datagen.schemas.specification import Specification
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots import open_robot
 from datagen.workers.scenes.generate import render_frame
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Lines = list[tuple[str, str]]
 
@@ -25,7 +25,7 @@ class Shown:
     run: str
     spec: Specification
     rows: SceneRows
-    recalled: RecalledScene
+    recalled: ReconstructedScene
 
     @property
     def title(self) -> str:

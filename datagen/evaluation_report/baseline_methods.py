@@ -10,8 +10,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from datagen.configuration.specify import first_of, read_toml
-from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, Place, refuse_no_trials
-from datagen.evaluation_report.methods import Contestant
+from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
+from datagen.evaluation_report.methods import EvaluatedMethod
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams
@@ -23,15 +23,15 @@ NONE = "none"
 
 
 @dataclass(frozen=True, eq=False)
-class Lineup:
+class BaselineMethods:
     """Baselines in their order, those left out with the cause, and the houses that numbers come from."""
 
-    baselines: tuple[Contestant, ...]
+    baselines: tuple[EvaluatedMethod, ...]
     left_out: dict[str, str]
     houses: frozenset[str]
 
 
-def read_heuristic(path: Path, places: Sequence[Place], allow_seen_houses: bool) -> HeuristicParams:
+def read_heuristic(path: Path, places: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
     """The rule's parameters in a file that `datagen calibrate` wrote.
 
     InputError where it has none, and where it says that they were fitted to one of `places`.
@@ -51,17 +51,17 @@ def read_heuristic(path: Path, places: Sequence[Place], allow_seen_houses: bool)
         raise first_of(error, str(path), "heuristic") from None
 
 
-def line_up(
+def baseline_methods(
     asked: Sequence[str] | None,
     fit: Sequence[str],
     detector: Path | None,
     heuristic: HeuristicParams | None,
     seed: int,
-    places: Sequence[Place],
+    places: Sequence[EvaluatedRun],
     allow_seen_houses: bool,
     allow_incomplete: bool = False,
     json: bool = False,
-) -> Lineup:
+) -> BaselineMethods:
     """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
 
     InputError where one that was asked for cannot be had, and where a house of `fit` is one of `places`.
@@ -69,7 +69,7 @@ def line_up(
     if asked and NONE in asked:
         if len(asked) > 1:
             raise InputError("--baselines", NONE, "stands beside others", "Give none alone, or leave it out")
-        return Lineup((), {}, frozenset())
+        return BaselineMethods((), {}, frozenset())
     names = list(dict.fromkeys(asked or BASELINES))
     made = make_baselines(names, detector, heuristic, seed)
     left_out: dict[str, str] = {}
@@ -104,8 +104,8 @@ def line_up(
         made = [b for b in made if not b.needs_fit]
     # What has to be said of a name stands in brackets behind it.
     told = [(b, *b.name.partition(" (")[::2]) for b in made]
-    return Lineup(
-        tuple(Contestant(name, b, state=b.state(), note=note.rstrip(")")) for b, name, note in told),
+    return BaselineMethods(
+        tuple(EvaluatedMethod(name, b, state=b.state(), note=note.rstrip(")")) for b, name, note in told),
         left_out,
         houses,
     )

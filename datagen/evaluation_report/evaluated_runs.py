@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.evaluation_report.methods import Contestant
+from datagen.evaluation_report.methods import EvaluatedMethod
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -23,7 +23,7 @@ _WITH_OUTCOMES = ("plan", "sim")
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class EvaluatedRun:
     """A run, or merged ones, of simulated or planned labels; `cells` of its whole grids, 0 without any."""
 
     place: str
@@ -54,7 +54,7 @@ class Place:
         }
 
 
-def tell_apart(places: Sequence[str]) -> tuple[list[str], list[str]]:
+def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
     """(checkpoints, runs): files are checkpoints; folders and addresses of object stores are runs."""
     checkpoints: list[str] = []
     runs: list[str] = []
@@ -72,9 +72,9 @@ def tell_apart(places: Sequence[str]) -> tuple[list[str], list[str]]:
     return checkpoints, runs
 
 
-def open_places(places: Sequence[str], allow_incomplete: bool = False) -> list[Place]:
+def open_evaluated_runs(places: Sequence[str], allow_incomplete: bool = False) -> list[EvaluatedRun]:
     """The runs. InputError where labels are no trials, or runs hold labels of different kinds or scenes."""
-    opened: list[Place] = []
+    opened: list[EvaluatedRun] = []
     by_scenes: dict[str, str] = {}
     kinds: dict[str, str] = {}
     for place in places:
@@ -94,7 +94,7 @@ def open_places(places: Sequence[str], allow_incomplete: bool = False) -> list[P
             shuffle=False,
             allow_incomplete=allow_incomplete,
         )
-        opened.append(Place(place, specs, stream))
+        opened.append(EvaluatedRun(place, specs, stream))
     return opened
 
 
@@ -115,7 +115,7 @@ def _refuse_other_labels(place: str, source: str, kinds: dict[str, str]) -> None
         raise InputError(place, "label_source", problem, "Evaluate the two apart")
 
 
-def sets_of(places: Sequence[Place], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
+def candidate_sets_of(places: Sequence[EvaluatedRun], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
     """The sets of candidates to tell of, those asked for or all, each with the places that offer it.
 
     A run of candidates within reach says nothing of others, and beside it one of whole grids says of all.
@@ -129,7 +129,7 @@ def sets_of(places: Sequence[Place], asked: Sequence[str]) -> dict[str, tuple[in
     return {name: rows for name, rows in offered.items() if not asked or name in asked}
 
 
-def refuse_seen_houses(places: Sequence[Place], contestants: Iterable[Contestant]) -> None:
+def refuse_seen_houses(places: Sequence[EvaluatedRun], contestants: Iterable[EvaluatedMethod]) -> None:
     """InputError that names a house of these runs on which somebody was trained."""
     mend = "Evaluate a run of another split, or say --allow-seen-houses, which tells of them apart"
     by = [(f"{c.name} ({c.place})", c.houses) for c in contestants]

@@ -21,7 +21,7 @@ REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 
 
 @dataclass(frozen=True, eq=False)
-class Contestant:
+class EvaluatedMethod:
     """One method with where it comes from.
 
     Models have a place and a checkpoint, baselines their fitted numbers. `note` is what else has to be
@@ -91,7 +91,7 @@ class Contestant:
         }
 
 
-def open_models(places: Sequence[str]) -> list[Contestant]:
+def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
     """The models of these checkpoints, named by their regimes, and by what else tells equal ones apart."""
     if not places:
         return []
@@ -105,7 +105,7 @@ def open_models(places: Sequence[str]) -> list[Contestant]:
             raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
         by_digest[head.digest] = place
     return [
-        Contestant(name, ModelScorer(model, name, only_clear=True), place, head)
+        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), place, head)
         for (place, model, head), name in zip(loaded, names, strict=True)
     ]
 

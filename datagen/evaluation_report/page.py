@@ -9,7 +9,7 @@ from datagen.evaluation_report import report_tables as tables
 from datagen.evaluation_report.curves import draw_curves, draw_intervals
 from datagen.evaluation_report.grid_pictures import draw_examples
 from datagen.evaluation_report.number_format import Report
-from datagen.evaluation_report.report_tables import Shown
+from datagen.evaluation_report.report_tables import TitledTable
 from datagen.evaluation_report.svg import svg_of
 from datagen.schemas.errors import printable
 from datagen.train.evaluation.columns import Gathered
@@ -122,14 +122,14 @@ def _sources(report: Report) -> Iterable[str]:
     yield f"<p class=note>datagen {escape(report['datagen'])}</p>"
 
 
-def _shown(shown: Shown | None, level: str = "h3", first: str = "", kind: str = "") -> list[str]:
+def _shown(shown: TitledTable | None, level: str = "h3", first: str = "", kind: str = "") -> list[str]:
     """Heading, whatever comes first, and the table; nothing where it has no tables."""
     if shown is None or not shown.rows:
         return []
     return [f"<{level}>{escape(shown.title)}</{level}>", first, _table(shown.heads, shown.rows, kind)]
 
 
-def _folded(shown: Shown, kind: str = "") -> str:
+def _folded(shown: TitledTable, kind: str = "") -> str:
     table = _table(shown.heads, shown.rows, kind)
     return f"<details><summary>{escape(shown.title)}</summary>{table}</details>"
 

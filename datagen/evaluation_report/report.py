@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from datagen import __version__
-from datagen.evaluation_report.evaluated_runs import Place
-from datagen.evaluation_report.methods import Contestant
+from datagen.evaluation_report.evaluated_runs import EvaluatedRun
+from datagen.evaluation_report.methods import EvaluatedMethod
 from datagen.schemas.errors import InputError
 from datagen.train.evaluation import paper_results
 from datagen.train.evaluation.bootstrap import LEVEL
@@ -21,8 +21,8 @@ UNSEEN, SEEN = "unseen", "seen"
 
 def evaluation_report(
     gathered: Gathered,
-    contestants: Sequence[Contestant],
-    places: Sequence[Place],
+    contestants: Sequence[EvaluatedMethod],
+    places: Sequence[EvaluatedRun],
     sets: Mapping[str, Sequence[int]],
     *,
     seen_houses: frozenset[str],

@@ -28,7 +28,7 @@ _COMPARED = ("accuracy", "balanced_accuracy", "good", "mean_average_precision")
 
 
 @dataclass(frozen=True)
-class Shown:
+class TitledTable:
     """A table with its title."""
 
     title: str
@@ -36,7 +36,7 @@ class Shown:
     rows: Sequence[Sequence[str]]
 
 
-def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_I) -> Shown:
+def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_I) -> TitledTable:
     """Table I: these metrics of every method, with the paper's accuracy."""
     rows = [
         (
@@ -47,20 +47,20 @@ def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_
         for record in report["methods"]
     ]
     heads = ("method", *(METRIC_WORDS[metric] for metric in metrics), "paper, accuracy")
-    return Shown(f"Table I: {candidates_line(told)}", heads, rows)
+    return TitledTable(f"Table I: {candidates_line(told)}", heads, rows)
 
 
-def choice_table(report: Report, told: Report) -> Shown:
+def choice_table(report: Report, told: Report) -> TitledTable:
     """How each method chooses among a robot's candidates of a set, and orders them."""
     rows = [
         (record["name"], *(with_interval(told["methods"][record["name"]][metric]) for metric in CHOICE))
         for record in report["methods"]
     ]
     title = f"choosing among a robot's candidates ({told['candidates']})"
-    return Shown(title, ("method", *(METRIC_WORDS[metric] for metric in CHOICE)), rows)
+    return TitledTable(title, ("method", *(METRIC_WORDS[metric] for metric in CHOICE)), rows)
 
 
-def comparison_table(comparisons: Sequence[Report], where: str) -> Shown:
+def comparison_table(comparisons: Sequence[Report], where: str) -> TitledTable:
     """What regimes add to each other, and the best model to the best baseline, scene by scene."""
     rows = [
         (f"{d['first']} - {d['second']}", METRIC_WORDS[d["metric"]], with_interval(d, signed=True),
@@ -70,12 +70,12 @@ def comparison_table(comparisons: Sequence[Report], where: str) -> Shown:
         if d["kind"] == kind and d["metric"] in _COMPARED
     ]  # fmt: skip
     title = f"differences over the same resampled scenes ({where}): regimes, and best model - best baseline"
-    return Shown(title, ("difference", "by", "points", ""), rows)
+    return TitledTable(title, ("difference", "by", "points", ""), rows)
 
 
 def order_tables(
     records: Sequence[Report], differences: Sequence[Report], metrics: Sequence[str], where: str
-) -> Iterator[Shown]:
+) -> Iterator[TitledTable]:
     """Whom each of these methods is above and below, by metric; none where nobody else is there."""
     for metric in metrics:
         rows = [
@@ -85,10 +85,10 @@ def order_tables(
         ]
         if rows:
             title = f"by {METRIC_WORDS[metric]} ({where}): + where the two intervals are disjoint as well"
-            yield Shown(title, ("method", "above", "not told apart from", "below"), rows)
+            yield TitledTable(title, ("method", "above", "not told apart from", "below"), rows)
 
 
-def reach_table(report: Report, told: Report) -> Shown | None:
+def reach_table(report: Report, told: Report) -> TitledTable | None:
     """Table II: accuracy within and beyond reach; None where nothing is beyond."""
     inside, outside = told["in_reach"], told["out_of_reach"]
     if not outside["count"]:
@@ -106,10 +106,10 @@ def reach_table(report: Report, told: Report) -> Shown | None:
     title = (
         f"Table II: {told['candidates']}, {inside['count']:,} within reach and {outside['count']:,} beyond"
     )
-    return Shown(title, ("method", "R_in", "R_out", "paper, all", "paper, R_out"), rows)
+    return TitledTable(title, ("method", "R_in", "R_out", "paper, all", "paper, R_out"), rows)
 
 
-def grids_table(report: Report, grids: Report) -> Shown:
+def grids_table(report: Report, grids: Report) -> TitledTable:
     """Table III: what the best-scored clear candidate of a grid is, and the order of all of them."""
     rows = [
         (
@@ -129,10 +129,10 @@ def grids_table(report: Report, grids: Report) -> Shown:
     )  # fmt: skip
     heads = ("method", "best clear one good", "else missed by (m)", METRIC_WORDS["mean_average_precision"],
              "s per 600")  # fmt: skip
-    return Shown(f"Table III: {grids_line(grids)}", heads, rows)
+    return TitledTable(f"Table III: {grids_line(grids)}", heads, rows)
 
 
-def calibration_table(report: Report, told: Report) -> Shown:
+def calibration_table(report: Report, told: Report) -> TitledTable:
     """How far said probabilities can be believed; without rows where no method says any."""
     rows = [
         (record["name"], f"{said['brier']:.4f}", f"{said['expected_calibration_error']:.4f}")
@@ -140,10 +140,10 @@ def calibration_table(report: Report, told: Report) -> Shown:
         if (said := told["methods"][record["name"]])["brier"] is not None
     ]
     heads = ("method", "Brier score", "expected calibration error")
-    return Shown(f"probabilities ({told['candidates']})", heads, rows)
+    return TitledTable(f"probabilities ({told['candidates']})", heads, rows)
 
 
-def breakdown_tables(report: Report, told: Report, most_methods: int | None = None) -> Iterator[Shown]:
+def breakdown_tables(report: Report, told: Report, most_methods: int | None = None) -> Iterator[TitledTable]:
     """Accuracy by kinds of candidates, of so many methods."""
     names = [record["name"] for record in models_first(report["methods"])][:most_methods]
     for heading in dict.fromkeys(row["by"] for row in told["breakdown"]):
@@ -158,7 +158,7 @@ def breakdown_tables(report: Report, told: Report, most_methods: int | None = No
             if row["by"] == heading
         ]
         title = f"accuracy by {heading} ({told['candidates']})"
-        yield Shown(title, (heading, "count", "good", *names), rows)
+        yield TitledTable(title, (heading, "count", "good", *names), rows)
 
 
 def notes(report: Report) -> list[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datagen.console.printing import print_rows
 from datagen.evaluation_report import report_tables as tables
 from datagen.evaluation_report.number_format import Report
-from datagen.evaluation_report.report_tables import Shown
+from datagen.evaluation_report.report_tables import TitledTable
 
 _MOST_COLUMNS = 5  # of methods in a breakdown
 
@@ -42,6 +42,6 @@ def print_evaluation(report: Report) -> None:
     print_rows("notes", tables.notes(report))
 
 
-def _print(shown: Shown | None) -> None:
+def _print(shown: TitledTable | None) -> None:
     if shown is not None and shown.rows:
         print_rows(shown.title, shown.rows, shown.heads)

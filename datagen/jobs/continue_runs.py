@@ -12,7 +12,7 @@ from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detached_words
 from datagen.jobs.job import JobPlan, Work, carry_out
 from datagen.jobs.options import Placing, absolute_place, absolute_source
-from datagen.regeneration.shards import open_origin
+from datagen.regeneration.shards import open_sources
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import different_fields
@@ -48,7 +48,7 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
         problem = f"{run.storage.url} draws its own scenes"
         raise InputError("--scenes-from", given.scenes_from, problem, "Take --scenes-from out")
     _refuse_other_engines(run)
-    open_origin(run, given)
+    open_sources(run, given)
     refuse_unusable_engines(spec, address)
     return Work(
         run,
@@ -58,7 +58,7 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
     )
 
 
-def go_on(
+def continue_runs(
     place: Storage,
     name: str,
     works: Sequence[Work],

@@ -16,24 +16,24 @@ from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.executor import Executor
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_monitor import Watch
-from datagen.cluster.job_totals import JobSummary, Tally, no_work
+from datagen.cluster.job_monitor import JobMonitor
+from datagen.cluster.job_totals import JobSummary, JobTotals, empty_summary
 from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import RayExecutor, ray_executor
-from datagen.cluster.retry_policy import Policy, too_many_quarantined
-from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.retry_policy import RetryPolicy, too_many_quarantined
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import ShardTask
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
-from datagen.jobs.job_recorder import JobBoard
+from datagen.jobs.job_recorder import JobRecorder
 from datagen.jobs.options import Placing
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
-from datagen.schemas.record_files import now
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
@@ -67,12 +67,12 @@ class JobPlan:
 def carry_out(plan: JobPlan) -> int:
     """Make every missing shard, seal, and say how it went; the exit code.
 
-    While it works, the job is known in the place, and heeds requests to stop that are left there.
+    While it works, the job is known in the place, and handles requests to stop that are left there.
     """
     if not _count_missing(plan):
         for work in plan.works:
             close_lost_attempts(work.run)
-        return _finish(plan, _judged(plan, no_work()))
+        return _finish(plan, _judged(plan, empty_summary()))
     board = open_board(plan)
     try:
         summary = _judged(plan, make_missing(plan, board))
@@ -89,24 +89,24 @@ def carry_out(plan: JobPlan) -> int:
 def _end_of(error: BaseException) -> tuple[JobEnd, int]:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", 130
-    if isinstance(error, _CannotGoOn):
+    if isinstance(error, _CannotContinue):
         return "aborted", 2
     return "broken", 2 if isinstance(error, InputError) else 1
 
 
-def open_board(plan: JobPlan) -> JobBoard:
+def open_board(plan: JobPlan) -> JobRecorder:
     """Make the job known in its place."""
     record = JobRecord(
         id=new_job_id(),
         command=("datagen", *sys.argv[1:]),
         host=platform.node(),
         pid=os.getpid(),
-        started=now(),
+        started=utc_now(),
         address=plan.placing.address,
         submission=os.environ.get(SUBMISSION, ""),
         jobs_api=os.environ.get(JOBS_API, ""),
     )
-    board = JobBoard(Jobs(plan.place), record, _count_missing(plan))
+    board = JobRecorder(Jobs(plan.place), record, _count_missing(plan))
     board.begin()
     return board
 
@@ -115,12 +115,12 @@ def _count_missing(plan: JobPlan) -> int:
     return sum(len(work.run.missing()) for work in plan.works)
 
 
-def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
+def make_missing(plan: JobPlan, board: JobRecorder) -> JobSummary:
     """Drive one run after the other on one set of workers; how that ended."""
     missing = [work.run.missing() for work in plan.works]
     placing, stop = plan.placing, StopRequest()
-    policy = Policy(max_quarantined_share=placing.max_quarantined)
-    whole = no_work()
+    policy = RetryPolicy(max_quarantined_share=placing.max_quarantined)
+    whole = empty_summary()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
         shown = stack.enter_context(Progress(placing.json))
@@ -128,10 +128,10 @@ def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
         stack.enter_context(stop_on_signals(stop, interrupt=placing.workers == 0))
         for work, shards in zip(plan.works, missing, strict=True):
             if whole.end in ("interrupted", "aborted"):
-                whole = replace(whole, tally=whole.tally.plus(Tally(len(shards))))
+                whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
             elif shards:
                 whole = whole.plus(_drive(work, shards, executor, policy, board, stop, shown, notes))
-                board.add(whole.tally)
+                board.add(whole.totals)
         whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
     for work in plan.works:
         # What a killed driver left open is closed last: its workers may outlive it and still commit.
@@ -143,8 +143,8 @@ def _drive(
     work: Work,
     shards: Sequence[int],
     executor: Executor[ShardTask],
-    policy: Policy,
-    board: JobBoard,
+    policy: RetryPolicy,
+    board: JobRecorder,
     stop: StopRequest,
     shown: Progress,
     notes: str,
@@ -172,8 +172,8 @@ def _drive(
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     shown.phase("making labels")
-    events = Watch(board, stop, per_shard, JobProgress(shown, per_shard, done))
-    return drive(shards, make_task, executor, RunBooks(run), policy, events, stop)
+    events = JobMonitor(board, stop, per_shard, JobProgress(shown, per_shard, done))
+    return drive(shards, make_task, executor, RunRecorder(run), policy, events, stop)
 
 
 def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
@@ -188,7 +188,7 @@ def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
         shards = work.run.planned()
         planned += len(shards)
         given_up += sum(shard in shards for shard in work.run.quarantined())
-    policy = Policy(max_quarantined_share=plan.placing.max_quarantined)
+    policy = RetryPolicy(max_quarantined_share=plan.placing.max_quarantined)
     failed = too_many_quarantined(policy, given_up, planned)
     return replace(summary, end="failed" if failed else "complete")
 
@@ -203,26 +203,26 @@ def _executor(placing: Placing, shards: int, stack: ExitStack, shown: Progress) 
     return stack.enter_context(ray_executor(run_attempt, ray_settings))
 
 
-class _CannotGoOn(InputError):
+class _CannotContinue(InputError):
     """The job met what no retry cures."""
 
 
 def _finish(plan: JobPlan, summary: JobSummary) -> int:
     """Seal what there is, say how it went and how to go on; return the exit code."""
-    tally, runs, name = summary.tally, [work.run for work in plan.works], plan.name
+    totals, runs, name = summary.totals, [work.run for work in plan.works], plan.name
     n, resume = sum(run.n for run in runs), command_line(plan.resume)
     given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
-    if tally.shards:
-        labels = f"{tally.labels:,} new, {n:,} wanted"
+    if totals.shards:
+        labels = f"{totals.labels:,} new, {n:,} wanted"
     elif given_up:
         labels = f"nothing to do: the shards of {n:,} labels are made or given up"
     else:
         labels = f"nothing to do: all {n:,} labels are there"
     rows = [
         ("labels", labels),
-        ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
+        ("positive", f"{100 * totals.positives / totals.labels:.1f}%" if totals.labels else "-"),
         ("time", _time(summary)),
-        ("retries", str(tally.retries)),
+        ("retries", str(totals.retries)),
     ]
     if given_up:
         again = command_line(["resume", name, "--quarantined"])
@@ -234,7 +234,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
     print_rows(f"{summary.end}: {name}", rows)
     if summary.end == "aborted":
-        raise _CannotGoOn(name, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
+        raise _CannotContinue(name, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
     if summary.end == "failed":
         causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
         most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
@@ -246,8 +246,8 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
 
 
 def _time(summary: JobSummary) -> str:
-    if not summary.tally.labels:
+    if not summary.totals.labels:
         return seconds(summary.start_s + summary.elapsed_s)
-    rate = summary.tally.labels / max(summary.elapsed_s, 1e-6)
+    rate = summary.totals.labels / max(summary.elapsed_s, 1e-6)
     parts = f"start {seconds(summary.start_s)}, labels {seconds(summary.elapsed_s)}"
     return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts} at {rate:,.0f}/s"

@@ -1,18 +1,18 @@
-"""The records that a job keeps of itself in its place: they inform, and never stop the work."""
+"""Writes the status records of a job, and reads requests to stop it. Errors here never stop the work."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 
-from datagen.cluster.job_monitor import Standing, Wish
-from datagen.cluster.job_totals import End, JobSummary, Tally
+from datagen.cluster.job_monitor import JobStatus, StopMode
+from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState
-from datagen.schemas.record_files import now
+from datagen.schemas.record_files import utc_now
 
 
-class JobBoard:
-    """The board of one job over one run or several. `shards` are all that it has to make.
+class JobRecorder:
+    """The status records of one job over one run or several. `shards` are all that it has to make.
 
     A state that cannot be written, or a request that cannot be read, is passed over: what is wrong with
     the store is said by the commits.
@@ -20,34 +20,34 @@ class JobBoard:
 
     def __init__(self, jobs: Jobs, record: JobRecord, shards: int) -> None:
         self._jobs, self._record, self._shards = jobs, record, shards
-        self._before = Tally(0)  # of the runs that this job is through with
-        self._last = JobState(id=record.id, updated=now(), phase="starting", shards=shards)
+        self._before = JobTotals(0)  # of the runs that this job is through with
+        self._last = JobState(id=record.id, updated=utc_now(), phase="starting", shards=shards)
 
     def begin(self) -> None:
         """Make the job known. InputError where that cannot be written: then nothing could."""
         self._jobs.begin(self._record)
         self._put(self._last)
 
-    def add(self, tally: Tally) -> None:
-        """One run is done; `tally` is the job's up to here."""
-        self._before = tally
+    def add(self, totals: JobTotals) -> None:
+        """One run is done; `totals` is the job's up to here."""
+        self._before = totals
 
-    def tell(self, standing: Standing) -> None:
-        tally = self._before.plus(standing.tally)
+    def publish(self, status: JobStatus) -> None:
+        totals = self._before.plus(status.totals)
         self._put(
             self._last.model_copy(
                 update={
-                    **_counts(tally),
-                    "updated": now(),
+                    **_counts(totals),
+                    "updated": utc_now(),
                     "phase": "making",
-                    "labels_per_s": standing.labels_per_s,
-                    "left_s": standing.left_s,
-                    "stopping": standing.stopping,
+                    "labels_per_s": status.labels_per_s,
+                    "left_s": status.left_s,
+                    "stopping": status.stopping,
                 }
             )
         )
 
-    def wish(self) -> Wish | None:
+    def stop_requested(self) -> StopMode | None:
         with suppress(InputError):
             if (order := self._jobs.stop_order(self._record.id)) is not None:
                 return "force" if order.now else "drain"
@@ -55,12 +55,12 @@ class JobBoard:
 
     def seal(self) -> None:
         """Say that the shards are made and the store is laid."""
-        self._put(self._last.model_copy(update={"updated": now(), "phase": "sealing", "in_flight": 0}))
+        self._put(self._last.model_copy(update={"updated": utc_now(), "phase": "sealing", "in_flight": 0}))
 
     def end(self, end: JobEnd | End, code: int, cause: str, summary: JobSummary | None = None) -> None:
         """Say how the job ended."""
         update = {
-            "updated": now(),
+            "updated": utc_now(),
             "phase": "ended",
             "end": end,
             "exit_code": code,
@@ -69,21 +69,21 @@ class JobBoard:
             "left_s": None,
         }
         if summary is not None:
-            rate = summary.tally.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
-            update |= {**_counts(summary.tally), "in_flight": 0, "labels_per_s": rate}
+            rate = summary.totals.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
+            update |= {**_counts(summary.totals), "in_flight": 0, "labels_per_s": rate}
         self._put(self._last.model_copy(update=update))
 
     def _put(self, state: JobState) -> None:
         self._last = state
         with suppress(InputError):
-            self._jobs.tell(state)
+            self._jobs.put_state(state)
 
 
-def _counts(tally: Tally) -> dict[str, int]:
+def _counts(totals: JobTotals) -> dict[str, int]:
     return {
-        "done": tally.finished,
-        "in_flight": tally.in_flight,
-        "labels": tally.labels,
-        "retries": tally.retries,
-        "quarantined": tally.quarantined,
+        "done": totals.finished,
+        "in_flight": totals.in_flight,
+        "labels": totals.labels,
+        "retries": totals.retries,
+        "quarantined": totals.quarantined,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.console.printing import counted, seconds
-from datagen.schemas.jobs import Job, Jobs
+from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import Storage
 
 
@@ -14,7 +14,7 @@ def jobs_report(place: Storage) -> list[dict[str, Any]]:
     return [job_report(job) for job in Jobs(place).all()]
 
 
-def job_report(job: Job) -> dict[str, Any]:
+def job_report(job: StoredJob) -> dict[str, Any]:
     """One job: its record, its last state, and whether it lives."""
     record, state = job.record, job.state
     told = state.model_dump(mode="json", exclude={"format_version", "id"}) if state else {}
@@ -27,7 +27,7 @@ def job_report(job: Job) -> dict[str, Any]:
     }
 
 
-def health_line(job: Job) -> str:
+def health_line(job: StoredJob) -> str:
     """One line: who it is, how it is."""
     record, state, health = job.record, job.state, job.health()
     where = f"{record.host}, process {record.pid}"

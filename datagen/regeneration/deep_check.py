@@ -12,7 +12,7 @@ from itertools import groupby
 import numpy as np
 
 from datagen.regeneration.scenes import Replayer, chosen_rows, open_replayer, what_differs_here
-from datagen.regeneration.shards import Origin
+from datagen.regeneration.shards import OpenedSources
 from datagen.regeneration.stage_comparison import (
     DRAWN,
     RECOMPUTED,
@@ -32,7 +32,7 @@ _MEND = "Trust neither it nor its neighbours: find out what made it"
 _TRIED = 4
 
 
-def deep_findings(run: Run, k: int, origin: Origin, rng: np.random.Generator) -> Iterator[Finding]:
+def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Generator) -> Iterator[Finding]:
     """What is wrong with k random committed samples and k random committed scenes of a run.
 
     The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.

@@ -11,7 +11,7 @@ import numpy as np
 
 from datagen.cluster.attempt_guard import this_host
 from datagen.configuration.specify import label_engines, scene_engines
-from datagen.regeneration.shards import Origin, source_of
+from datagen.regeneration.shards import OpenedSources, source_of
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
@@ -19,8 +19,8 @@ from datagen.schemas.run import Run
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.run_shard import Columns, candidate_columns, scene_row
-from datagen.workers.scenes.generate import draw_scene
-from datagen.workers.scenes.reconstruct import recall_candidates, recall_scene
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import World, assemble_world
 
@@ -44,13 +44,13 @@ class Replayer:
         """
         if self.drawing is None:
             raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _MEND)
-        drawn, candidates = draw_scene(self.drawing, scene, StageClock())
+        drawn, candidates = generate_scene(self.drawing, scene, StageClock())
         plain = scene_row(drawn)
         fields = self.run.schema.scene_fields
         record = {f.name: np.array(plain[f.name], object if f.is_text else f.dtype) for f in fields}
         settled: SettledScene = drawn
         if self.drawing is not self.world:  # another run drew it: it reaches the labels as a record
-            settled = recall_scene(self.world, record)
+            settled = reconstruct_scene(self.world, record)
         chosen = range(len(candidates)) if rows is None else rows
         return SceneRows(record, self._samples(settled, candidates, chosen))
 
@@ -59,8 +59,8 @@ class Replayer:
 
         InputError where the record names what is not there, or poses that nothing can have.
         """
-        scene = recall_scene(self.world, stored.record)
-        candidates = recall_candidates(stored.samples, scene)
+        scene = reconstruct_scene(self.world, stored.record)
+        candidates = reconstruct_candidates(stored.samples, scene)
         return SceneRows(stored.record, self._samples(scene, candidates, rows))
 
     def _samples(self, scene: SettledScene, candidates: SceneCandidates, rows: Sequence[int]) -> Columns:
@@ -75,7 +75,7 @@ _NO_DRAWING = "the run that drew the scenes is not there any more"
 _MEND = "Give --scenes-from the run that drew them"
 
 
-def open_replayer(run: Run, origin: Origin) -> Replayer:
+def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     """A run opened to make its scenes again from its origin, where whatever drew them is there."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:

@@ -14,14 +14,14 @@ from datagen.workers.world import World, open_world
 
 
 @dataclass(frozen=True, eq=False)
-class Origin:
+class OpenedSources:
     """What a run's shards are made from, opened."""
 
     world: World
     scenes: Run | None  # the run whose scenes are labelled again
 
 
-def open_origin(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> Origin:
+def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> OpenedSources:
     """Open the run's sources: those given, or else where the run found them.
 
     InputError where they are not there any more, or are not those that the run was made from. Without
@@ -33,13 +33,13 @@ def open_origin(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) 
         spec, given.houses or known.get("houses", "builtin"), given.objects or known.get("objects", "builtin")
     )
     if spec.scenes_from is None:
-        return Origin(world, None)
+        return OpenedSources(world, None)
     try:
-        return Origin(world, source_of(run, given))
+        return OpenedSources(world, source_of(run, given))
     except InputError:
         if needs_scenes or given.scenes_from is not None:
             raise
-        return Origin(world, None)
+        return OpenedSources(world, None)
 
 
 def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
@@ -54,7 +54,7 @@ def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
     return source
 
 
-def remake(run: Run, shard: int, origin: Origin) -> ShardResult:
+def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
     """The shard's rows, computed anew. Raises whatever the computation does."""
     first = shard * run.layout.scenes_per_shard
     scenes = range(first, first + run.layout.scenes_per_shard)
@@ -62,6 +62,6 @@ def remake(run: Run, shard: int, origin: Origin) -> ShardResult:
     return run_shard(run.manifest.spec, origin.world, scenes, stored, run.schema.version)
 
 
-def remade_files(run: Run, made: ShardResult) -> dict[str, bytes]:
+def regenerated_files(run: Run, made: ShardResult) -> dict[str, bytes]:
     """The shard's files, by path in its attempt's folder, as an attempt writes them."""
     return encode_shard(run.schema, run.layout, run.manifest.spec_hash, made.scene, made.sample)

@@ -10,7 +10,7 @@ from hashlib import sha256
 from typing import Any
 
 from datagen.console.printing import print_json, print_lines, print_rows
-from datagen.regeneration.shards import Origin, remade_files, remake
+from datagen.regeneration.shards import OpenedSources, regenerate_shard, regenerated_files
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
@@ -21,7 +21,7 @@ class ShardFailed(Exception):
     """A replayed shard broke one of its own rules. Not input that is wrong, so it keeps its traceback."""
 
 
-def replay_shard(place: str, run: Run, shard: int, origin: Origin, json: bool = False) -> int:
+def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: bool = False) -> int:
     """Print what is known of the shard's failures, and make it again; the exit code.
 
     Whatever the computation raises leaves this function as it is, or with `ShardFailed` around an
@@ -57,9 +57,9 @@ def replay_shard(place: str, run: Run, shard: int, origin: Origin, json: bool = 
     return 1 if differing else 0
 
 
-def _make(run: Run, shard: int, origin: Origin) -> ShardResult:
+def _make(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
     try:
-        return remake(run, shard, origin)
+        return regenerate_shard(run, shard, origin)
     except InputError as error:
         # The command line would make one line of it, and the defect is where it was raised.
         raise ShardFailed(str(error)) from error
@@ -73,7 +73,7 @@ def _differing_files(run: Run, shard: int, made: ShardResult) -> list[str] | Non
     if shard not in run.committed():
         return None
     entries = {entry.path: entry.sha256 for entry in run.commit_of(shard).files}
-    files = {path: sha256(data).hexdigest() for path, data in remade_files(run, made).items()}
+    files = {path: sha256(data).hexdigest() for path, data in regenerated_files(run, made).items()}
     return sorted(path for path in {*entries, *files} if entries.get(path) != files.get(path))
 
 

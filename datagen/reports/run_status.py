@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from datagen.cluster.retry_policy import Policy
+from datagen.cluster.retry_policy import RetryPolicy
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
@@ -20,15 +20,15 @@ _SHOWN = 20  # causes and stacks
 _GOOD = ("committed", "superseded", "cancelled")
 # Of what a shard may spend in one job; crash, hang and failure have one budget together.
 _BUDGETS: dict[Outcome, int] = {
-    "failed": Policy.max_failures,
-    "crashed": Policy.max_failures,
-    "hung": Policy.max_failures,
-    "out_of_memory": Policy.max_out_of_memory,
-    "lost": Policy.max_lost,
+    "failed": RetryPolicy.max_failures,
+    "crashed": RetryPolicy.max_failures,
+    "hung": RetryPolicy.max_failures,
+    "out_of_memory": RetryPolicy.max_out_of_memory,
+    "lost": RetryPolicy.max_lost,
 }
 
 
-def place_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
+def runs_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
     """The state of the run at a place, or of several that were merged: their sums, and each under `parts`."""
     runs, root = open_runs(place), sealed_root(place)
     reports = [status_report(run, root, stacks) for run in runs]

@@ -47,7 +47,7 @@ class Account:
 
 
 @dataclass
-class Books:
+class Spending:
     """All that was paid for a set of runs, split into what became data and what did not."""
 
     labels: int = 0
@@ -70,26 +70,26 @@ class Books:
         return self.useful.wall_s + sum(a.wall_s for a in self.waste.values())
 
 
-def account_for(runs: Iterable[Run]) -> Books:
+def account_for(runs: Iterable[Run]) -> Spending:
     """Read commits and ledgers. A committed attempt is counted from its commit, once.
 
     The ledger's other entries are waste by their outcome: ledger = commits + waste. An attempt
     whose commit exists and whose ledger entry does not (the driver died between the two) is useful
     all the same.
     """
-    books = Books()
+    spending = Spending()
     for run in runs:
         summaries, committed = Summaries(run), set[str]()
         for commit in summaries.commits():
             committed.add(commit.attempt)
-            books.labels += commit.samples
-            books.positives += commit.positives
-            books.scenes += commit.scenes
-            books.redraws.update(commit.redraws)
-            books.useful.add(commit.cost)
-            books.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
+            spending.labels += commit.samples
+            spending.positives += commit.positives
+            spending.scenes += commit.scenes
+            spending.redraws.update(commit.redraws)
+            spending.useful.add(commit.cost)
+            spending.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
         for entry in summaries.ends():
             if entry.attempt not in committed:
-                books.waste.setdefault(entry.outcome, Account()).add(entry.cost)
-        books.running += sum(start.attempt not in committed for start in summaries.unfinished())
-    return books
+                spending.waste.setdefault(entry.outcome, Account()).add(entry.cost)
+        spending.running += sum(start.attempt not in committed for start in summaries.unfinished())
+    return spending

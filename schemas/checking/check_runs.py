@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from datagen.schemas.checking.commits import check_account, check_commit
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.ledger import Books, check_quarantine, check_rest
+from datagen.schemas.checking.ledger import LedgerTotals, check_quarantine, check_rest
 from datagen.schemas.checking.roots import below, check_notes, check_plans, open_roots
 from datagen.schemas.checking.sealed import (
     SealedSlice,
@@ -19,7 +19,7 @@ from datagen.schemas.checking.sealed import (
     slices_of,
 )
 from datagen.schemas.checking.shards import ShardForm, check_shard, form_of
-from datagen.schemas.concurrent_map import in_order
+from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
@@ -38,12 +38,12 @@ class Checked:
     bytes: int = 0
     samples: int = 0
     is_sealed: bool = False
-    books: Books = field(default_factory=Books)
+    totals: LedgerTotals = field(default_factory=LedgerTotals)
     runs: list[Run] = field(default_factory=list[Run])
 
 
 @dataclass(frozen=True, eq=False)
-class _Subject:
+class _CheckedRun:
     """One run of the place, and what all checks of its shards share."""
 
     place: Storage
@@ -54,7 +54,7 @@ class _Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class _Looked:
+class _CheckedShard:
     """What came of one shard."""
 
     shard: int
@@ -62,7 +62,7 @@ class _Looked:
     findings: list[Finding]
 
 
-def check_place(
+def check_runs(
     place: Storage, checked: Checked, seen: Callable[[int, int], None] = lambda done, total: None
 ) -> Iterator[Finding]:
     """Everything that is wrong at `place`, as it is found.
@@ -92,9 +92,11 @@ def check_place(
         for run, shards in work:
             prefix = roots.folder_of(run)
             slice_ = slices.get(run.manifest.spec_hash)
-            subject = _Subject(place, run, prefix, form_of(run), slice_)
+            subject = _CheckedRun(place, run, prefix, form_of(run), slice_)
             committed: dict[int, str] = {}
-            for looked in in_order(pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards):
+            for looked in concurrent_map(
+                pool, 2 * threads, lambda shard, s=subject: _look_at(s, shard), shards
+            ):
                 yield from looked.findings
                 if slice_ is not None and looked.shard in slice_.positions:
                     tally.add(run, slice_, looked.shard, looked.commit, bool(looked.findings))
@@ -113,7 +115,7 @@ def _shards_of(run: Run, slice_: SealedSlice | None) -> list[int]:
     return sorted(run.committed() | (slice_.positions.keys() if slice_ else set()))
 
 
-def _look_at(subject: _Subject, shard: int) -> _Looked:
+def _look_at(subject: _CheckedRun, shard: int) -> _CheckedShard:
     """One shard: its commit, its account, its files and rows, its chunks in the sealed store."""
     run, prefix = subject.run, subject.prefix
     folder = f"shards/{shard:06d}"
@@ -121,7 +123,7 @@ def _look_at(subject: _Subject, shard: int) -> _Looked:
         listed = {file.key: file for file in run.storage.list(folder)}
     except InputError as error:  # something in it is no file: nothing there is trusted
         key = error.place.removeprefix(f"{run.storage.url}/")
-        return _Looked(
+        return _CheckedShard(
             shard, None, [below(prefix, Finding(key, "foreign", error.problem, error.mend, shard))]
         )
     found = check_commit(run, shard, listed)
@@ -133,15 +135,15 @@ def _look_at(subject: _Subject, shard: int) -> _Looked:
     findings = [below(prefix, finding) for finding in findings]
     if commit is not None and subject.slice_ is not None and shard in subject.slice_.positions:
         findings += check_chunks(subject.place, prefix, run, subject.form, subject.slice_, commit)
-    return _Looked(shard, commit, findings)
+    return _CheckedShard(shard, commit, findings)
 
 
-def _rest(subject: _Subject, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:
+def _rest(subject: _CheckedRun, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:
     """What is left of a run after its shards: the waste in the ledger, lost commits, the quarantine."""
-    run, prefix, books = subject.run, subject.prefix, checked.books
-    books.lost_shards = {}
-    yield from (below(prefix, finding) for finding in check_rest(run, committed, books))
-    for shard in sorted(books.lost_shards.keys() - set(_shards_of(run, subject.slice_))):
+    run, prefix, totals = subject.run, subject.prefix, checked.totals
+    totals.lost_shards = {}
+    yield from (below(prefix, finding) for finding in check_rest(run, committed, totals))
+    for shard in sorted(totals.lost_shards.keys() - set(_shards_of(run, subject.slice_))):
         looked = _look_at(subject, shard)
         yield from looked.findings
         if looked.commit is not None:
@@ -154,5 +156,5 @@ def _count(checked: Checked, commit: Commit) -> None:
     checked.files += len(commit.files)
     checked.bytes += sum(entry.size for entry in commit.files)
     checked.samples += commit.samples
-    checked.books.attempts += 1
-    checked.books.committed_wall_s += commit.cost.wall_s
+    checked.totals.attempts += 1
+    checked.totals.committed_wall_s += commit.cost.wall_s

@@ -10,7 +10,7 @@ from datagen.schemas.checking.finding import Finding, Restore, curable
 from datagen.schemas.checking.records import read
 from datagen.schemas.ledger import lost_end, start_from_end
 from datagen.schemas.quarantine import name_before
-from datagen.schemas.record_files import encode_record, now
+from datagen.schemas.record_files import encode_record, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
 
@@ -18,7 +18,7 @@ _GONE = "Restore the file from a backup; or remove it: its attempt then counts a
 
 
 @dataclass
-class Books:
+class LedgerTotals:
     """Wall seconds as the records have them: the ledger's must be the commits' and the waste's."""
 
     committed_wall_s: float = 0.0
@@ -29,8 +29,8 @@ class Books:
     lost_shards: dict[int, str] = field(default_factory=dict[int, str])  # committed by the ledger alone
 
 
-def check_rest(run: Run, committed: Mapping[int, str], books: Books) -> Iterator[Finding]:
-    """Every ledger record but those of `committed` attempts (shard -> attempt); adds to the books."""
+def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> Iterator[Finding]:
+    """Every ledger record but those of `committed` attempts (shard -> attempt); adds to the totals."""
     names: set[str] = set()
     for file in run.storage.list("ledger"):
         name = file.key.removeprefix("ledger/")
@@ -43,19 +43,19 @@ def check_rest(run: Run, committed: Mapping[int, str], books: Books) -> Iterator
     starts = {name.removesuffix(".start") for name in names if name.endswith(".start")}
     quarantined = run.quarantined()
     for attempt in sorted(ends - done):
-        yield from _check_end(run, attempt, attempt in starts, committed, books)
+        yield from _check_end(run, attempt, attempt in starts, committed, totals)
     for attempt in sorted(starts - ends - done):
-        yield from _check_unfinished(run, attempt, committed, quarantined, books)
+        yield from _check_unfinished(run, attempt, committed, quarantined, totals)
 
 
 def _check_end(
-    run: Run, attempt: str, has_start: bool, committed: Mapping[int, str], books: Books
+    run: Run, attempt: str, has_start: bool, committed: Mapping[int, str], totals: LedgerTotals
 ) -> Iterator[Finding]:
     end = read(run.storage, f"ledger/{attempt}.json", LedgerEntry, lambda e: _misnamed(e.attempt, attempt))
     start = read(
         run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
     )
-    books.attempts += 1
+    totals.attempts += 1
     if end.record is None:
         yield Finding(end.key, "account", end.problem, _GONE)
         if start.record is None:
@@ -67,29 +67,29 @@ def _check_end(
     if odd := odd_cost(noted.cost):
         mend = "Look at what wrote it: the record is as it was written"
         yield Finding(end.key, "account", odd, mend, noted.shard)
-    books.without_account += noted.cost is None
-    books.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
+    totals.without_account += noted.cost is None
+    totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
     if noted.outcome == "committed" and noted.shard not in committed:
-        books.lost_shards[noted.shard] = attempt
+        totals.lost_shards[noted.shard] = attempt
 
 
 def _check_unfinished(
-    run: Run, attempt: str, committed: Mapping[int, str], quarantined: set[int], books: Books
+    run: Run, attempt: str, committed: Mapping[int, str], quarantined: set[int], totals: LedgerTotals
 ) -> Iterator[Finding]:
     start = read(
         run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
     )
-    books.attempts += 1
+    totals.attempts += 1
     if start.record is None:
         yield Finding(start.key, "account", start.problem, _GONE)
     elif start.record.shard in committed or start.record.shard in quarantined:
         shard = start.record.shard
         problem = "missing, though its shard is decided; what it cost is lost"
-        books.without_account += 1
-        cure = Restore(encode_record(lost_end(start.record, now())), is_guess=True)
+        totals.without_account += 1
+        cure = Restore(encode_record(lost_end(start.record, utc_now())), is_guess=True)
         yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
     else:
-        books.unfinished += 1
+        totals.unfinished += 1
 
 
 def check_quarantine(run: Run) -> Iterator[Finding]:

@@ -11,12 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
-from datagen.schemas.checking.check_runs import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding, Remake, Reseal, Restore
 from datagen.schemas.checking.roots import open_roots
 from datagen.schemas.checking.sealed import SealedSlice, read_root, slices_of
 from datagen.schemas.checking.shards import form_of
-from datagen.schemas.concurrent_map import in_order
+from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry
@@ -37,7 +37,7 @@ Seen = Callable[[int, int], None]
 
 
 @dataclass
-class Mended:
+class Repaired:
     """What a mending did, and what it left."""
 
     records: list[str] = field(default_factory=list[str])  # keys that were put, by what they were put from
@@ -57,16 +57,16 @@ class Mended:
         return {*self.records, *self.copied_files, *self.remade_files, *self.sealed_files}
 
 
-def mend_place(
+def repair_runs(
     place: Storage, remake: RemakeShard, workers: int = 1, seen: Seen = lambda done, total: None
-) -> Mended:
+) -> Repaired:
     """Check the place, mend what can be mended, and check again until nothing more can be.
 
     `remake` gives all files of a shard by path, and raises where it cannot; several shards are made at a
     time with more `workers`. A remade file is written only where it has the committed digest, and only
-    where all bad files of its shard have. What is left is in the result. InputError as `check_place`.
+    where all bad files of its shard have. What is left is in the result. InputError as `check_runs`.
     """
-    mended = Mended()
+    mended = Repaired()
     before = {file.key: _state(file) for file in place.list("")}
     refused: dict[str, str] = {}  # key -> why; not tried twice
     for _ in range(_PASSES):
@@ -96,14 +96,14 @@ def _is_ours(key: str, written: Container[str], resealed: bool) -> bool:
 
 
 def _pass(
-    place: Storage, remake: RemakeShard, workers: int, seen: Seen, mended: Mended, refused: dict[str, str]
+    place: Storage, remake: RemakeShard, workers: int, seen: Seen, mended: Repaired, refused: dict[str, str]
 ) -> bool:
     """Check once and mend what is found; whether anything was mended."""
     mended.checked, mended.left = Checked(), []
     bad: dict[tuple[str, int], list[Finding]] = {}
     sealed: list[Finding] = []
     done = False
-    for finding in check_place(place, mended.checked, seen):
+    for finding in check_runs(place, mended.checked, seen):
         cure = finding.cure
         if isinstance(cure, Restore):
             done |= _put(place, finding, cure.data, mended.records, mended, refused, cure.is_guess)
@@ -137,7 +137,7 @@ def _put(
     finding: Finding,
     data: bytes,
     noted: list[str],
-    mended: Mended,
+    mended: Repaired,
     refused: dict[str, str],
     is_guess: bool = False,
 ) -> bool:
@@ -164,7 +164,7 @@ def _mend_files(
     remake: RemakeShard,
     workers: int,
     bad: Mapping[tuple[str, int], list[Finding]],
-    mended: Mended,
+    mended: Repaired,
     refused: dict[str, str],
 ) -> int:
     """Files of shards from the sealed store, from their schema, or remade; how many were put."""
@@ -250,7 +250,7 @@ def _remade(
         return
     with ThreadPoolExecutor(workers) as pool:
         # So many results in memory, and no more.
-        for one, files in zip(shards, in_order(pool, workers, make, shards), strict=True):
+        for one, files in zip(shards, concurrent_map(pool, workers, make, shards), strict=True):
             yield (*one, files)
 
 
@@ -264,7 +264,7 @@ def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:
     return ""
 
 
-def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refused: dict[str, str]) -> bool:
+def _mend_sealed(place: Storage, findings: list[Finding], mended: Repaired, refused: dict[str, str]) -> bool:
     """Mend the sealed store: as a whole where one rename does it, else file by file."""
     roots = {SEALED, f"{SEALED}/{ROOT}"}
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged_runs import open_runs, wanted
+from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
 from datagen.schemas.merging.resharding import common_layout
 from datagen.schemas.merging.writing import Written, begin_union, replace_record, write_union
@@ -106,7 +106,7 @@ def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
 
 def _seal(place: Storage) -> str:
     """Seal the place unless it is sealed as it stands."""
-    if not wanted(open_runs(place)).labels:
+    if not label_counts(open_runs(place)).labels:
         return ""
     root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
     if place.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:

@@ -144,7 +144,7 @@ def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
         run.check_files(commit)
         return commit
 
-    return run.storage.in_order(check, commits)
+    return run.storage.concurrent_map(check, commits)
 
 
 def _refuse_other_arrays(first: Run, run: Run) -> None:

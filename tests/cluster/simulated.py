@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from datagen.cluster.driver import Order
-from datagen.cluster.job_totals import Tally
+from datagen.cluster.job_totals import JobTotals
 from datagen.cluster.retry_policy import Trouble
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
@@ -115,8 +115,8 @@ class SimulatedExecutor:
 
 
 @dataclass
-class PaperBooks:
-    """Books that only count, and remember the commits that a test gives them."""
+class PaperRecorder:
+    """A recorder that only counts, and remember the commits that a test gives them."""
 
     keep_entries: bool = True
     entries: list[LedgerEntry] = field(default_factory=list)
@@ -145,13 +145,13 @@ class Heard:
 
     actions: list[tuple[int, str, str]] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
-    on_tick: Callable[[Tally], None] = lambda tally: None
+    on_tick: Callable[[JobTotals], None] = lambda totals: None
 
     def ended(self, report: AttemptReport, action: str) -> None:
         self.actions.append((report.shard, report.outcome, action))
 
-    def tick(self, tally: Tally) -> None:
-        self.on_tick(tally)
+    def tick(self, totals: JobTotals) -> None:
+        self.on_tick(totals)
 
     def stopping(self, reason: str) -> None:
         self.reasons.append(reason)

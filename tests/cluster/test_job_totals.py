@@ -6,11 +6,11 @@ from functools import reduce
 
 import pytest
 
-from datagen.cluster.job_totals import End, JobSummary, Tally, no_work
+from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
 
 
 def summary(end: End, cause: str = "", committed: int = 1) -> JobSummary:
-    return JobSummary(end, cause, Tally(shards=3, committed=committed, labels=10 * committed), 2.0)
+    return JobSummary(end, cause, JobTotals(shards=3, committed=committed, labels=10 * committed), 2.0)
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_a_job_over_several_runs_ends_as_the_worst_of_them(
     ends: tuple[End, ...], worst: End, code: int
 ) -> None:
     for order in (ends, ends[::-1]):
-        whole = reduce(JobSummary.plus, map(summary, order), no_work())
+        whole = reduce(JobSummary.plus, map(summary, order), empty_summary())
         assert (whole.end, whole.exit_code) == (worst, code)
 
 
@@ -36,16 +36,16 @@ def test_the_first_cause_of_the_worst_end_is_told() -> None:
 
 
 def test_sums_are_over_all_runs() -> None:
-    whole = no_work().plus(summary("complete", committed=3)).plus(summary("interrupted", committed=1))
-    assert (whole.tally.shards, whole.tally.committed, whole.tally.labels) == (6, 4, 40)
+    whole = empty_summary().plus(summary("complete", committed=3)).plus(summary("interrupted", committed=1))
+    assert (whole.totals.shards, whole.totals.committed, whole.totals.labels) == (6, 4, 40)
     assert (whole.remaining, whole.elapsed_s) == (2, 4.0)
-    assert (no_work().remaining, no_work().exit_code) == (0, 0)
+    assert (empty_summary().remaining, empty_summary().exit_code) == (0, 0)
 
 
 def test_only_the_first_shards_in_quarantine_are_named() -> None:
-    parts = [Tally(shards=30), Tally(shards=30)]
-    for tally in parts:
+    parts = [JobTotals(shards=30), JobTotals(shards=30)]
+    for totals in parts:
         for shard in range(30):
-            tally.count_quarantined(shard)
+            totals.count_quarantined(shard)
     both = parts[0].plus(parts[1])
     assert both.quarantined == 60 and both.quarantined_shards == list(range(20))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.preflight import Fitness, look_at, refuse_unfit_machines, versions_of
+from datagen.cluster.preflight import MachineReport, inspect_machine, refuse_unfit_machines, versions_of
 from datagen.cluster.task import ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -34,8 +34,8 @@ def one_machine(seen: ShardTask | None = None, **answered: Any) -> Ask:
     """A cluster of one other machine, which is this one, or sees other places, or answers as told."""
 
     def ask(function: Any, task: ShardTask, *arguments: Any, patience_s: float) -> dict[str, Any]:
-        assert function is look_at and patience_s > 0
-        return {"192.0.2.7 (node abc)": answered.get("finding") or look_at(seen or task, *arguments)}
+        assert function is inspect_machine and patience_s > 0
+        return {"192.0.2.7 (node abc)": answered.get("finding") or inspect_machine(seen or task, *arguments)}
 
     return ask
 
@@ -76,6 +76,6 @@ def test_a_machine_with_other_versions_is_named(run: Run) -> None:
     names = sorted(run.manifest.spec.engines)
     here = versions_of(names)
     assert here["numpy"] and here["scenes"] == ""
-    other = Fitness("", {**here, "numpy": "1.0"})
+    other = MachineReport("", {**here, "numpy": "1.0"})
     with pytest.raises(InputError, match=r"numpy: it has 1\.0, and this machine .* Install"):
         refuse_unfit_machines(one_machine(finding=other), run, task_of(run))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from datagen.cluster.retry_policy import (
     Durations,
-    Policy,
+    RetryPolicy,
     Trouble,
     deadline_s,
     decide,
@@ -23,7 +23,7 @@ from datagen.cluster.retry_policy import (
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Outcome
 
-POLICY = Policy()
+POLICY = RetryPolicy()
 
 
 def follow(outcomes: list[Outcome]) -> tuple[list[str], Trouble, list[float]]:

@@ -8,7 +8,7 @@ import pytest
 
 import datagen.cluster.run_recorder
 from datagen.cluster.retry_policy import Trouble
-from datagen.cluster.run_recorder import RunBooks, close_lost_attempts
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.summaries import index_files, refresh
@@ -27,7 +27,7 @@ def test_attempts_of_a_killed_driver_are_closed_once_their_shards_are_decided(tm
         run.ledger.start(attempt, shard)
     run.commit(write(run, 0, "by-the-next-driver"))
     run.commit(write(run, 1, "won-one"))
-    RunBooks(run).quarantine(3, TROUBLE)
+    RunRecorder(run).quarantine(3, TROUBLE)
     # Nobody knows yet whether the orphan will reach its commit.
     assert close_lost_attempts(run) == 3 and close_lost_attempts(run) == 0
     assert [start.attempt for start in run.ledger.unfinished()] == ["orphan"]
@@ -84,19 +84,19 @@ def test_the_index_follows_a_long_job_now_and_then(
     monkeypatch.setattr(datagen.cluster.run_recorder, "_INDEX_FACTOR", factor)
     monkeypatch.setattr(datagen.cluster.run_recorder, "_INDEX_EVERY", 3)
     run = make_run(tmp_path / "run", shards=())
-    books, indexed = RunBooks(run), list[bool]()
+    recorder, indexed = RunRecorder(run), list[bool]()
     for shard in range(3):
-        books.close(LedgerEntry(attempt=f"a-{shard}", shard=shard, outcome="failed"))
+        recorder.close(LedgerEntry(attempt=f"a-{shard}", shard=shard, outcome="failed"))
         indexed.append(bool(index_files(run)))
     assert indexed == [False, False, True]
     for shard in range(3):
-        books.close(LedgerEntry(attempt=f"b-{shard}", shard=shard, outcome="failed"))
+        recorder.close(LedgerEntry(attempt=f"b-{shard}", shard=shard, outcome="failed"))
     assert refresh(run) == left_out
 
 
 def test_a_shard_in_quarantine_can_be_run_alone(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", shards=())
-    RunBooks(run).quarantine(3, TROUBLE)
+    RunRecorder(run).quarantine(3, TROUBLE)
     (record,) = run.quarantine_records()
     assert (record.shard, record.seed, record.first_scene, record.scenes) == (3, 0, 6, 2)
     assert (record.attempts, record.causes, record.stacks) == (
@@ -112,9 +112,9 @@ def test_an_attempt_taken_for_lost_replaces_that_by_its_own_account(tmp_path: Pa
     run.ledger.start("slow", 0)
     run.commit(write(run, 0, "fast"))
     assert close_lost_attempts(run) == 1
-    books, cost = RunBooks(run), Cost(wall_s=7.0, cpu_s=6.0)
+    recorder, cost = RunRecorder(run), Cost(wall_s=7.0, cpu_s=6.0)
     for seconds in (7.0, 9.0):  # an account stands, whoever comes later
         told = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=seconds, cpu_s=6))
-        books.close(told)
+        recorder.close(told)
     (entry,) = run.ledger.ends()
     assert (entry.outcome, entry.cost) == ("superseded", cost)

@@ -12,8 +12,8 @@ from pathlib import Path
 from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
 from datagen.commands.gc import remove
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from datagen.schemas.checking.check_runs import Checked, check_place
-from datagen.schemas.checking.repair import mend_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
 from datagen.schemas.garbage_collection import find_garbage
@@ -129,7 +129,7 @@ def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
         f"{place}: {finding.key}: {finding.problem}"
         for place in places
         if (folder / place).exists()
-        for finding in check_place(open_storage(folder / place, probe=False), Checked())
+        for finding in check_runs(open_storage(folder / place, probe=False), Checked())
         if finding.is_damage
     ]
 
@@ -253,7 +253,7 @@ def _repair(folder: Path) -> None:
     def remake(run: Run, shard: int) -> Mapping[str, bytes]:
         return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, shard))
 
-    mended = mend_place(open_storage(folder, probe=False), remake)
+    mended = repair_runs(open_storage(folder, probe=False), remake)
     for finding in mended.left:
         raise InputError(finding.key, "", finding.problem, finding.mend)  # the command ends with 1
 

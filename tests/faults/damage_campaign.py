@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.schemas.checking.check_runs import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.repair import Mended, mend_place
+from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry
@@ -22,7 +22,7 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
-from tests.made_runs import make_run, now, rows_of
+from tests.made_runs import make_run, rows_of, utc_now
 
 # What has no second source: its loss is found, and cannot be undone bit for bit.
 _ALONE = ("ledger/", "quarantine/")
@@ -76,7 +76,7 @@ def make_place(
     """A sealed run of few files, whose ledger has waste too."""
     run = make_run(folder, n, scenes_per_shard, candidates_per_scene)
     run.ledger.start("b-0", 0)
-    run.ledger.end(LedgerEntry(attempt="b-0", shard=0, outcome="failed", cause="ValueError", ended=now()))
+    run.ledger.end(LedgerEntry(attempt="b-0", shard=0, outcome="failed", cause="ValueError", ended=utc_now()))
     seal(run.storage)
     return run
 
@@ -199,12 +199,12 @@ def _overwrite(path: Path, data: bytes) -> None:
 
 def findings_at(folder: Path) -> list[Finding]:
     """What checks find at a place."""
-    return list(check_place(open_storage(folder, probe=False, create=False), Checked()))
+    return list(check_runs(open_storage(folder, probe=False, create=False), Checked()))
 
 
-def mend_at(folder: Path) -> Mended:
+def mend_at(folder: Path) -> Repaired:
     """Mend a place of random rows."""
-    return mend_place(open_storage(folder, probe=False, create=False), remake)
+    return repair_runs(open_storage(folder, probe=False, create=False), remake)
 
 
 def _flipped(data: bytes, bit: int) -> bytes:

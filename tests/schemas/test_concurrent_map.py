@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.schemas.concurrent_map import in_order
+from datagen.schemas.concurrent_map import concurrent_map
 
 
 @given(st.integers(0, 30), st.integers(1, 5), st.integers(1, 9))
@@ -29,7 +29,7 @@ def test_results_come_in_order_and_items_are_taken_as_they_are_needed(
             yield i
 
     with ThreadPoolExecutor(threads) as pool:
-        for result in in_order(pool, most, lambda i: i * i, items()):
+        for result in concurrent_map(pool, most, lambda i: i * i, items()):
             assert result == given_back**2
             given_back += 1
     assert (taken, given_back) == (n, n)
@@ -71,7 +71,7 @@ def test_nothing_is_under_way_when_it_has_ended(by: str) -> None:
         return i
 
     with _Pool(2) as pool:
-        results = in_order(pool, 4, do, range(9))
+        results = concurrent_map(pool, 4, do, range(9))
         threading.Thread(target=lambda: pool.let_go_when_cancelled(let_end), daemon=True).start()
         if by == "failure":
             with pytest.raises(ValueError, match="the first"):

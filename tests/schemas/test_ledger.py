@@ -132,10 +132,10 @@ def test_the_books_add_up_what_was_wasted(run: Run) -> None:
     run.ledger.end(LedgerEntry(attempt="z", shard=0, outcome="lost"))
     run.ledger.start("open", 0)
     findings, checked = check(folder_of(run))
-    books = checked.books
+    totals = checked.totals
     assert findings == []
-    assert (books.attempts, books.without_account, books.unfinished) == (5, 1, 1)
-    assert (books.committed_wall_s, books.wasted_wall_s) == (1.0, 6.0)
+    assert (totals.attempts, totals.without_account, totals.unfinished) == (5, 1, 1)
+    assert (totals.committed_wall_s, totals.wasted_wall_s) == (1.0, 6.0)
 
 
 def test_attempts_without_an_end_are_lost_once_their_shards_are_decided(run: Run) -> None:
@@ -149,7 +149,7 @@ def test_attempts_without_an_end_are_lost_once_their_shards_are_decided(run: Run
         assert isinstance(finding.cure, Restore) and finding.cure.is_guess
         entry = restored(finding, LedgerEntry)
         assert entry == lost_end(starts[entry.attempt], entry.ended)
-    assert (checked.books.without_account, checked.books.unfinished) == (2, 1)
+    assert (checked.totals.without_account, checked.totals.unfinished) == (2, 1)
 
 
 def test_a_shard_that_the_ledger_alone_calls_committed_is_lost(run: Run) -> None:
@@ -159,7 +159,7 @@ def test_a_shard_that_the_ledger_alone_calls_committed_is_lost(run: Run) -> None
         run.ledger.start(attempt, shard)
         run.ledger.end(LedgerEntry(attempt=attempt, shard=shard, outcome=outcome, cost=COST))
     _, checked = check(folder_of(run))
-    assert checked.books.lost_shards == {0: "gone"}
+    assert checked.totals.lost_shards == {0: "gone"}
 
 
 def test_quarantine_records_that_are_half_written_or_lifted_are_no_damage(run: Run) -> None:

@@ -12,7 +12,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
-from datagen.schemas.merged_runs import find_scene, open_runs, wanted
+from datagen.schemas.merged_runs import find_scene, label_counts, open_runs
 from datagen.schemas.merging import Result, carry_out, plan_merge
 from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from datagen.schemas.record_files import read_record
@@ -72,7 +72,7 @@ def test_runs_of_several_specifications_become_a_place_of_parts(tmp_path: Path):
     runs = open_runs(tmp_path / "out")
     assert [run.manifest.spec_hash for run in runs] == sorted(small_spec(k).hash() for k in (0, 1))
     assert not (tmp_path / "out" / "manifest.json").exists()
-    found = wanted(runs)
+    found = label_counts(runs)
     assert (found.n, found.labels, found.missing) == (50, 40, 1)
     first = runs[0]
     assert find_scene(runs, 1) == (first, 1)
@@ -336,5 +336,5 @@ def test_merging_on_s3_gives_the_same_files(tmp_path: Path, bucket: str):
     assert {k: v for k, v in there.items() if not k.startswith("data.zarr")} == {
         k: v for k, v in here.items() if not k.startswith("data.zarr")
     }
-    assert wanted(open_runs(place)) == wanted(open_runs(tmp_path / "here"))
+    assert label_counts(open_runs(place)) == label_counts(open_runs(tmp_path / "here"))
     assert sealed_root(place) == sealed_root(open_storage(tmp_path / "here"))

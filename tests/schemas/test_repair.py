@@ -10,7 +10,7 @@ import pytest
 
 from datagen.schemas.checking import repair
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.repair import mend_place
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.keys import commit_copy_key, commit_key
 from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
 from datagen.schemas.run_records import Cost, LedgerEntry
@@ -28,7 +28,7 @@ def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
     for name in ("slow", "lost"):
         run.ledger.start(name, 0)
     account = LedgerEntry(attempt="slow", shard=0, outcome="superseded", cost=Cost(wall_s=7, cpu_s=5))
-    check = repair.check_place
+    check = repair.check_runs
 
     def and_the_driver_goes_on(*arguments: Any) -> Iterator[Finding]:
         for finding in check(*arguments):
@@ -36,8 +36,8 @@ def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
                 assert run.ledger.end(account)
             yield finding
 
-    monkeypatch.setattr(repair, "check_place", and_the_driver_goes_on)
-    mended = mend_place(run.storage, never)
+    monkeypatch.setattr(repair, "check_runs", and_the_driver_goes_on)
+    mended = repair_runs(run.storage, never)
     assert (mended.records, mended.left) == (["ledger/lost.json"], [])
     assert run.ledger.end_of("slow") == account
     end = run.ledger.end_of("lost")
@@ -59,7 +59,7 @@ def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
         run.storage.put("new.txt", b"1")
         run.storage.delete(["gone.txt"])
 
-    mended = mend_place(run.storage, never, 1, others)
+    mended = repair_runs(run.storage, never, 1, others)
     assert mended.records == [] and sorted(mended.changed) == ["gone.txt", "other.txt"]
     assert mended.untouched == files - 2
 
@@ -70,6 +70,6 @@ def test_of_several_copies_the_one_of_the_ledgers_winner_restores_a_commit(tmp_p
         run.storage.put(commit_copy_key(1, name), encode_record(write(run, 1, name)))
     whole = run.storage.get(commit_key(1), MAX_RECORD_BYTES)
     run.storage.delete([commit_key(1)])
-    mended = mend_place(run.storage, never)
+    mended = repair_runs(run.storage, never)
     assert (mended.records, mended.left) == ([commit_key(1)], [])
     assert run.storage.get(commit_key(1), MAX_RECORD_BYTES) == whole

@@ -39,7 +39,7 @@ class RobotSize:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class BaseCells:
     """N base positions around the target, with what stands there."""
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
@@ -47,7 +47,7 @@ class Places:
     floor_seen: F64  # (N,), share of the floor under the base that was seen
 
 
-def look_at_places(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> Places:
+def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> BaseCells:
     """The grid around the target, each place blocked, clear or unseen.
 
     Blocked where observed points lie within the base's radius between the floor and a board's thickness
@@ -69,7 +69,7 @@ def look_at_places(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Ca
     share = _floor_share(seen.points_m[is_floor], base_xy, params.base_radius_m)
     state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
     state[~blocked & (share >= SEEN_SHARE)] = STATES.index(CLEAR)
-    return Places(offsets.astype(np.float32), state, share)
+    return BaseCells(offsets.astype(np.float32), state, share)
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:

@@ -17,10 +17,10 @@ from datagen.train.prediction.base_cells import (
     CLEAR,
     STATES,
     UNSEEN,
-    Places,
+    BaseCells,
     RobotSize,
     facing_yaw,
-    look_at_places,
+    observe_cells,
     seen_share,
 )
 from datagen.train.prediction.frames import SensorFrame, image_frame
@@ -50,7 +50,7 @@ class Prediction:
     target: TargetBox
     filled: Filled | None  # None where no mask was given or clicked
     cloud: Cloud
-    places: Places
+    places: BaseCells
     score: F64  # (N,)
     best: int | None  # the best of those that may be chosen; None where there is none
     notes: tuple[str, ...]
@@ -183,7 +183,7 @@ def predict(
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
-    places = look_at_places(seen, centre, robot, _grid(grid, half_width_m))
+    places = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
     score = scored(scorer, _batch(cloud, target, robot, places))
     best = _best(score, places, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
     notes = _notes(grounds, filled, cloud)
@@ -264,7 +264,7 @@ def _grid(cells: int, half_width_m: float) -> CandidateParams:
     return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
 
 
-def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) -> Batch[Array]:
+def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: BaseCells) -> Batch[Array]:
     """The places as a scorer takes them; `base_is_clear` says what was seen to stand in the way."""
     n = len(places.offset_m)
 
@@ -293,7 +293,7 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) ->
     )
 
 
-def _best(score: F64, places: Places, allowed: Sequence[str]) -> int | None:
+def _best(score: F64, places: BaseCells, allowed: Sequence[str]) -> int | None:
     rows = np.flatnonzero(np.isin(places.state, [STATES.index(name) for name in allowed]))
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
 

@@ -11,7 +11,7 @@ from datagen.workers.registry import install_line
 
 
 @dataclass(frozen=True)
-class Step:
+class TrainingStep:
     """One step of the optimiser, over all ranks."""
 
     step: int  # counted from 1
@@ -24,23 +24,23 @@ class Step:
     step_s: float  # all of it
 
 
-class Watcher(Protocol):
+class TrainingCallback(Protocol):
     """Is told of steps and epochs."""
 
-    def step(self, step: Step) -> None: ...
+    def step(self, step: TrainingStep) -> None: ...
 
     def epoch(self, record: dict[str, Any]) -> None:
         """A row of the history: epoch, loss, val_loss, val_accuracy, val_balanced_accuracy, val_auc, best."""
         ...
 
 
-class Watchers:
+class CallbackList:
     """Several as one."""
 
-    def __init__(self, watchers: Sequence[Watcher]) -> None:
+    def __init__(self, watchers: Sequence[TrainingCallback]) -> None:
         self._watchers = tuple(watchers)
 
-    def step(self, step: Step) -> None:
+    def step(self, step: TrainingStep) -> None:
         for watcher in self._watchers:
             watcher.step(step)
 
@@ -49,7 +49,7 @@ class Watchers:
             watcher.epoch(record)
 
 
-class TensorBoard:
+class TensorBoardCallback:
     """Curves for TensorBoard. A training that goes on replaces what was drawn beyond `step`."""
 
     def __init__(self, folder: str, step: int = 0) -> None:
@@ -61,7 +61,7 @@ class TensorBoard:
         self._writer = SummaryWriter(folder, purge_step=step + 1)
         self._step = step
 
-    def step(self, step: Step) -> None:
+    def step(self, step: TrainingStep) -> None:
         self._step = step.step
         for name, value in (("train/loss", step.loss), ("train/lr", step.lr)):
             self._writer.add_scalar(name, value, step.step)

@@ -21,7 +21,7 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
 from datagen.train.tensors import to_torch
-from datagen.train.training.callbacks import Step, Watcher
+from datagen.train.training.callbacks import TrainingCallback, TrainingStep
 from datagen.train.training.checkpoints import EpochRecord
 from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
@@ -73,7 +73,7 @@ class Training:
 def run(
     training: Training,
     keep: Callable[[], None],
-    watcher: Watcher,
+    watcher: TrainingCallback,
     stopping: Callable[[], bool] = lambda: False,
     keep_every_s: float = 300.0,
 ) -> bool:
@@ -105,7 +105,7 @@ def run(
 
 def _step(
     training: Training, logits_of: Callable[..., Tensor], batch: Batch[Array], clock: _Clock, stopping: bool
-) -> tuple[Step, bool]:
+) -> tuple[TrainingStep, bool]:
     """A step on the batches of all ranks as if they were one; what it was, and whether any rank stops."""
     options, at, ranks, device = training.options, training.position, training.ranks, training.model.device
     torch.manual_seed(_seed(options.seed, at.epoch, at.batch, ranks.rank))
@@ -137,10 +137,10 @@ def _step(
     _pay(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
     loss_now = sums[1] / sums[0]
     times = (wait_s / ranks.world, wall_s / ranks.world)
-    return Step(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
+    return TrainingStep(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
 
 
-def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
+def _end_epoch(training: Training, clock: _Clock, watcher: TrainingCallback) -> None:
     """Validate, keep the best weights in mind, and decide whether to go on."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)

@@ -34,7 +34,7 @@ class _Name:
 
 
 @dataclass(frozen=True)
-class _Storage:
+class _TensorStorage:
     items: int
 
 
@@ -168,13 +168,13 @@ def _declared(pickle: bytes, sizes: dict[str, int]) -> Any:
     raise ValueError("it has no end")
 
 
-def _storage(identity: Any, sizes: dict[str, int]) -> _Storage:
+def _storage(identity: Any, sizes: dict[str, int]) -> _TensorStorage:
     word, kind, key, device, items = identity
     if word != "storage" or device != "cpu" or not isinstance(kind, _Name) or type(items) is not int:
         raise ValueError("an unknown kind of storage")
     if key not in sizes or sizes[key] != items * _ITEM_BYTES[kind.text]:
         raise ValueError(f"a tensor whose record {key} is of another size")
-    return _Storage(items)
+    return _TensorStorage(items)
 
 
 def _called(function: Any, arguments: Any) -> Any:
@@ -183,7 +183,7 @@ def _called(function: Any, arguments: Any) -> Any:
     if function != _Name(_REBUILD):
         raise ValueError("it calls what no checkpoint needs")
     storage, offset, shape, stride, requires_grad, hooks = arguments
-    if not isinstance(storage, _Storage) or len(shape) > _MAX_AXES:
+    if not isinstance(storage, _TensorStorage) or len(shape) > _MAX_AXES:
         raise ValueError("a tensor of no shape")
     if any(type(n) is not int or n < 0 for n in (*shape, *stride)):
         raise ValueError("a tensor of no shape")

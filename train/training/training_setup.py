@@ -19,7 +19,7 @@ from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.models import Model, build_model
 from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
-from datagen.train.training.callbacks import TensorBoard, Watcher, Watchers
+from datagen.train.training.callbacks import CallbackList, TensorBoardCallback, TrainingCallback
 from datagen.train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
@@ -37,7 +37,7 @@ from datagen.train.training.ranks import Ranks
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainingJob:
     """A training as it is asked for. Only `options`, the runs' rows and `init` decide its weights."""
 
     options: Options
@@ -54,14 +54,14 @@ class Job:
     allow_incomplete: bool = False  # runs that lack samples of their plan
 
 
-def train_job(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
+def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
     """Train in this process, one of `ranks`, from where `job.out` stands. Whether it came to its end.
 
     InputError for data, checkpoints or options that do not go together, before anything is written.
     """
     torch.set_num_threads(job.threads)
     with ExitStack() as stack:
-        watchers: list[Watcher] = []
+        watchers: list[TrainingCallback] = []
         if ranks.leads:
             stack.enter_context(only_writer(job.out))
             shown = stack.enter_context(Progress(job.json_lines))
@@ -70,12 +70,12 @@ def train_job(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
         training, head = prepare(job, ranks)
         at = training.position
         if ranks.leads and job.tensorboard and not at.finished:
-            watchers.append(stack.enter_context(closing(TensorBoard(job.tensorboard, at.step))))
-        watcher = Watchers(watchers)
+            watchers.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
+        watcher = CallbackList(watchers)
         return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
 
 
-def prepare(job: Job, ranks: Ranks) -> tuple[Training, CheckpointHead]:
+def prepare(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
     """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say."""
     options, stage = job.options, STAGES[job.options.stage]
     began = read_checkpoint(job.init) if job.init is not None else None
@@ -140,7 +140,7 @@ def _go_on(place: str, there: Checkpoint, model: Model, optimiser: torch.optim.O
     )
 
 
-def _streams(job: Job, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
+def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
     options = job.options
     if options.batch_scenes % ranks.world:
         problem = f"{options.batch_scenes} scenes cannot be shared out evenly among {ranks.world} processes"
@@ -180,7 +180,7 @@ def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
             raise InputError(summary.part.place, "label_source", problem, f"Train {fitting} on it")
 
 
-def _refuse_known_houses(job: Job, began: CheckpointHead, val: SampleStream) -> None:
+def _refuse_known_houses(job: TrainingJob, began: CheckpointHead, val: SampleStream) -> None:
     known = sorted(val.house_ids() & set(began.house_ids))
     if known:
         problem = f"{known[0]!r} was trained on by --init, and would be judged on ({len(known)} such houses)"
@@ -194,7 +194,7 @@ def _class_weights(train: SampleStream, weighted: bool) -> Tensor:
     return torch.from_numpy(weights.astype(np.float32))
 
 
-def _model(job: Job, began: Checkpoint | None) -> Model:
+def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
     """With the parameters of the checkpoint to begin from, or drawn from the seed."""
     options = job.options
     torch.manual_seed(options.seed)
@@ -209,7 +209,7 @@ def _model(job: Job, began: Checkpoint | None) -> Model:
 
 
 def _head(
-    job: Job, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
+    job: TrainingJob, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
 ) -> CheckpointHead:
     data = tuple(train.origin())
     house_ids = _all(train.house_ids(), began.house_ids if began else ())

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.scene_rejected import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 
 Bools = npt.NDArray[np.bool_]
 
@@ -62,7 +62,7 @@ def draw_candidates(
 
     Cells are drawn from all without repetition, or from those that `within` asks for. Robots:
     `robots_per_scene` of them with the candidates dealt out in turn, so that a model can encode a
-    scene once a robot; or one a candidate, as the paper has it. Raises Redraw("no_base") where
+    scene once a robot; or one a candidate, as the paper has it. Raises SceneRejected("no_base") where
     around this target there are too few places of the asked kind for these robots.
     """
     n = params.count
@@ -151,7 +151,7 @@ def _places_within(
             free[found] = False
         if not open_.any():
             return base_xy_m
-    raise Redraw("no_base")
+    raise SceneRejected("no_base")
 
 
 def _is_within(candidates: SceneCandidates, target_center_m: F64, params: CandidateParams) -> Bools:

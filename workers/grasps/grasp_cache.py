@@ -10,14 +10,14 @@ import numpy as np
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import GraspParams
-from datagen.workers.content_cache import Arrays, Shelf
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.grasps.search import VERSION, ScoredGrasps, search_grasps
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Gripper, Parts
 
 _KEPT_IN_MEMORY = 512
-_SHELF = Shelf(
+_CACHE = CacheFolder(
     "grasps",
     {
         "T_object_tcp": (np.float64, ("n", 4, 4)),
@@ -57,12 +57,12 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> 
         _kept.move_to_end(digest)
         return _kept[digest]
     key = _file_digest(digest)
-    stored = _SHELF.load(key)
+    stored = _CACHE.load(key)
     found = None if stored is None else _restored(stored)
     if found is None:
         rng = np.random.Generator(np.random.PCG64(int(digest, 16)))
         found = search_grasps(model, gripper, params.per_object, rng)
-        _SHELF.store(key, _stored(found))
+        _CACHE.store(key, _stored(found))
     _kept[digest] = found
     if len(_kept) > _KEPT_IN_MEMORY:
         _kept.popitem(last=False)

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from scipy.ndimage import map_coordinates
 
-from datagen.workers.content_cache import Arrays, Shelf
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32
 from datagen.workers.objects.hulls import (
     Hull,
@@ -36,7 +36,7 @@ _NEIGHBOURS = 12
 _CELLS_ACROSS, _SAMPLES_ACROSS = 32, 128
 # Hulls whose errors differ by less are compared by the volume they add.
 _ERROR_STEP_M = 2e-4
-_SHELF = Shelf(
+_CACHE = CacheFolder(
     "hulls",
     {
         "vertices": (np.float32, ("corners", 3)),
@@ -86,10 +86,10 @@ def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
         return MergedParts(tuple(parts_m), len(parts_m), 0.0, 0.0, 0.0)
     key = _key(parts_m, limit)
     if key not in _known:
-        stored = _SHELF.load(key)
+        stored = _CACHE.load(key)
         merged = _restored(stored) if stored is not None else _merge(parts_m, limit)
         if stored is None:
-            _SHELF.store(key, _stored(merged))
+            _CACHE.store(key, _stored(merged))
         _known[key] = merged
     return _known[key]
 

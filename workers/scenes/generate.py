@@ -20,7 +20,7 @@ from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.rendering.rays import RayScene
-from datagen.workers.scene_rejected import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.scenes.viewpoint import draw_viewpoint
@@ -32,7 +32,7 @@ from datagen.workers.world import PreparedHouse, World
 _SURROUNDINGS_M = 0.3
 
 
-def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
+def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
     """Scene `index` of the specification's endless sequence and its candidates: the first retry that works.
 
     Raises InputError when `scene.max_retries` redraws were not enough.
@@ -41,7 +41,7 @@ def draw_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, Scen
     for retry in range(world.spec.scene.max_retries):
         try:
             return _try_scene(world, index, retry, dict(redraws), clock)
-        except Redraw as redraw:
+        except SceneRejected as redraw:
             redraws[redraw.cause] += 1
             detail = redraw.detail or detail
     causes = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
@@ -62,7 +62,7 @@ def _try_scene(
         house = _load_house(world, world.house_ids[rng.integers(len(world.house_ids))])
         surfaces = eligible_surfaces(house.house, spec.scene)
         if not surfaces:
-            raise Redraw("no_surface")
+            raise SceneRejected("no_surface")
         surface = surfaces[rng.integers(len(surfaces))]
         names = _draw_names(world, rng, clock)
         models = tuple(world.object(name).model for name in names)
@@ -98,7 +98,7 @@ def _load_house(world: World, house_id: str) -> PreparedHouse:
     try:
         return world.house(house_id)
     except InputError as error:
-        raise Redraw("bad_house", str(error)) from error
+        raise SceneRejected("bad_house", str(error)) from error
 
 
 def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> list[str]:
@@ -113,19 +113,19 @@ def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> li
 def check_settled(
     settled: SettleResult, models: tuple[ObjectModel, ...], surface: Surface, params: SettleParams
 ) -> None:
-    """Raise Redraw where the result is no scene: blown up, still moving, sunk in, or fallen off."""
+    """Raise SceneRejected where the result is no scene: blown up, still moving, sunk in, or fallen off."""
     T = settled.T_world_object
     if not np.isfinite(T).all():
-        raise Redraw("not_finite")
+        raise SceneRejected("not_finite")
     if not settled.at_rest:
-        raise Redraw("not_at_rest")
+        raise SceneRejected("not_at_rest")
     local = (T[:, :3, 3] - surface.T_world_surface[:3, 3]) @ surface.T_world_surface[:3, :3]
     bottoms_m = np.array([_lowest_m(m, T[k]) for k, m in enumerate(models)]) - surface.height_m
     beyond = (np.abs(local[:, :2]) > np.array(surface.size_m) / 2).any()
     if beyond or (bottoms_m < -params.max_drop_m).any():
-        raise Redraw("fell_off")
+        raise SceneRejected("fell_off")
     if settled.penetration_m > params.max_penetration_m:
-        raise Redraw("penetration")
+        raise SceneRejected("penetration")
 
 
 def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:

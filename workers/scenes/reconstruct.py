@@ -33,7 +33,7 @@ _NEAR_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class RecalledScene:
+class ReconstructedScene:
     """What a scene's record stands for: a `SettledScene`, with the camera it was observed by."""
 
     index: int
@@ -54,7 +54,7 @@ class RecalledScene:
         return SceneGeometry(self.house.house, self.models, self.T_world_object)
 
 
-def recall_scene(world: World, record: Record) -> RecalledScene:
+def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     """Rebuild the stage of a record from the sources it names.
 
     Raises InputError where a house or an object is not there any more or has other content, and for
@@ -85,10 +85,10 @@ def recall_scene(world: World, record: Record) -> RecalledScene:
         _same(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
     rays = world.stage(house, names, T_world_object)
-    return RecalledScene(index, retry, house, models, T_world_object, rays, camera)
+    return ReconstructedScene(index, retry, house, models, T_world_object, rays, camera)
 
 
-def recall_candidates(columns: Record, scene: RecalledScene) -> SceneCandidates:
+def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneCandidates:
     """The candidates of a scene from their stored columns, by field name.
 
     Raises InputError for numbers that are not finite, or that no robot around the target can have.

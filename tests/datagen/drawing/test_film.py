@@ -14,7 +14,7 @@ from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.rays import RayScene
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials.trial import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, table_house
@@ -25,7 +25,7 @@ TITLE = Title("#0a9148", "candidate 3: success", ("a scene", "numbers"))
 
 
 @pytest.fixture(scope="module")
-def scene() -> RecalledScene:
+def scene() -> ReconstructedScene:
     return recalled()
 
 
@@ -35,12 +35,12 @@ def bodies() -> RobotBodies:
 
 
 @pytest.fixture(scope="module")
-def recording(scene: RecalledScene, bodies: RobotBodies) -> Recording:
+def recording(scene: ReconstructedScene, bodies: RobotBodies) -> Recording:
     return recording_of(bodies.robot, scene, base_pose())
 
 
 @pytest.fixture(scope="module")
-def film(scene: RecalledScene, bodies: RobotBodies, recording: Recording) -> Film:
+def film(scene: ReconstructedScene, bodies: RobotBodies, recording: Recording) -> Film:
     told = told_moments(recording)
     return film_of(scene, bodies, base_pose(), recording, told, *SIZES)
 
@@ -141,7 +141,7 @@ def test_a_sheet_has_eight_moments(film: Film, tmp_path: Path) -> None:
 
 
 def test_a_sheet_of_one_pose(
-    scene: RecalledScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
+    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     still = cut(recording, 1)
     film = film_of(scene, bodies, base_pose(), still, told_moments(still), *SIZES)
@@ -151,7 +151,7 @@ def test_a_sheet_of_one_pose(
 
 
 def test_a_film_moves(
-    scene: RecalledScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
+    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     told = told_moments(recording)
     film = film_of(scene, bodies, base_pose(), recording, told, *SIZES)

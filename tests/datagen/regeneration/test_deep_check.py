@@ -11,7 +11,7 @@ import pytest
 
 from datagen import cli
 from datagen.regeneration.deep_check import deep_findings
-from datagen.regeneration.shards import open_origin
+from datagen.regeneration.shards import open_sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
@@ -33,7 +33,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def findings(run: Run, k: int = ALL, seed: int = 0) -> list[Finding]:
-    return list(deep_findings(run, k, open_origin(run), np.random.default_rng(seed)))
+    return list(deep_findings(run, k, open_sources(run), np.random.default_rng(seed)))
 
 
 def test_a_sound_run_has_no_findings(source: Path) -> None:

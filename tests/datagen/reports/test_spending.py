@@ -29,9 +29,9 @@ class _RunThatGrows(Run):
 
 def test_a_shard_that_is_committed_during_an_audit_is_no_waste(tmp_path: Path) -> None:
     made = make_run(tmp_path, n=50, shards=[0, 1, 2])
-    books = account_for([_RunThatGrows(made.storage, made.manifest)])
+    spending = account_for([_RunThatGrows(made.storage, made.manifest)])
     assert made.committed() == {0, 1, 2, 3}
-    assert books.waste == {} and books.useful.attempts == 3 and books.running == 0
+    assert spending.waste == {} and spending.useful.attempts == 3 and spending.running == 0
 
 
 def test_positives_are_counted_among_the_labels_made_not_among_those_wanted(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from datagen.train.training.checkpoints import read_checkpoint
 from datagen.train.training.launching import interruptible, train_in_processes
 from datagen.train.training.loop import run
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.training_setup import Job, prepare
+from datagen.train.training.training_setup import TrainingJob, prepare
 from tests.train.training.rank_work import Union, told_by, train_and_tell
 from tests.train.training.small import TINY, Recorder, equal, job_of
 
@@ -29,7 +29,7 @@ from tests.train.training.small import TINY, Recorder, equal, job_of
 STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
 
 
-def still_job(run_: Path, out: Path) -> Job:
+def still_job(run_: Path, out: Path) -> TrainingJob:
     return job_of(run_, out, epochs=1, model_config=STILL)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from datagen.schemas.specification import CandidateParams
 from datagen.workers.bases.candidates import SceneCandidates, distances, draw_candidates, grid_offsets
 from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
-from datagen.workers.scene_rejected import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, table_house
 
 TARGET = np.array([ROOM_M[0] / 2 - 0.35, ROOM_M[1] / 2 - 0.2, TABLE_TOP_M + 0.05])  # near a corner
@@ -152,6 +152,6 @@ def test_cells_come_again_only_where_too_few_serve() -> None:
     ],
 )
 def test_a_scene_without_such_a_place_is_to_be_drawn_again(params: dict[str, object]) -> None:
-    with pytest.raises(Redraw) as redraw:
+    with pytest.raises(SceneRejected) as redraw:
         draw(**params)
     assert redraw.value.cause == "no_base"

@@ -20,7 +20,7 @@ from datagen.workers.rendering.embree_renderer import ray_stage
 from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.reconstruct import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house
@@ -67,7 +67,7 @@ def scene_of(
 ) -> SettledScene:
     T = np.stack(poses)
     rays = ray_stage(SceneGeometry(house, tuple(objects), T))
-    return RecalledScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
+    return ReconstructedScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
 
 
 def table_scene(

@@ -11,7 +11,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
-from datagen.workers.scenes.reconstruct import RecalledScene, recall_candidates, recall_scene
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import World, open_world
 from tests.small_runs import PER_SCENE, make_small_run
 
@@ -33,17 +33,17 @@ def changed(values: Any, at: Any, value: Any) -> Any:
 
 def refusal(world: World, rows: SceneRows, record: dict[str, Any], samples: dict[str, Any]) -> str:
     with pytest.raises(InputError) as error:
-        scene = recall_scene(world, {**rows.record, **record})
-        recall_candidates({**rows.samples, **samples}, scene)
+        scene = reconstruct_scene(world, {**rows.record, **record})
+        reconstruct_candidates({**rows.samples, **samples}, scene)
     return str(error.value)
 
 
 def test_a_sound_scene_is_the_stored_one(stored: Stored) -> None:
     world, rows = stored
-    scene = recall_scene(world, rows.record)
-    assert isinstance(scene, RecalledScene)
+    scene = reconstruct_scene(world, rows.record)
+    assert isinstance(scene, ReconstructedScene)
     np.testing.assert_array_equal(scene.T_world_object, rows.record["T_world_object"])
-    candidates = recall_candidates(rows.samples, scene)
+    candidates = reconstruct_candidates(rows.samples, scene)
     np.testing.assert_array_equal(candidates.clearance_m, rows.samples["base_clearance_m"])
 
 
