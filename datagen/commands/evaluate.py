@@ -87,11 +87,11 @@ def evaluate(
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    lineup = baseline_methods(
+    baseline_set = baseline_methods(
         baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
     )
-    contestants = [*lineup.baselines, *models]
-    if not contestants:
+    evaluated = [*baseline_set.baselines, *models]
+    if not evaluated:
         mend = "Name a checkpoint, or leave --baselines out"
         raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
     with counting("scenes", json) as seen:
@@ -104,16 +104,16 @@ def evaluate(
 
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
-        gathered = gather(batches, {c.name: c.scorer for c in contestants}, rng, seen=step)
-    houses = lineup.houses.union(*(model.houses for model in models))
+        gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
+    houses = baseline_set.houses.union(*(model.houses for model in models))
     report = evaluation_report(
         gathered,
-        contestants,
+        evaluated,
         opened,
         sets,
         seen_houses=houses,
         fit=fit or [],
-        left_out=lineup.left_out,
+        left_out=baseline_set.left_out,
         resamples=bootstrap,
         seed=seed,
     )

@@ -1,4 +1,4 @@
-"""The baselines that stand beside the models, fitted where runs to fit them on are named."""
+"""The baselines that models are compared with, fitted where runs to fit them on are named."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class BaselineMethods:
     houses: frozenset[str]
 
 
-def read_heuristic(path: Path, places: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
+def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
     """The rule's parameters in a file that `datagen calibrate` wrote.
 
-    InputError where it has none, and where it says that they were fitted to one of `places`.
+    InputError where it has none, and where it says that they were fitted to one of `runs`.
     """
     mend = "Give the file that `datagen calibrate` wrote"
     section = read_toml(path, mend).get("heuristic")
     if not isinstance(section, dict):
         raise InputError(path, "heuristic", "there is no such section", mend)
     fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
-    for place in places:
-        if not allow_seen_houses and any(spec.hash() in fitted_to for spec in place.specs):
-            problem = f"its rule was fitted to the labels of {place.place}"
+    for run in runs:
+        if not allow_seen_houses and any(spec.hash() in fitted_to for spec in run.specs):
+            problem = f"its rule was fitted to the labels of {run.place}"
             raise InputError(path, "heuristic", problem, "Calibrate to runs of another split")
     try:
         return HeuristicParams.model_validate(section)
@@ -57,14 +57,14 @@ def baseline_methods(
     detector: Path | None,
     heuristic: HeuristicParams | None,
     seed: int,
-    places: Sequence[EvaluatedRun],
+    runs: Sequence[EvaluatedRun],
     allow_seen_houses: bool,
     allow_incomplete: bool = False,
     json: bool = False,
 ) -> BaselineMethods:
     """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
 
-    InputError where one that was asked for cannot be had, and where a house of `fit` is one of `places`.
+    InputError where one that was asked for cannot be had, and where a house of `fit` is one of `runs`.
     """
     if asked and NONE in asked:
         if len(asked) > 1:
@@ -85,8 +85,8 @@ def baseline_methods(
             allow_incomplete=allow_incomplete,
         )
         if not allow_seen_houses:
-            for place in places:
-                refuse_shared_houses(stream, place.stream)
+            for run in runs:
+                refuse_shared_houses(stream, run.stream)
         houses = frozenset(stream.house_ids())
         batches = list(stream.epoch(0))
         fitted: list[Baseline] = []

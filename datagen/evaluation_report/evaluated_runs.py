@@ -1,4 +1,4 @@
-"""The runs that methods are held against: what they hold, and that nobody was trained on it."""
+"""The runs on which methods are evaluated: what they hold, and that no method was trained on it."""
 
 from __future__ import annotations
 
@@ -115,29 +115,29 @@ def _refuse_other_labels(place: str, source: str, kinds: dict[str, str]) -> None
         raise InputError(place, "label_source", problem, "Evaluate the two apart")
 
 
-def candidate_sets_of(places: Sequence[EvaluatedRun], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """The sets of candidates to tell of, those asked for or all, each with the places that offer it.
+def candidate_sets_of(runs: Sequence[EvaluatedRun], asked: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """The candidate sets to report, those asked for or all, each with the runs that offer it.
 
     A run of candidates within reach says nothing of others, and beside it one of whole grids says of all.
     """
-    by_name = {n: tuple(k for k, place in enumerate(places) if n in place.offers) for n in CANDIDATE_SETS}
+    by_name = {n: tuple(k for k, run in enumerate(runs) if n in run.offers) for n in CANDIDATE_SETS}
     offered = {name: rows for name, rows in by_name.items() if rows}
     for name in asked:
         if name not in offered:
             problem = f"no run was made of {name} candidates, but of {list(offered)[-1]}"
-            raise InputError(places[0].place, "--candidates", problem, f"Choose of: {', '.join(offered)}")
+            raise InputError(runs[0].place, "--candidates", problem, f"Choose of: {', '.join(offered)}")
     return {name: rows for name, rows in offered.items() if not asked or name in asked}
 
 
-def refuse_seen_houses(places: Sequence[EvaluatedRun], contestants: Iterable[EvaluatedMethod]) -> None:
-    """InputError that names a house of these runs on which somebody was trained."""
+def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[EvaluatedMethod]) -> None:
+    """InputError that names a house of these runs on which a method was trained."""
     mend = "Evaluate a run of another split, or say --allow-seen-houses, which tells of them apart"
-    by = [(f"{c.name} ({c.place})", c.houses) for c in contestants]
-    for place in places:
-        here = place.stream.house_ids()
+    by = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
+    for run in runs:
+        here = run.stream.house_ids()
         for who, houses in by:
             if shared := sorted(here & houses):
                 problem = f"{shared[0]!r} and {len(shared) - 1} more: {who} has seen them in training"
                 if len(shared) == 1:
                     problem = f"{shared[0]!r}: {who} has seen it in training"
-                raise InputError(place.place, "house_id", problem, mend)
+                raise InputError(run.place, "house_id", problem, mend)

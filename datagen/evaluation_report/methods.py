@@ -1,4 +1,4 @@
-"""Who is evaluated: models by their checkpoints, and baselines by their names."""
+"""The methods that are evaluated: models by their checkpoints, and baselines by their names."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ UNSEEN, SEEN = "unseen", "seen"
 
 def evaluation_report(
     gathered: Gathered,
-    contestants: Sequence[EvaluatedMethod],
-    places: Sequence[EvaluatedRun],
+    evaluated: Sequence[EvaluatedMethod],
+    runs: Sequence[EvaluatedRun],
     sets: Mapping[str, Sequence[int]],
     *,
     seen_houses: frozenset[str],
@@ -31,13 +31,13 @@ def evaluation_report(
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """All tables and curves. Scenes in houses that somebody was trained on are a part of their own.
+    """All tables and curves. Scenes in houses that a method was trained on are a part of their own.
 
-    `sets` names candidates, each with the places whose scenes are told of.
+    `sets` names candidates, each with the indices of the runs that offer them.
     """
     columns = gathered.columns
-    methods = [c.method for c in contestants]
-    objects = frozenset[str]().union(*(c.objects for c in contestants))
+    methods = [c.method for c in evaluated]
+    objects = frozenset[str]().union(*(c.objects for c in evaluated))
     is_seen = np.isin(columns.house.astype(str), np.array(sorted(seen_houses), str))
     sides = [(name, rows) for name, rows in ((UNSEEN, ~is_seen), (SEEN, is_seen)) if rows.any()]
     parts = [
@@ -51,7 +51,7 @@ def evaluation_report(
     return {
         "datagen": __version__,
         "paper": paper_record(),
-        "runs": [place.record() for place in places],
+        "runs": [run.record() for run in runs],
         "fitted_on": list(fit),
         "methods": [
             {
@@ -59,7 +59,7 @@ def evaluation_report(
                 "seconds": gathered.seconds[c.name],
                 "seconds_per_600": gathered.seconds[c.name] * paper_results.TIMED_CANDIDATES / n,
             }
-            for c in contestants
+            for c in evaluated
         ],
         "left_out": dict(left_out),
         "bootstrap": {"resamples": resamples, "seed": seed, "level": LEVEL, "by": "scene"},

@@ -12,12 +12,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.executor import Executor
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobMonitor
 from datagen.cluster.job_totals import JobSummary, JobTotals, empty_summary
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings

@@ -1,7 +1,7 @@
-"""What checks found, mended: from second copies, from other records, or by making shards again.
+"""What checks found, repaired: from second copies, from other records, or by making shards again.
 
-Every file is replaced by one atomic put of bytes that are known to be the right ones, so that a mending
-that is broken off has only less mended, and the next goes on.
+Every file is replaced by one atomic put of bytes that are known to be the right ones, so that a repair
+that is broken off has only less repaired, and the next goes on.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
 from datagen.schemas.checking.check_runs import Checked, check_runs
-from datagen.schemas.checking.finding import Finding, Remake, Reseal, Restore
+from datagen.schemas.checking.finding import Finding, Regenerate, Reseal, Restore
 from datagen.schemas.checking.roots import open_roots
 from datagen.schemas.checking.sealed import SealedSlice, read_root, slices_of
 from datagen.schemas.checking.shards import form_of
@@ -32,18 +32,18 @@ _PASSES = 5
 # Findings on which it depends what rows there are.
 _UNDECIDED = ("record", "lost", "foreign", "sealed")
 
-RemakeShard = Callable[[Run, int], Mapping[str, bytes]]
+RegenerateShard = Callable[[Run, int], Mapping[str, bytes]]
 Seen = Callable[[int, int], None]
 
 
 @dataclass
 class Repaired:
-    """What a mending did, and what it left."""
+    """What a repair did, and what it left."""
 
     records: list[str] = field(default_factory=list[str])  # keys that were put, by what they were put from
     copied_files: list[str] = field(default_factory=list[str])
-    remade_files: list[str] = field(default_factory=list[str])
-    remade_shards: list[int] = field(default_factory=list[int])
+    regenerated_files: list[str] = field(default_factory=list[str])
+    regenerated_shards: list[int] = field(default_factory=list[int])
     sealed_files: list[str] = field(default_factory=list[str])
     resealed: bool = False
     left: list[Finding] = field(default_factory=list[Finding])
@@ -54,36 +54,36 @@ class Repaired:
     @property
     def written(self) -> set[str]:
         """Keys of all files that were put."""
-        return {*self.records, *self.copied_files, *self.remade_files, *self.sealed_files}
+        return {*self.records, *self.copied_files, *self.regenerated_files, *self.sealed_files}
 
 
 def repair_runs(
-    place: Storage, remake: RemakeShard, workers: int = 1, seen: Seen = lambda done, total: None
+    place: Storage, regenerate: RegenerateShard, workers: int = 1, seen: Seen = lambda done, total: None
 ) -> Repaired:
-    """Check the place, mend what can be mended, and check again until nothing more can be.
+    """Check the place, mend what can be repaired, and check again until nothing more can be.
 
-    `remake` gives all files of a shard by path, and raises where it cannot; several shards are made at a
-    time with more `workers`. A remade file is written only where it has the committed digest, and only
+    `regenerate` gives all files of a shard by path, and raises where it cannot; several shards are made at a
+    time with more `workers`. A regenerated file is written only where it has the committed digest, and only
     where all bad files of its shard have. What is left is in the result. InputError as `check_runs`.
     """
-    mended = Repaired()
+    repaired = Repaired()
     before = {file.key: _state(file) for file in place.list("")}
     refused: dict[str, str] = {}  # key -> why; not tried twice
     for _ in range(_PASSES):
-        found = _pass(place, remake, workers, seen, mended, refused)
+        found = _pass(place, regenerate, workers, seen, repaired, refused)
         if not found:
             break
-    written = mended.written
+    written = repaired.written
     for file in place.list(""):  # in a second dictionary the files of a large run would not fit
         state = before.pop(file.key, None)
-        if state is None or _is_ours(file.key, written, mended.resealed):
+        if state is None or _is_ours(file.key, written, repaired.resealed):
             continue
         if state == _state(file):
-            mended.untouched += 1
+            repaired.untouched += 1
         else:
-            mended.changed.append(file.key)
-    mended.changed += [key for key in before if not _is_ours(key, written, mended.resealed)]
-    return mended
+            repaired.changed.append(file.key)
+    repaired.changed += [key for key in before if not _is_ours(key, written, repaired.resealed)]
+    return repaired
 
 
 def _state(file: StoredFile) -> int:
@@ -96,32 +96,37 @@ def _is_ours(key: str, written: Container[str], resealed: bool) -> bool:
 
 
 def _pass(
-    place: Storage, remake: RemakeShard, workers: int, seen: Seen, mended: Repaired, refused: dict[str, str]
+    place: Storage,
+    regenerate: RegenerateShard,
+    workers: int,
+    seen: Seen,
+    repaired: Repaired,
+    refused: dict[str, str],
 ) -> bool:
-    """Check once and mend what is found; whether anything was mended."""
-    mended.checked, mended.left = Checked(), []
+    """Check once and mend what is found; whether anything was repaired."""
+    repaired.checked, repaired.left = Checked(), []
     bad: dict[tuple[str, int], list[Finding]] = {}
     sealed: list[Finding] = []
     done = False
-    for finding in check_runs(place, mended.checked, seen):
+    for finding in check_runs(place, repaired.checked, seen):
         cure = finding.cure
         if isinstance(cure, Restore):
-            done |= _put(place, finding, cure.data, mended.records, mended, refused, cure.is_guess)
-        elif isinstance(cure, Remake) and finding.key not in refused:
+            done |= _put(place, finding, cure.data, repaired.records, repaired, refused, cure.is_guess)
+        elif isinstance(cure, Regenerate) and finding.key not in refused:
             bad.setdefault((cure.run.storage.url, cure.shard), []).append(finding)
         elif isinstance(cure, Reseal) and SEALED not in refused:
             sealed.append(finding)
         else:
-            mended.left.append(_refused(finding, refused))
+            repaired.left.append(_refused(finding, refused))
     files = 0
     if bad:
-        files = _mend_files(place, remake, workers, bad, mended, refused)
-    relink = bool(files) and mended.checked.is_sealed and place.folder is not None
-    if any(finding.kind in _UNDECIDED for finding in mended.left):
+        files = _repair_files(place, regenerate, workers, bad, repaired, refused)
+    relink = bool(files) and repaired.checked.is_sealed and place.folder is not None
+    if any(finding.kind in _UNDECIDED for finding in repaired.left):
         why = "Mend the other findings first: nothing is sealed until they are decided"
-        mended.left += [replace(finding, mend=why, cure=None) for finding in sealed]
+        repaired.left += [replace(finding, mend=why, cure=None) for finding in sealed]
     elif sealed or relink:
-        done |= _mend_sealed(place, sealed, mended, refused)
+        done |= _repair_sealed(place, sealed, repaired, refused)
     return done or bool(files)
 
 
@@ -137,7 +142,7 @@ def _put(
     finding: Finding,
     data: bytes,
     noted: list[str],
-    mended: Repaired,
+    repaired: Repaired,
     refused: dict[str, str],
     is_guess: bool = False,
 ) -> bool:
@@ -155,19 +160,19 @@ def _put(
         else:
             noted += [finding.key] * is_put
             return True
-    mended.left.append(_refused(finding, refused))
+    repaired.left.append(_refused(finding, refused))
     return False
 
 
-def _mend_files(
+def _repair_files(
     place: Storage,
-    remake: RemakeShard,
+    regenerate: RegenerateShard,
     workers: int,
     bad: Mapping[tuple[str, int], list[Finding]],
-    mended: Repaired,
+    repaired: Repaired,
     refused: dict[str, str],
 ) -> int:
-    """Files of shards from the sealed store, from their schema, or remade; how many were put."""
+    """Files of shards from the sealed store, from their schema, or regenerated; how many were put."""
     slices, put = _slices(place), 0
     to_make: list[tuple[Run, int, list[Finding]]] = []
     for (_, shard), findings in bad.items():
@@ -177,20 +182,20 @@ def _mend_files(
             if data is None:
                 rest.append(finding)
             else:
-                put += _put(place, finding, data, mended.copied_files, mended, refused)
-        if rest and isinstance(rest[0].cure, Remake):
+                put += _put(place, finding, data, repaired.copied_files, repaired, refused)
+        if rest and isinstance(rest[0].cure, Regenerate):
             to_make.append((rest[0].cure.run, shard, rest))
-    for _, shard, findings, files in _remade(remake, to_make, workers):
+    for _, shard, findings, files in _regenerated(regenerate, to_make, workers):
         why = files if isinstance(files, str) else _unlike(findings, files)
         for finding in findings:
             if why:
                 refused[finding.key] = why
-                mended.left.append(_refused(finding, refused))
-            elif isinstance(finding.cure, Remake) and not isinstance(files, str):
+                repaired.left.append(_refused(finding, refused))
+            elif isinstance(finding.cure, Regenerate) and not isinstance(files, str):
                 data = files[finding.cure.entry.path]
-                put += _put(place, finding, data, mended.remade_files, mended, refused)
+                put += _put(place, finding, data, repaired.regenerated_files, repaired, refused)
         if not why:
-            mended.remade_shards.append(shard)
+            repaired.regenerated_shards.append(shard)
     return put
 
 
@@ -204,7 +209,7 @@ def _slices(place: Storage) -> Mapping[str, SealedSlice]:
 def _second_source(place: Storage, slices: Mapping[str, SealedSlice], finding: Finding) -> bytes | None:
     """The committed bytes of a file where they are known without making the shard again."""
     cure = finding.cure
-    if not isinstance(cure, Remake):
+    if not isinstance(cure, Regenerate):
         return None
     run, entry = cure.run, cure.entry
     form = form_of(run)
@@ -231,14 +236,14 @@ def _has_digest(data: bytes, entry: FileEntry) -> bool:
     return len(data) == entry.size and sha256(data).hexdigest() == entry.sha256
 
 
-def _remade(
-    remake: RemakeShard, to_make: Iterable[tuple[Run, int, list[Finding]]], workers: int
+def _regenerated(
+    regenerate: RegenerateShard, to_make: Iterable[tuple[Run, int, list[Finding]]], workers: int
 ) -> Iterator[tuple[Run, int, list[Finding], Mapping[str, bytes] | str]]:
-    """Each shard with its remade files, or with why there are none."""
+    """Each shard with its regenerated files, or with why there are none."""
 
     def make(one: tuple[Run, int, list[Finding]]) -> Mapping[str, bytes] | str:
         try:
-            return remake(one[0], one[1])
+            return regenerate(one[0], one[1])
         except InputError as error:
             return str(error)
         except Exception as error:  # noqa: BLE001 - a simulator's failure concerns this shard alone
@@ -255,16 +260,18 @@ def _remade(
 
 
 def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:
-    """Why remade files are not to be written, or ""."""
+    """Why regenerated files are not to be written, or ""."""
     for finding in findings:
-        if isinstance(finding.cure, Remake):
+        if isinstance(finding.cure, Regenerate):
             data = files.get(finding.cure.entry.path)
             if data is None or not _has_digest(data, finding.cure.entry):
                 return "Restore the file from a backup: made again here, the shard has other bytes"
     return ""
 
 
-def _mend_sealed(place: Storage, findings: list[Finding], mended: Repaired, refused: dict[str, str]) -> bool:
+def _repair_sealed(
+    place: Storage, findings: list[Finding], repaired: Repaired, refused: dict[str, str]
+) -> bool:
     """Mend the sealed store: as a whole where one rename does it, else file by file."""
     roots = {SEALED, f"{SEALED}/{ROOT}"}
     try:
@@ -273,16 +280,16 @@ def _mend_sealed(place: Storage, findings: list[Finding], mended: Repaired, refu
             f.key in roots and isinstance(f.cure, Reseal) and f.cure.data is None for f in findings
         ):
             seal(place)
-            mended.resealed = True
+            repaired.resealed = True
             return True
         # The root last: it is what opens the store.
         for finding in sorted(findings, key=lambda f: f.key in roots):
             if isinstance(finding.cure, Reseal):
-                _mend_one(place, finding.key, finding.cure)
-                mended.sealed_files.append(finding.key)
+                _repair_one(place, finding.key, finding.cure)
+                repaired.sealed_files.append(finding.key)
     except InputError as error:
         refused[SEALED] = str(error)
-        mended.left += [_refused(finding, refused) for finding in findings]
+        repaired.left += [_refused(finding, refused) for finding in findings]
         return False
     return True
 
@@ -302,7 +309,7 @@ def _refuse_fewer_rows(place: Storage) -> None:
         raise InputError(f"{place.url}/{SEALED}", "", problem, mend)
 
 
-def _mend_one(place: Storage, key: str, cure: Reseal) -> None:
+def _repair_one(place: Storage, key: str, cure: Reseal) -> None:
     if cure.source:
         place.link_or_copy(cure.source, key)
     elif cure.data is not None:

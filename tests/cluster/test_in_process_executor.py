@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from datagen.cluster.attempt_guard import Meter, Note, failure_report, guarded, read_note
+from datagen.cluster.attempt_guard import Meter, guarded
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_totals import JobSummary
+from datagen.cluster.post_mortem import Note, failure_report, read_note
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder
 from datagen.cluster.stop_request import StopRequest, stop_on_signals

@@ -250,11 +250,11 @@ def _flip(path: Path) -> None:
 
 
 def _repair(folder: Path) -> None:
-    def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+    def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
         return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, shard))
 
-    mended = repair_runs(open_storage(folder, probe=False), remake)
-    for finding in mended.left:
+    repaired = repair_runs(open_storage(folder, probe=False), regenerate)
+    for finding in repaired.left:
         raise InputError(finding.key, "", finding.problem, finding.mend)  # the command ends with 1
 
 

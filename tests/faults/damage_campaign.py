@@ -42,7 +42,7 @@ class Campaign:
     """How many damages of each kind there were, and those that went wrong."""
 
     tried: Counter[str] = field(default_factory=Counter[str])
-    mended: Counter[str] = field(default_factory=Counter[str])
+    repaired: Counter[str] = field(default_factory=Counter[str])
     missed: list[str] = field(default_factory=list[str])
     not_restored: list[str] = field(default_factory=list[str])
     not_clean: list[str] = field(default_factory=list[str])
@@ -54,7 +54,7 @@ class Campaign:
                 sum(one.startswith(f"{kind} ") for one in bad)
                 for bad in (self.missed, self.not_restored, self.not_clean)
             ]
-            yield kind, self.tried[kind], counts[0], self.mended[kind], counts[1], counts[2]
+            yield kind, self.tried[kind], counts[0], self.repaired[kind], counts[1], counts[2]
 
 
 @contextmanager
@@ -81,7 +81,7 @@ def make_place(
     return run
 
 
-def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
     """The files of a shard of random rows, computed again."""
     scenes, samples = rows_of(run, shard)
     return encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
@@ -142,17 +142,17 @@ def try_all(
         if number % mend_every:
             undo()
             continue
-        campaign.mended[damage.kind] += 1
-        mended = mend_at(scratch)
-        if mended.changed:
-            campaign.not_restored.append(f"{name}: also touched {mended.changed[:3]}")
+        campaign.repaired[damage.kind] += 1
+        repaired = mend_at(scratch)
+        if repaired.changed:
+            campaign.not_restored.append(f"{name}: also touched {repaired.changed[:3]}")
         there = {key: (scratch / key).read_bytes() for key in keys_of(scratch)}
         # What has no second source may be left as it is, or be written anew from what is known.
         apart = {key for key in whole.keys() | there.keys() if whole.get(key) != there.get(key)}
         alone = damage.key.startswith(_ALONE)
         if apart - ({damage.key} if alone else set()):
             campaign.not_restored.append(f"{name}: {sorted(apart)[:3]}")
-        if not alone and ((left := findings_at(scratch)) or mended.left):
+        if not alone and ((left := findings_at(scratch)) or repaired.left):
             campaign.not_clean.append(f"{name}: {left[:2]}")
         if apart:
             shutil.rmtree(scratch)
@@ -204,7 +204,7 @@ def findings_at(folder: Path) -> list[Finding]:
 
 def mend_at(folder: Path) -> Repaired:
     """Mend a place of random rows."""
-    return repair_runs(open_storage(folder, probe=False, create=False), remake)
+    return repair_runs(open_storage(folder, probe=False, create=False), regenerate)
 
 
 def _flipped(data: bytes, bit: int) -> bytes:

@@ -10,8 +10,9 @@ import sys
 import time
 from dataclasses import dataclass
 
-from datagen.cluster.attempt_guard import Meter, notes_of_a_job
+from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import Order, drive
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor

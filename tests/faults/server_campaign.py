@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import psutil
 
-from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.job_totals import JobSummary, JobTotals
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
 from datagen.cluster.retry_policy import RetryPolicy

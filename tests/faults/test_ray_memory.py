@@ -8,8 +8,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.retry_policy import RetryPolicy

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.attempt_guard import notes_of_a_job
 from datagen.cluster.driver import Order, drive
 from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor

@@ -37,8 +37,8 @@ def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
             yield finding
 
     monkeypatch.setattr(repair, "check_runs", and_the_driver_goes_on)
-    mended = repair_runs(run.storage, never)
-    assert (mended.records, mended.left) == (["ledger/lost.json"], [])
+    repaired = repair_runs(run.storage, never)
+    assert (repaired.records, repaired.left) == (["ledger/lost.json"], [])
     assert run.ledger.end_of("slow") == account
     end = run.ledger.end_of("lost")
     assert end is not None and end.outcome == "lost"
@@ -59,9 +59,9 @@ def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
         run.storage.put("new.txt", b"1")
         run.storage.delete(["gone.txt"])
 
-    mended = repair_runs(run.storage, never, 1, others)
-    assert mended.records == [] and sorted(mended.changed) == ["gone.txt", "other.txt"]
-    assert mended.untouched == files - 2
+    repaired = repair_runs(run.storage, never, 1, others)
+    assert repaired.records == [] and sorted(repaired.changed) == ["gone.txt", "other.txt"]
+    assert repaired.untouched == files - 2
 
 
 def test_of_several_copies_the_one_of_the_ledgers_winner_restores_a_commit(tmp_path: Path) -> None:
@@ -70,6 +70,6 @@ def test_of_several_copies_the_one_of_the_ledgers_winner_restores_a_commit(tmp_p
         run.storage.put(commit_copy_key(1, name), encode_record(write(run, 1, name)))
     whole = run.storage.get(commit_key(1), MAX_RECORD_BYTES)
     run.storage.delete([commit_key(1)])
-    mended = repair_runs(run.storage, never)
-    assert (mended.records, mended.left) == ([commit_key(1)], [])
+    repaired = repair_runs(run.storage, never)
+    assert (repaired.records, repaired.left) == ([commit_key(1)], [])
     assert run.storage.get(commit_key(1), MAX_RECORD_BYTES) == whole
