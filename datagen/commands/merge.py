@@ -14,7 +14,7 @@ from datagen.jobs.options import absolute_place
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import label_counts, open_runs
-from datagen.schemas.merging import Merge, Result, carry_out, plan_merge
+from datagen.schemas.merging import Merge, Result, merge_runs, plan_merge
 from datagen.schemas.merging.writing import Written
 from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
@@ -38,7 +38,7 @@ def merge(
         with steps("commits read", commits, json) as step:
             planned = plan_merge(runs, out, step)
         with steps("records written", planned.records, json) as step:
-            result = carry_out(planned, step)
+            result = merge_runs(planned, step)
     report = merge_report(planned, result)
     if json:
         print_json(report)

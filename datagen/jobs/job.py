@@ -29,7 +29,7 @@ from datagen.cluster.task import ShardTask
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.job_recorder import JobRecorder
-from datagen.jobs.options import Placing
+from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
@@ -43,7 +43,7 @@ SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class JobRun:
     """One run of a job, and where its sources lie."""
 
     run: Run
@@ -56,33 +56,33 @@ class Work:
 class JobPlan:
     """What a job does: the missing shards of one run, or of the parts of a merged place."""
 
-    place: Storage  # where the job's records and the sealed store go
-    name: str  # the place as the user wrote it
-    works: Sequence[Work]
-    placing: Placing
+    storage: Storage  # where the job's records and the sealed store go
+    path: str  # as the user wrote it
+    runs: Sequence[JobRun]
+    options: JobOptions
     began_s: float  # by the monotonic clock, when the command began to open them
     resume: Sequence[str]  # the words of the command that goes on with it
 
 
-def carry_out(plan: JobPlan) -> int:
+def run_job(plan: JobPlan) -> int:
     """Make every missing shard, seal, and say how it went; the exit code.
 
-    While it works, the job is known in the place, and handles requests to stop that are left there.
+    While it works, the job is known there, and handles requests to stop that are left there.
     """
     if not _count_missing(plan):
-        for work in plan.works:
-            close_lost_attempts(work.run)
+        for job_run in plan.runs:
+            close_lost_attempts(job_run.run)
         return _finish(plan, _judged(plan, empty_summary()))
-    board = open_board(plan)
+    recorder = open_recorder(plan)
     try:
-        summary = _judged(plan, make_missing(plan, board))
-        board.seal()
+        summary = _judged(plan, make_missing(plan, recorder))
+        recorder.seal()
         code = _finish(plan, summary)
     except BaseException as error:
         end, code = _end_of(error)
-        board.end(end, code, " ".join(str(error).split())[:1000])
+        recorder.end(end, code, " ".join(str(error).split())[:1000])
         raise
-    board.end(summary.end, code, summary.cause, summary)
+    recorder.end(summary.end, code, summary.cause, summary)
     return code
 
 
@@ -94,7 +94,7 @@ def _end_of(error: BaseException) -> tuple[JobEnd, int]:
     return "broken", 2 if isinstance(error, InputError) else 1
 
 
-def open_board(plan: JobPlan) -> JobRecorder:
+def open_recorder(plan: JobPlan) -> JobRecorder:
     """Make the job known in its place."""
     record = JobRecord(
         id=new_job_id(),
@@ -102,54 +102,54 @@ def open_board(plan: JobPlan) -> JobRecorder:
         host=platform.node(),
         pid=os.getpid(),
         started=utc_now(),
-        address=plan.placing.address,
+        address=plan.options.address,
         submission=os.environ.get(SUBMISSION, ""),
         jobs_api=os.environ.get(JOBS_API, ""),
     )
-    board = JobRecorder(Jobs(plan.place), record, _count_missing(plan))
-    board.begin()
-    return board
+    recorder = JobRecorder(Jobs(plan.storage), record, _count_missing(plan))
+    recorder.begin()
+    return recorder
 
 
 def _count_missing(plan: JobPlan) -> int:
-    return sum(len(work.run.missing()) for work in plan.works)
+    return sum(len(job_run.run.missing()) for job_run in plan.runs)
 
 
-def make_missing(plan: JobPlan, board: JobRecorder) -> JobSummary:
+def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
     """Drive one run after the other on one set of workers; how that ended."""
-    missing = [work.run.missing() for work in plan.works]
-    placing, stop = plan.placing, StopRequest()
-    policy = RetryPolicy(max_quarantined_share=placing.max_quarantined)
+    missing = [job_run.run.missing() for job_run in plan.runs]
+    job_options, stop = plan.options, StopRequest()
+    policy = RetryPolicy(max_quarantined_share=job_options.max_quarantined)
     whole = empty_summary()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
-        shown = stack.enter_context(Progress(placing.json))
-        executor = _executor(placing, sum(map(len, missing)), stack, shown)
-        stack.enter_context(stop_on_signals(stop, interrupt=placing.workers == 0))
-        for work, shards in zip(plan.works, missing, strict=True):
+        shown = stack.enter_context(Progress(job_options.json))
+        executor = _executor(job_options, sum(map(len, missing)), stack, shown)
+        stack.enter_context(stop_on_signals(stop, interrupt=job_options.workers == 0))
+        for job_run, shards in zip(plan.runs, missing, strict=True):
             if whole.end in ("interrupted", "aborted"):
                 whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
             elif shards:
-                whole = whole.plus(_drive(work, shards, executor, policy, board, stop, shown, notes))
-                board.add(whole.totals)
+                whole = whole.plus(_drive(job_run, shards, executor, policy, recorder, stop, shown, notes))
+                recorder.add(whole.totals)
         whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
-    for work in plan.works:
+    for job_run in plan.runs:
         # What a killed driver left open is closed last: its workers may outlive it and still commit.
-        close_lost_attempts(work.run)
+        close_lost_attempts(job_run.run)
     return whole
 
 
 def _drive(
-    work: Work,
+    job_run: JobRun,
     shards: Sequence[int],
     executor: Executor[ShardTask],
     policy: RetryPolicy,
-    board: JobRecorder,
+    recorder: JobRecorder,
     stop: StopRequest,
     shown: Progress,
     notes: str,
 ) -> JobSummary:
-    run = work.run
+    run = job_run.run
     layout, spec = run.layout, run.manifest.spec
 
     def make_task(order: Order) -> ShardTask:
@@ -159,11 +159,11 @@ def _drive(
             layout=layout,
             shard=order.shard,
             attempt=order.attempt,
-            houses=work.houses,
-            objects=work.objects,
+            houses=job_run.houses,
+            objects=job_run.objects,
             deadline_s=order.deadline_s,
             notes=notes,
-            scenes_from=work.scenes_from,
+            scenes_from=job_run.scenes_from,
         )
 
     if isinstance(executor, RayExecutor):
@@ -172,7 +172,7 @@ def _drive(
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     shown.phase("making labels")
-    events = JobMonitor(board, stop, per_shard, JobProgress(shown, per_shard, done))
+    events = JobMonitor(recorder, stop, per_shard, JobProgress(shown, per_shard, done))
     return drive(shards, make_task, executor, RunRecorder(run), policy, events, stop)
 
 
@@ -184,22 +184,22 @@ def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
     if summary.end not in ("complete", "failed") or summary.remaining:
         return summary
     given_up = planned = 0
-    for work in plan.works:
-        shards = work.run.planned()
+    for job_run in plan.runs:
+        shards = job_run.run.planned()
         planned += len(shards)
-        given_up += sum(shard in shards for shard in work.run.quarantined())
-    policy = RetryPolicy(max_quarantined_share=plan.placing.max_quarantined)
+        given_up += sum(shard in shards for shard in job_run.run.quarantined())
+    policy = RetryPolicy(max_quarantined_share=plan.options.max_quarantined)
     failed = too_many_quarantined(policy, given_up, planned)
     return replace(summary, end="failed" if failed else "complete")
 
 
-def _executor(placing: Placing, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
-    if placing.workers == 0:
+def _executor(job_options: JobOptions, shards: int, stack: ExitStack, shown: Progress) -> Executor[ShardTask]:
+    if job_options.workers == 0:
         return InProcessExecutor(run_attempt)
     shown.phase("starting Ray")
     cores = len(os.sched_getaffinity(0))
-    workers = min(placing.workers or cores, shards)  # Ray starts them all at once
-    ray_settings = RaySettings(address=placing.address, workers=workers)
+    workers = min(job_options.workers or cores, shards)  # Ray starts them all at once
+    ray_settings = RaySettings(address=job_options.address, workers=workers)
     return stack.enter_context(ray_executor(run_attempt, ray_settings))
 
 
@@ -209,7 +209,7 @@ class _CannotContinue(InputError):
 
 def _finish(plan: JobPlan, summary: JobSummary) -> int:
     """Seal what there is, say how it went and how to go on; return the exit code."""
-    totals, runs, name = summary.totals, [work.run for work in plan.works], plan.name
+    totals, runs, path = summary.totals, [job_run.run for job_run in plan.runs], plan.path
     n, resume = sum(run.n for run in runs), command_line(plan.resume)
     given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
     if totals.shards:
@@ -225,21 +225,21 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         ("retries", str(totals.retries)),
     ]
     if given_up:
-        again = command_line(["resume", name, "--quarantined"])
+        again = command_line(["resume", path, "--quarantined"])
         those = f"{counted(len(given_up), 'shard')} ({listed([shard for _, shard in given_up])})"
         shown = f"{those}: {again} tries again"
         rows.append(("quarantined", shown))
     if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
-        sealed = seal(plan.place)
+        sealed = seal(plan.storage)
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
-    print_rows(f"{summary.end}: {name}", rows)
+    print_rows(f"{summary.end}: {path}", rows)
     if summary.end == "aborted":
-        raise _CannotContinue(name, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
+        raise _CannotContinue(path, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
     if summary.end == "failed":
         causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
         most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
-        see = command_line(["status", name])
-        sys.stderr.write(one_line(f"error: {name}: too many shards failed{most}. See: {see}") + "\n")
+        see = command_line(["status", path])
+        sys.stderr.write(one_line(f"error: {path}: too many shards failed{most}. See: {see}") + "\n")
     if summary.end == "interrupted":
         say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", plan.resume)
     return summary.exit_code

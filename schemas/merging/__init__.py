@@ -87,7 +87,7 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     return Merge(out, tuple(existing), unions, hashes)
 
 
-def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
+def merge_runs(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
     """Write a planned merge and seal it; `tick` is called for every shard and every attempt.
 
     Doing it again finishes what was cut short, and changes nothing where it is done.

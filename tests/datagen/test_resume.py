@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import datagen.commands.submit
-import datagen.jobs.continue_runs
+import datagen.jobs.start_job
 from datagen import cli
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
@@ -157,7 +157,7 @@ def test_an_early_ctrl_c_says_how_to_go_on(
         patched.setattr("datagen.jobs.job.InProcessExecutor", interrupting)
         assert the_command(capsys, lambda: cli.run(again))[:2] == ["resume", str(run)]
     with monkeypatch.context() as patched:  # while sources are opened
-        patched.setattr(datagen.jobs.continue_runs, "open_sources", interrupting)
+        patched.setattr(datagen.jobs.start_job, "open_sources", interrupting)
         again = the_command(capsys, lambda: cli.run(["resume", str(run), *HERE]))
     jobs = json_of(capsys, ["status", str(run)])["jobs"]
     assert [job["state"]["end"] for job in jobs] == ["interrupted"]

@@ -19,7 +19,7 @@ from datagen.schemas.fields import SCHEMAS, RecordSchema
 from datagen.schemas.garbage_collection import find_garbage
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.root_records import publish
 from datagen.schemas.run import Run
@@ -218,7 +218,7 @@ def _apart(folder: Path, seeds: tuple[int, int]) -> None:
 
 
 def _merge(folder: Path) -> None:
-    carry_out(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
+    merge_runs(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
 
 
 def _damaged_records(folder: Path) -> None:

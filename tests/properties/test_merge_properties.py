@@ -23,7 +23,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import shard_folder
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry, QuarantineRecord
 from datagen.schemas.scene_rows import read_shard
@@ -160,7 +160,7 @@ def workplace() -> Iterator[Path]:
 
 
 def merge(folder: Path, names: Sequence[str], out: str) -> Path:
-    carry_out(plan_merge([str(folder / name) for name in names], str(folder / out)))
+    merge_runs(plan_merge([str(folder / name) for name in names], str(folder / out)))
     return folder / out
 
 

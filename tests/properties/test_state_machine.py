@@ -29,7 +29,7 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.keys import commit_key, shard_folder
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
@@ -221,10 +221,10 @@ class AnyHistory(RuleBasedStateMachine):
         named = [str(place.folder) for place in places]
         if len({place.rule for place in places}) > 1:
             with pytest.raises(InputError):
-                carry_out(plan_merge(named, str(folder)))
+                merge_runs(plan_merge(named, str(folder)))
             assert not folder.exists() or not any(folder.iterdir())
             return
-        carry_out(plan_merge(named, str(folder)))
+        merge_runs(plan_merge(named, str(folder)))
         parts: dict[tuple[int, str], Part] = {}
         for place in places:
             for key, part in place.parts.items():

@@ -9,7 +9,7 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage
@@ -39,12 +39,12 @@ def test_a_merge_without_room_leaves_what_another_one_has_committed(
                 with monkeypatch.context() as patch:
                     patch.setattr(Storage, "sync", plain)
                     if not is_first:
-                        carry_out(planned)
+                        merge_runs(planned)
                 raise FULL
 
     with monkeypatch.context() as patch, pytest.raises(InputError, match="No space left"):
         patch.setattr(Storage, "sync", full)
-        carry_out(planned)
+        merge_runs(planned)
     out = Run.open(tmp_path / "out")
     assert calls == 1
     assert out.committed() == (set() if is_first else {0, 1} if size == 1 else {0})
@@ -53,7 +53,7 @@ def test_a_merge_without_room_leaves_what_another_one_has_committed(
     left = [file.key for file in out.storage.list("shards")]
     assert not any(key.endswith(REMOVING) for key in left)
     assert bool(left) != is_first
-    carry_out(planned)
+    merge_runs(planned)
     assert list(Run.open(tmp_path / "out").missing()) == []
 
 

@@ -10,8 +10,8 @@ from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detached_words
-from datagen.jobs.job import JobPlan, Work, carry_out
-from datagen.jobs.options import Placing, absolute_place, absolute_source
+from datagen.jobs.job import JobPlan, JobRun, run_job
+from datagen.jobs.options import JobOptions, absolute_place, absolute_source
 from datagen.regeneration.shards import open_sources
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
@@ -34,7 +34,7 @@ def source_words(given: Sources) -> list[str]:
     )
 
 
-def open_work(run: Run, given: Sources, address: str) -> Work:
+def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
     """An existing run with its sources, checked to be those that it was made from.
 
     InputError where they are not there, or where another engine is installed than the run was made with:
@@ -50,7 +50,7 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
     _refuse_other_engines(run)
     open_sources(run, given)
     refuse_unusable_engines(spec, address)
-    return Work(
+    return JobRun(
         run,
         absolute_source(given.houses or known.get("houses", "builtin")),
         absolute_source(given.objects or known.get("objects", "builtin")),
@@ -58,19 +58,19 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
     )
 
 
-def continue_runs(
-    place: Storage,
-    name: str,
-    works: Sequence[Work],
-    placing: Placing,
+def start_job(
+    storage: Storage,
+    path: str,
+    job_runs: Sequence[JobRun],
+    job_options: JobOptions,
     began_s: float,
     given: Sources = AS_FOUND,
 ) -> int:
-    """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
-    words = ["resume", absolute_place(name), *source_words(given), *placing.words()]
-    words += detached_words() or placing.address_words()
+    """Run the job of what is missing; the exit code. `path` is the run as the user wrote it."""
+    words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
+    words += detached_words() or job_options.address_words()
     with resumable(words):
-        return carry_out(JobPlan(place, name, works, placing, began_s, words))
+        return run_job(JobPlan(storage, path, job_runs, job_options, began_s, words))
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:
