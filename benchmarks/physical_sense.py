@@ -36,8 +36,9 @@ from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance
+from datagen.workers.trials.trial_scene import prepare_trials
 from datagen.workers.world import assemble_world
 
 

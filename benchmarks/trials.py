@@ -23,9 +23,15 @@ from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
 from datagen.workers.labels.arm_labelling import arm_of, draw_disturbances
 from datagen.workers.trials import physics
-from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
+from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance, TrialResult
-from datagen.workers.trials.trial_scene import Things, pedestal_below, still_parts_near
+from datagen.workers.trials.trial_scene import (
+    Things,
+    TrialScene,
+    pedestal_below,
+    prepare_trials,
+    still_parts_near,
+)
 
 
 @dataclass(frozen=True)

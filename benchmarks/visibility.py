@@ -22,7 +22,7 @@ from datagen.schemas.cost import StageClock
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.embree_renderer import ray_scene
 from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.rendering.pybullet_renderer import PybulletScene
 from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
@@ -83,14 +83,14 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
 
         bare = SceneGeometry(scene.house.house, (), np.zeros((0, 4, 4)))
         started_s = time.process_time()
-        ray_stage(bare)
+        ray_scene(bare)
         embree.house_s += time.process_time() - started_s
         started_s = time.process_time()
         with PybulletScene(bare):
             tiny.house_s += time.process_time() - started_s
 
         started_s = time.process_time()
-        rays = ray_stage(stage)
+        rays = ray_scene(stage)
         loaded_s = time.process_time()
         by_embree = visible_pixels(rays, 0, eyes_m, window)
         embree.load_s += loaded_s - started_s

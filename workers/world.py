@@ -117,7 +117,7 @@ class World:
         gripper = gripper_of(self.spec.arm.robot)
         return Targets(self.object_names, self.objects.load, gripper, self.spec.arm.grasps)
 
-    def stage(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
+    def ray_scene(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
         """A house with the named objects at these poses (K, 4, 4), ready for rays."""
         prepared = [self.object(name) for name in names]
         radii_m = np.array([p.model.radius_m for p in prepared])

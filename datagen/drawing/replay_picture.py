@@ -34,7 +34,7 @@ def draw_replay(
     for column, (name, side) in enumerate((("stored", stored), ("drawn again", made))):
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
-        draw_frame(axes[0, column], render_frame(spec.observation, recalled.stage, recalled.camera, rng))
+        draw_frame(axes[0, column], render_frame(spec.observation, recalled.geometry, recalled.camera, rng))
         axes[0, column].set_title(f"{name}: RGB frame, target outlined")
         _draw_plan(axes[1, column], recalled, rows, centre, row)
         axes[1, column].set_title(f"{name}: candidates by label")

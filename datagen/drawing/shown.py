@@ -35,7 +35,7 @@ class Shown:
     def frame(self) -> Frame:
         """The RGB-D frame, rendered again."""
         rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
-        return render_frame(self.spec.observation, self.recalled.stage, self.recalled.camera, rng)
+        return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
     def place(self, row: int) -> str:
         """Where a candidate's base is."""

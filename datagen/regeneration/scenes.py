@@ -1,4 +1,4 @@
-"""Scenes of a run made again: drawn from their seeds, or recalled from what is stored, and labelled."""
+"""Scenes of a run made again: drawn from their seeds, or reconstructed from what is stored, and labelled."""
 
 from __future__ import annotations
 

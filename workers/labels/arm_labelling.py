@@ -30,8 +30,9 @@ from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, p
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
-from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
+from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance, TrialResult
+from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
 
 _PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; success is first
 

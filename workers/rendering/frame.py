@@ -55,6 +55,6 @@ class Frame:
 
 
 class Renderer(Protocol):
-    """Renders one frame of a stage."""
+    """Renders one frame of a scene."""
 
-    def __call__(self, stage: SceneGeometry, camera: Camera) -> Frame: ...
+    def __call__(self, scene: SceneGeometry, camera: Camera) -> Frame: ...

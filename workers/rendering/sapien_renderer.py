@@ -40,11 +40,11 @@ class _Studio:
 _studio: _Studio | None = None
 
 
-def render_sapien(stage: SceneGeometry, camera: Camera) -> Frame:
-    """The whole frame of a stage. Raises InputError where this machine has no render device."""
+def render_sapien(geometry: SceneGeometry, camera: Camera) -> Frame:
+    """The whole frame of a scene. Raises InputError where this machine has no render device."""
     studio = _the_studio()
-    meshes = [(concatenate([body.visual for body in stage.house.bodies]), np.eye(4))]
-    meshes += [(model.visual, T) for model, T in zip(stage.objects, stage.T_world_object, strict=True)]
+    meshes = [(concatenate([body.visual for body in geometry.house.bodies]), np.eye(4))]
+    meshes += [(model.visual, T) for model, T in zip(geometry.objects, geometry.T_world_object, strict=True)]
     entities: list[sapien.Entity] = []
     try:
         for mesh, T in meshes:

@@ -80,15 +80,15 @@ def _try_scene(
         candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng)
 
     with clock.stage("observe"):
-        rays = world.stage(house, names, settled.T_world_object)
+        rays = world.ray_scene(house, names, settled.T_world_object)
         room = house.house.room(surface.room_id)
         rng = generator(spec.seed, Stream.OBSERVE, index, retry)
         camera, share = draw_viewpoint(
             rays, room, house.obstacles, target_m, spec.observation, spec.candidates, rng
         )
-        stage = SceneGeometry(house.house, models, settled.T_world_object)
+        geometry = SceneGeometry(house.house, models, settled.T_world_object)
         noise_rng = generator(spec.seed, Stream.NOISE, index, retry)
-        cloud = _observe(spec.observation, stage, rays, camera, rng, noise_rng)
+        cloud = _observe(spec.observation, geometry, rays, camera, rng, noise_rng)
     scene = Scene(index, retry, redraws, house, surface, models, settled, rays, camera, share, cloud)
     return scene, candidates
 
@@ -135,16 +135,16 @@ def _lowest_m(model: ObjectModel, T_world_object: F64) -> float:
 
 
 def render_frame(
-    params: ObservationParams, stage: SceneGeometry, camera: Camera, noise_rng: np.random.Generator
+    params: ObservationParams, geometry: SceneGeometry, camera: Camera, noise_rng: np.random.Generator
 ) -> Frame:
     """The whole frame by the specified renderer, with the specified noise."""
-    frame = load_renderer(params.renderer)(stage, camera)
+    frame = load_renderer(params.renderer)(geometry, camera)
     return add_noise(frame, params.noise, noise_rng) if params.noise.enabled else frame
 
 
 def _observe(
     params: ObservationParams,
-    stage: SceneGeometry,
+    geometry: SceneGeometry,
     rays: RayScene,
     camera: Camera,
     rng: np.random.Generator,
@@ -156,7 +156,7 @@ def _observe(
     cast: PixelCaster = (
         (lambda pixels: cast_pixels(rays, camera, pixels))
         if single
-        else caster_of(render_frame(params, stage, camera, noise_rng))
+        else caster_of(render_frame(params, geometry, camera, noise_rng))
     )
     radius_m = float(rays.radii_m[0])
-    return observe_cloud(cast, camera, 1, stage.T_world_object[0, :3, 3], radius_m, params, rng)
+    return observe_cloud(cast, camera, 1, geometry.T_world_object[0, :3, 3], radius_m, params, rng)

@@ -1,4 +1,4 @@
-"""A stored scene made whole again from its record: the same stage, without drawing or physics.
+"""A stored scene made whole again from its record: the same geometry, without drawing or physics.
 
 The store checks that bytes are those that were written; here is checked that they make sense, so that no
 label is worked out for poses that no body can have.
@@ -50,12 +50,12 @@ class ReconstructedScene:
         return self.T_world_object[0, :3, 3]
 
     @property
-    def stage(self) -> SceneGeometry:
+    def geometry(self) -> SceneGeometry:
         return SceneGeometry(self.house.house, self.models, self.T_world_object)
 
 
 def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
-    """Rebuild the stage of a record from the sources it names.
+    """Rebuild the geometry of a record from the sources it names.
 
     Raises InputError where a house or an object is not there any more or has other content, and for
     poses that no body can have.
@@ -84,7 +84,7 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     for model, digest in zip(models, record["object_digest"], strict=True):
         _same(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
-    rays = world.stage(house, names, T_world_object)
+    rays = world.ray_scene(house, names, T_world_object)
     return ReconstructedScene(index, retry, house, models, T_world_object, rays, camera)
 
 

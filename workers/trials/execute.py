@@ -17,11 +17,8 @@ from datagen.workers.trials.trial_scene import (
     TrialScene,
     disturbed_things,
     pedestal_below,
-    prepare_trials,
     still_parts_near,
 )
-
-__all__ = ["TrialScene", "prepare_trials", "run_trial"]
 
 # At the end of reach and approach no joint may be farther off than this, nor the TCP.
 _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015

@@ -7,7 +7,7 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.houses.house import House
-from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.embree_renderer import ray_scene
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.reconstruct import ReconstructedScene
@@ -27,7 +27,7 @@ def recalled(house: House | None = None) -> ReconstructedScene:
     stage = stage_with(models, ((0.0, 0.0), (0.25, 0.15)), house)
     camera = camera_at((0.4, 0.4, 1.4), (ROOM_M[0] / 2, ROOM_M[1] / 2, TABLE_TOP_M))
     return ReconstructedScene(
-        0, 0, PreparedHouse(stage.house), models, stage.T_world_object, ray_stage(stage), camera
+        0, 0, PreparedHouse(stage.house), models, stage.T_world_object, ray_scene(stage), camera
     )
 
 

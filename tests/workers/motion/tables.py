@@ -16,7 +16,7 @@ from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.embree_renderer import ray_scene
 from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
@@ -66,7 +66,7 @@ def scene_of(
     house: House, objects: Sequence[ObjectModel], poses: Sequence[F64], index: int = 0
 ) -> SettledScene:
     T = np.stack(poses)
-    rays = ray_stage(SceneGeometry(house, tuple(objects), T))
+    rays = ray_scene(SceneGeometry(house, tuple(objects), T))
     return ReconstructedScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
 
 

@@ -9,7 +9,7 @@ import pybullet
 import pytest
 
 from datagen.workers.geometry.mesh import Mesh
-from datagen.workers.rendering.embree_renderer import ray_stage, render_embree
+from datagen.workers.rendering.embree_renderer import ray_scene, render_embree
 from datagen.workers.rendering.frame import Camera, SceneGeometry
 from datagen.workers.rendering.pybullet_renderer import PybulletScene, render_pybullet
 from datagen.workers.rendering.visibility import visible_pixels
@@ -76,7 +76,7 @@ def test_rho_agrees_with_embree_from_all_sides() -> None:
     rng = np.random.default_rng(3)
     angle = rng.uniform(0, 2 * np.pi, 40)
     eyes = np.stack([2 + 0.7 * np.cos(angle), 1.5 + 0.7 * np.sin(angle), rng.uniform(0.8, 1.4, 40)], axis=1)
-    rays = ray_stage(stage)
+    rays = ray_scene(stage)
     with PybulletScene(stage) as loaded:
         for target in (0, 1):
             ours_alone, ours_seen = loaded.visible_pixels(target, eyes, 48)
