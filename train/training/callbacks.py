@@ -1,4 +1,4 @@
-"""What a training tells while it runs, and to whom: the loop knows this protocol alone."""
+"""Callbacks of the training loop: steps and epochs as they end, and their curves for TensorBoard."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TrainingStep:
 
 
 class TrainingCallback(Protocol):
-    """Is told of steps and epochs."""
+    """Called after each step and each epoch."""
 
     def step(self, step: TrainingStep) -> None: ...
 
@@ -35,18 +35,18 @@ class TrainingCallback(Protocol):
 
 
 class CallbackList:
-    """Several as one."""
+    """Several callbacks as one."""
 
-    def __init__(self, watchers: Sequence[TrainingCallback]) -> None:
-        self._watchers = tuple(watchers)
+    def __init__(self, callbacks: Sequence[TrainingCallback]) -> None:
+        self._callbacks = tuple(callbacks)
 
     def step(self, step: TrainingStep) -> None:
-        for watcher in self._watchers:
-            watcher.step(step)
+        for callback in self._callbacks:
+            callback.step(step)
 
     def epoch(self, record: dict[str, Any]) -> None:
-        for watcher in self._watchers:
-            watcher.epoch(record)
+        for callback in self._callbacks:
+            callback.epoch(record)
 
 
 class TensorBoardCallback:

@@ -1,4 +1,4 @@
-"""From a stage's job to a training that can run: streams, refusals, model, and the position to go on from."""
+"""Sets up the training of a stage: streams, checks, model, and the position from which it resumes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from datagen.train.training.checkpoints import (
     write_checkpoint,
 )
 from datagen.train.training.display import TrainingProgress
-from datagen.train.training.loop import Position, Training, run
+from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from datagen.train.training.options import STAGES, Options
 from datagen.train.training.ranks import Ranks
@@ -48,7 +48,7 @@ class TrainingJob:
     init: str | None = None
     device: str = "cpu"
     threads: int = 1
-    keep_every_s: float = 300.0
+    save_every_s: float = 300.0
     tensorboard: str | None = None
     json_lines: bool = False  # as progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
@@ -61,21 +61,23 @@ def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> b
     """
     torch.set_num_threads(job.threads)
     with ExitStack() as stack:
-        watchers: list[TrainingCallback] = []
+        callbacks: list[TrainingCallback] = []
         if ranks.leads:
             stack.enter_context(only_writer(job.out))
             shown = stack.enter_context(Progress(job.json_lines))
             shown.phase("opening runs")
-            watchers.append(TrainingProgress(shown, job.out))
-        training, head = prepare(job, ranks)
+            callbacks.append(TrainingProgress(shown, job.out))
+        training, head = prepare_training(job, ranks)
         at = training.position
         if ranks.leads and job.tensorboard and not at.finished:
-            watchers.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
-        watcher = CallbackList(watchers)
-        return run(training, lambda: keep(job.out, training, head), watcher, stopping, job.keep_every_s)
+            callbacks.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
+        callback = CallbackList(callbacks)
+        return run_training(
+            training, lambda: save_checkpoint(job.out, training, head), callback, stopping, job.save_every_s
+        )
 
 
-def prepare(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
+def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
     """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say."""
     options, stage = job.options, STAGES[job.options.stage]
     began = read_checkpoint(job.init) if job.init is not None else None
@@ -91,12 +93,12 @@ def prepare(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
     if Path(job.out).exists():
         there = read_checkpoint(job.out)
         refuse_other_training(job.out, there.head, head)
-        position = _go_on(job.out, there, model, optimiser)
+        position = _resume_position(job.out, there, model, optimiser)
     weights = class_weights.to(model.device)
     return Training(options, model, optimiser, train, val, weights, position, ranks), head
 
 
-def keep(path: str, training: Training, head: CheckpointHead) -> None:
+def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None:
     """Write the checkpoint, if this rank leads."""
     if not training.ranks.leads:
         return
@@ -117,7 +119,9 @@ def keep(path: str, training: Training, head: CheckpointHead) -> None:
     write_checkpoint(path, Checkpoint(head, weights, resume, {"batch": at.batch, "sums": at.sums}))
 
 
-def _go_on(place: str, there: Checkpoint, model: Model, optimiser: torch.optim.Optimizer) -> Position:
+def _resume_position(
+    place: str, there: Checkpoint, model: Model, optimiser: torch.optim.Optimizer
+) -> Position:
     resume = there.resume
     put_weights(model, below("model.", resume), place)
     put_optimiser_tensors(optimiser, below("optimiser.", resume), place)

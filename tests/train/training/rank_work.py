@@ -14,9 +14,9 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.training.callbacks import CallbackList
-from datagen.train.training.loop import run
+from datagen.train.training.loop import run_training
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.training_setup import TrainingJob, keep, prepare
+from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 
 def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
@@ -25,8 +25,10 @@ def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool])
     Then the second rank refuses something while the first still waits for it.
     """
     torch.set_num_threads(1)
-    training, head = prepare(job, ranks)
-    assert run(training, lambda: keep(job.out, training, head), CallbackList([]), stopping)
+    training, head = prepare_training(job, ranks)
+    assert run_training(
+        training, lambda: save_checkpoint(job.out, training, head), CallbackList([]), stopping
+    )
     samples = [batch.sample_id for batch in training.train.epoch(0)]
     told = {"weights": training.model.state_dict(), "ids": torch.from_numpy(np.concatenate(samples))}
     torch.save(told, f"{job.out}.{ranks.rank}")

@@ -9,10 +9,10 @@ from typing import Any
 from torch import Tensor
 
 from datagen.train.training.callbacks import CallbackList, TrainingStep
-from datagen.train.training.loop import run
+from datagen.train.training.loop import run_training
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.training_setup import TrainingJob, keep, prepare
+from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 TINY: dict[str, Any] = {
     "n_points": 64,
@@ -60,13 +60,15 @@ class Recorder:
 
 def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Recorder]:
     """Go on with a job, as the verb does, until it ends or Ctrl-C comes during the given step."""
-    training, head = prepare(job, Ranks())
+    training, head = prepare_training(job, Ranks())
     seen = Recorder()
 
     def stopping() -> bool:
         return step is not None and training.position.step + 1 >= step
 
-    done = run(training, lambda: keep(job.out, training, head), CallbackList([seen]), stopping)
+    done = run_training(
+        training, lambda: save_checkpoint(job.out, training, head), CallbackList([seen]), stopping
+    )
     return done, seen
 
 
