@@ -28,12 +28,12 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     else goes wrong is raised as it is, and concerns this attempt alone unless a disk is full (`guarded`).
     """
     spec_hash = task.spec.hash()
-    run, world, source = open_task(task)
+    run, world, scenes_run = open_task(task)
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
             return AttemptResult(False, 0, 0, meter.cost())
-    stored = None if source is None else read_scenes(source, task.scene_indices)
+    stored = None if scenes_run is None else read_scenes(scenes_run, task.scene_indices)
     made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
@@ -66,8 +66,8 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     """
     with ends_job(every_input_error=True):
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
-        source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
-    return run, world, source
+        scenes_run = _open_scenes_run(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
+    return run, world, scenes_run
 
 
 @contextmanager
@@ -94,9 +94,9 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
 
 
 @lru_cache(maxsize=1)
-def _open_source(place: str, scenes_hash: str) -> Run:
-    source = Run.open(place)
-    if source.manifest.spec.scenes_hash != scenes_hash:
+def _open_scenes_run(place: str, scenes_hash: str) -> Run:
+    scenes_run = Run.open(place)
+    if scenes_run.manifest.spec.scenes_hash != scenes_hash:
         mend = "Give --scenes-from the run that this one was started with"
         raise InputError(place, "spec_hash", "the run now has other scenes", mend)
-    return source
+    return scenes_run
