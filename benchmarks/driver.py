@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
@@ -63,7 +63,7 @@ def through_ray(shards: int) -> float:
     with ray_cluster(settings) as ray, tempfile.TemporaryDirectory() as notes:
         executor = RayExecutor(nothing, settings, ray)
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             return ScriptedTask(order.shard, order.attempt, order.deadline_s, notes)
 
         def run(count: int) -> None:

@@ -26,7 +26,7 @@ from datagen.workers.trials import physics
 from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import (
-    Things,
+    MovableObjects,
     TrialScene,
     pedestal_below,
     prepare_trials,
@@ -112,7 +112,7 @@ def build_time_s(cases: list[Case], prepared: list[TrialScene], trial: TrialPara
         physics.TrialWorld(
             still_parts_near(scene, case.T_world_base),
             pedestal_below(scene, case.T_world_base),
-            Things(scene.parts_m, scene.mass_kg, scene.T_world_object),
+            MovableObjects(scene.parts_m, scene.mass_kg, scene.T_world_object),
             scene.robot,
             scene.articulation,
             case.T_world_base,

@@ -28,7 +28,7 @@ from datagen.schemas.cost import StageClock
 from datagen.schemas.locked_folders import is_private
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, Host
-from datagen.schemas.storage.errors import FULL, StoreFailure, machine_error
+from datagen.schemas.storage.errors import FULL, StoreUnavailable, machine_error
 from datagen.schemas.whole_files import whole_file
 
 T = TypeVar("T", bound=Task)
@@ -84,7 +84,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
 
 def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
     # A store that gives no answer gives none to the next shard either, and a full disk stays full.
-    final = error if isinstance(error, JobCannotContinue | StoreFailure) else machine_error(error, FULL)
+    final = error if isinstance(error, JobCannotContinue | StoreUnavailable) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
     return AttemptReport(
         attempt=task.attempt,

@@ -43,7 +43,7 @@ class RetryPolicy:
 
 
 @dataclass(frozen=True)
-class Trouble:
+class ShardFailures:
     """What went wrong with one shard so far. Shards without trouble have none of these."""
 
     failures: int = 0
@@ -61,12 +61,16 @@ class Decision:
     """What to do after an attempt ended. `wait_s` is for retries."""
 
     action: Action
-    trouble: Trouble
+    trouble: ShardFailures
     wait_s: float = 0.0
 
 
 def decide(
-    policy: RetryPolicy, trouble: Trouble, report: AttemptReport, successes: int = 0, alone: bool = False
+    policy: RetryPolicy,
+    trouble: ShardFailures,
+    report: AttemptReport,
+    successes: int = 0,
+    alone: bool = False,
 ) -> Decision:
     """What to do with a shard after this report.
 
@@ -104,7 +108,7 @@ def decide(
     return Decision("retry", now, wait_s)
 
 
-def is_suspect(trouble: Trouble) -> bool:
+def is_suspect(trouble: ShardFailures) -> bool:
     """Whether the shard may be what takes its machine along: then no other suspect is in flight with it."""
     return trouble.lost >= 2
 
@@ -152,7 +156,7 @@ def percentile_95(values: Sequence[float] | deque[float]) -> float:
     return ordered[math.ceil(0.95 * len(ordered)) - 1]
 
 
-def deadline_s(policy: RetryPolicy, durations: Durations, trouble: Trouble) -> float:
+def deadline_s(policy: RetryPolicy, durations: Durations, trouble: ShardFailures) -> float:
     """How long an attempt may run: well above what others took, doubled after each hang."""
     if durations.seen < policy.deadlines_known_after:
         base = policy.initial_deadline_s

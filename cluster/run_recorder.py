@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from datagen.cluster.retry_policy import Trouble
+from datagen.cluster.retry_policy import ShardFailures
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.ledger import end_from_commit, lost_end
@@ -37,7 +37,7 @@ class RunRecorder:
             end_s = time.monotonic()
             self._since_index, self._index_s = 0, end_s + _INDEX_FACTOR * (end_s - start_s)
 
-    def quarantine(self, shard: int, trouble: Trouble) -> None:
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         """Give a shard up, with all that is needed to run it alone."""
         scenes = self._run.layout.scenes_per_shard
         self._run.quarantine(

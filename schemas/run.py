@@ -35,7 +35,7 @@ from datagen.schemas.run_records import (
 )
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.storage.errors import StoreFailure
+from datagen.schemas.storage.errors import StoreUnavailable
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
@@ -238,7 +238,7 @@ class Run:
         folder = shard_folder(shard, attempt)
         try:
             yield
-        except StoreFailure:
+        except StoreUnavailable:
             raise  # it would not delete either
         except InputError as error:
             with suppress(InputError):

@@ -14,8 +14,8 @@ from datagen.jobs.options import absolute_place
 from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import label_counts, open_runs
-from datagen.schemas.merging import Merge, Result, merge_runs, plan_merge
-from datagen.schemas.merging.writing import Written
+from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge
+from datagen.schemas.merging.writing import WrittenUnion
 from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
 
@@ -47,7 +47,7 @@ def merge(
     return 0
 
 
-def merge_report(planned: Merge, result: Result) -> dict[str, Any]:
+def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
     """What was merged as plain values; times in seconds."""
     parts = open_runs(result.place)
     done = {w.run.storage.url: w for w in result.written}
@@ -63,7 +63,7 @@ def merge_report(planned: Merge, result: Result) -> dict[str, Any]:
     }
 
 
-def _part(run: Run, written: Written | None) -> dict[str, Any]:
+def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
     spec, want = run.manifest.spec, label_counts([run])
     return {
         "run": run.storage.url,

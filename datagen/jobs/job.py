@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.executor import Executor
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_monitor import JobMonitor
@@ -152,7 +152,7 @@ def _drive(
     run = job_run.run
     layout, spec = run.layout, run.manifest.spec
 
-    def make_task(order: Order) -> ShardTask:
+    def make_task(order: AttemptOrder) -> ShardTask:
         return ShardTask(
             run=run.storage.url,
             spec=spec,
@@ -168,7 +168,7 @@ def _drive(
 
     if isinstance(executor, RayExecutor):
         shown.phase("checking the machines")
-        probe = make_task(Order(shards[0], "probe", deadline_s=0.0))
+        probe = make_task(AttemptOrder(shards[0], "probe", deadline_s=0.0))
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     shown.phase("making labels")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_totals import JobSummary, empty_summary
 from datagen.cluster.progress import JobProgress
@@ -160,7 +160,7 @@ def _relabel_run(
     def work(task: RelabelTask, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter, flips)
 
-    def make_task(order: Order) -> RelabelTask:
+    def make_task(order: AttemptOrder) -> RelabelTask:
         return RelabelTask(order.shard, order.attempt, order.deadline_s)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard

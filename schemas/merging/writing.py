@@ -28,7 +28,7 @@ Tick = Callable[[], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
+class WrittenUnion:
     """What became of a union. `there` are shards that its place had before."""
 
     run: Run
@@ -58,7 +58,7 @@ def begin_union(union: Union, storage: Storage) -> Run:
     return run
 
 
-def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
+def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUnion:
     """Write the union into its run; `tick` is called for every shard and every attempt.
 
     InputError where a source lacks a committed file, or one that must be cut is damaged.
@@ -82,7 +82,7 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
     for shard in sorted(given_up.keys() - run.quarantined()):
         run.quarantine(given_up[shard])
     replace_record(run.storage, LINEAGE, encode_lineage(_lineage(union)))
-    return Written(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
+    return WrittenUnion(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
 
 
 def replace_record(storage: Storage, key: str, record: bytes) -> None:

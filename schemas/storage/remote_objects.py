@@ -19,7 +19,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage.errors import StoreTrouble, store_trouble, too_large
+from datagen.schemas.storage.errors import RequestFailure, store_trouble, too_large
 from datagen.schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
 from datagen.schemas.storage.stored_file import StoredFile
 
@@ -177,5 +177,5 @@ class _TransientTrouble(OSError):
     """Trouble that the client does not take for any."""
 
     def __init__(self, problem: str) -> None:
-        self.trouble = StoreTrouble(problem, "Submit again when the store has recovered", passing=True)
+        self.trouble = RequestFailure(problem, "Submit again when the store has recovered", passing=True)
         super().__init__(problem)

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary, JobTotals
-from datagen.cluster.retry_policy import RetryPolicy, Trouble
+from datagen.cluster.retry_policy import RetryPolicy, ShardFailures
 from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, Host
@@ -45,8 +45,8 @@ class BadCluster:
         self._slots_a_node, self._alive = slots_a_node, [True] * nodes
         self._slow = {node for node in range(nodes) if self.rng.random() < SLOW_NODES}
         self._free = [node for node in range(nodes) for _ in range(slots_a_node)]
-        self._queue: deque[Order] = deque()
-        self._running: dict[str, tuple[Order, int]] = {}
+        self._queue: deque[AttemptOrder] = deque()
+        self._running: dict[str, tuple[AttemptOrder, int]] = {}
         self._events: list[tuple[float, int, str, object]] = []
         self._numbered = 0
         self._ready: list[AttemptReport] = []
@@ -61,7 +61,7 @@ class BadCluster:
         self._numbered += 1
         heapq.heappush(self._events, (self.clock.now_s + in_s, self._numbered, kind, what))
 
-    def submit(self, order: Order) -> None:
+    def submit(self, order: AttemptOrder) -> None:
         self._queue.append(order)
         self._start()
 
@@ -146,7 +146,7 @@ class BadCluster:
             self._ready.append(report_of(order, "lost", 0.5))
         self._at(NODE_GONE_S, "return", node)
 
-    def _zombie(self, order: Order) -> None:
+    def _zombie(self, order: AttemptOrder) -> None:
         if order.shard not in self.recorder.given_up and self._commit(order.shard):
             self.recorder.commits[order.shard] = commit_by(order)
 
@@ -173,26 +173,26 @@ class _Books(PaperRecorder):
         super().__init__(keep_entries=False)
         self._cluster = cluster
 
-    def quarantine(self, shard: int, trouble: Trouble) -> None:
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         of = self._cluster.failures
         spent = (of[shard, "failures"] >= 3, of[shard, "lost"] >= 10, of[shard, "out_of_memory"] >= 2)
         assert any(spent) and not self._cluster.done[shard]
         assert len(trouble.attempts) == sum(of[shard, name] for name in ("failures", "lost", "out_of_memory"))
         assert shard not in self.given_up
-        self.given_up[shard] = Trouble()
+        self.given_up[shard] = ShardFailures()
 
     def commit_of(self, shard: int) -> Commit | None:
         if shard in self.commits:
             return self.commits[shard]
         if not self._cluster.done[shard]:
             return None
-        return commit_by(Order(shard, "another", 0.0))
+        return commit_by(AttemptOrder(shard, "another", 0.0))
 
     def missing(self) -> ShardRanges:
         return ShardRanges.of(np.flatnonzero(np.frombuffer(self._cluster.done, np.uint8) == 0))
 
 
-def commit_by(order: Order) -> Commit:
+def commit_by(order: AttemptOrder) -> Commit:
     host = Host(name="h", cpu="c", cores=1, memory_bytes=1)
     return Commit(
         shard=order.shard, attempt=order.attempt, spec_hash="0" * 64, scenes=1, samples=10, positives=3,

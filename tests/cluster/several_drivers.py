@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import TypeVar
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.stop_request import StopRequest
@@ -54,7 +54,7 @@ class Executor(SimulatedExecutor):
         super().__init__(clock, self.begin, slots, keep_orders=True)
         self.shared, self.turns, self.driver = shared, turns, driver
 
-    def begin(self, order: Order, n: int) -> Fate:
+    def begin(self, order: AttemptOrder, n: int) -> Fate:
         now_s = self.clock.now_s
         if self.shared.is_done(order.shard, now_s):
             return ("superseded", LOOK_S)

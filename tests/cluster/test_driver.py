@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import RetryPolicy
@@ -33,7 +33,7 @@ def run_script(
 ) -> tuple[JobSummary, PaperRecorder, SimulatedExecutor, Heard]:
     """Shards end as the script says, attempt by attempt, and commit when it has no more to say."""
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         words = script.get(order.shard, [])
         word = words[n - 1] if n <= len(words) else "committed"
         return (word, None if word == "silent" else 5.0)
@@ -84,7 +84,7 @@ class OneMachine(SimulatedExecutor):
 
 
 def on_one_machine(
-    shards: int, fate: Callable[[Order, int], Fate]
+    shards: int, fate: Callable[[AttemptOrder, int], Fate]
 ) -> tuple[JobSummary, PaperRecorder, OneMachine]:
     clock, recorder = FakeClock(), PaperRecorder()
     executor = OneMachine(clock, fate, keep_orders=True)
@@ -97,7 +97,7 @@ def on_one_machine(
 def test_an_executor_that_loses_everything_ends_the_job_and_is_no_shards_fault(shards: int) -> None:
     made = 0
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         nonlocal made
         made += shards > 2
         return ("committed", 5.0) if 0 < made <= 3 else ("lost", 0.01)
@@ -111,7 +111,7 @@ def test_an_executor_that_loses_everything_ends_the_job_and_is_no_shards_fault(s
 def test_an_executor_that_works_again_completes_the_job() -> None:
     began = 0
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         nonlocal began
         began += 1
         return ("lost", 0.1) if began % 40 < 4 else ("committed", 5.0)
@@ -122,7 +122,7 @@ def test_an_executor_that_works_again_completes_the_job() -> None:
 
 @pytest.mark.parametrize(("shards", "wall_s"), [(1, 1.0), (300, 0.01), (300, 20.0)])
 def test_a_shard_that_takes_its_machine_along_is_given_up_alone(shards: int, wall_s: float) -> None:
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         return ("lost", wall_s) if order.shard == shards // 3 else ("committed", 5.0)
 
     summary, recorder, executor = on_one_machine(shards, fate)
@@ -192,7 +192,7 @@ def test_an_executor_that_never_confirms_a_kill_does_not_hold_the_driver() -> No
 def test_a_worker_that_died_after_its_commit_has_committed() -> None:
     recorder, clock, name = PaperRecorder(), FakeClock(), {}
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         if order.shard == 1:
             name[1] = order.attempt
             recorder.commits[1] = commit_by(1, order.attempt)
@@ -214,7 +214,7 @@ def test_a_worker_that_died_after_its_commit_has_committed() -> None:
 def test_a_worker_that_lost_the_answer_to_its_commit_has_committed() -> None:
     recorder, clock = PaperRecorder(), FakeClock()
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         if order.shard == 1:
             recorder.commits[1] = commit_by(1, order.attempt)
             return ("failed!", 1.0)
@@ -347,7 +347,7 @@ class Other:
                     self.done.add(self.at)
                     self.at += 1
 
-    def fate(self, order: Order, n: int) -> Fate:
+    def fate(self, order: AttemptOrder, n: int) -> Fate:
         self.advance()
         if order.shard in self.done:
             return ("superseded", 0.01)

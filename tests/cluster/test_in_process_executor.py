@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from datagen.cluster.attempt_guard import Meter, guarded
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.post_mortem import Note, failure_report, read_note
@@ -37,7 +37,7 @@ def play(run: Run, folder: Path, words: dict[int, tuple[str, ...]], stop: StopRe
         commit = write(run, task.shard, task.attempt).model_copy(update={"cost": product.cost})
         return AttemptResult(run.commit(commit), commit.samples, commit.positives, product.cost)
 
-    def make_task(order: Order) -> ScriptedTask:
+    def make_task(order: AttemptOrder) -> ScriptedTask:
         return ScriptedTask(order.shard, order.attempt, 60, str(notes), words.get(order.shard, ()))
 
     executor = InProcessExecutor(commit_after)
@@ -71,7 +71,7 @@ def test_a_shard_that_another_driver_committed_is_superseded(tmp_path: Path) -> 
         written = write(run, task.shard, task.attempt)
         return AttemptResult(run.commit(written), written.samples, written.positives, meter.cost())
 
-    def make_task(order: Order) -> ScriptedTask:
+    def make_task(order: AttemptOrder) -> ScriptedTask:
         return ScriptedTask(order.shard, order.attempt, 60, "")
 
     summary = drive(

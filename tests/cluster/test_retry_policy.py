@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from datagen.cluster.retry_policy import (
     Durations,
     RetryPolicy,
-    Trouble,
+    ShardFailures,
     deadline_s,
     decide,
     ends_early,
@@ -26,9 +26,9 @@ from datagen.schemas.run_records import Outcome
 POLICY = RetryPolicy()
 
 
-def follow(outcomes: list[Outcome]) -> tuple[list[str], Trouble, list[float]]:
+def follow(outcomes: list[Outcome]) -> tuple[list[str], ShardFailures, list[float]]:
     """Actions, the trouble at the end and the waits of a shard whose attempts end like this."""
-    trouble, actions, waits = Trouble(), [], []
+    trouble, actions, waits = ShardFailures(), [], []
     for n, outcome in enumerate(outcomes):
         decision = decide(POLICY, trouble, AttemptReport(f"a{n}", 0, outcome, cause="why"), alone=True)
         actions.append(decision.action)
@@ -59,7 +59,7 @@ def test_budgets(outcomes: list[Outcome], last: str) -> None:
 
 
 def test_a_loss_counts_where_the_shard_was_alone_or_others_succeeded_since_its_last() -> None:
-    trouble, lost = Trouble(), AttemptReport("a", 0, "lost")
+    trouble, lost = ShardFailures(), AttemptReport("a", 0, "lost")
     for successes, alone, counted in (
         (0, False, 0),
         (3, False, 1),
@@ -78,7 +78,7 @@ def test_losses_in_a_row_are_the_executors_fault_and_never_before_a_lone_shards_
     assert [nothing_runs(POLICY, lost, at_once=4) for lost in (20, 21)] == [False, True]
     assert [nothing_runs(POLICY, lost, at_once=1) for lost in (11, 12)] == [False, True]
     # The first of its losses may not count.
-    trouble, actions = Trouble(), []
+    trouble, actions = ShardFailures(), []
     for _ in range(11):
         decision = decide(POLICY, trouble, AttemptReport("a", 0, "lost"), alone=bool(actions))
         trouble, actions = decision.trouble, [*actions, decision.action]
@@ -92,19 +92,19 @@ def test_waits_double_up_to_a_limit() -> None:
 
 def test_what_no_retry_cures_aborts_whatever_the_budget_says() -> None:
     report = AttemptReport("a", 0, "failed", cause="disk full", ends_job=True)
-    assert decide(POLICY, Trouble(), report).action == "abort"
+    assert decide(POLICY, ShardFailures(), report).action == "abort"
 
 
 def test_deadlines_follow_what_attempts_took() -> None:
     durations = Durations()
-    assert deadline_s(POLICY, durations, Trouble()) == POLICY.initial_deadline_s
+    assert deadline_s(POLICY, durations, ShardFailures()) == POLICY.initial_deadline_s
     for _ in range(20):
         durations.add(30.0)
-    assert deadline_s(POLICY, durations, Trouble()) == 300.0
-    assert deadline_s(POLICY, durations, Trouble(hangs=2)) == 1200.0
+    assert deadline_s(POLICY, durations, ShardFailures()) == 300.0
+    assert deadline_s(POLICY, durations, ShardFailures(hangs=2)) == 1200.0
     for _ in range(400):
         durations.add(0.01)
-    assert deadline_s(POLICY, durations, Trouble()) == POLICY.min_deadline_s
+    assert deadline_s(POLICY, durations, ShardFailures()) == POLICY.min_deadline_s
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=200))

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 import datagen.cluster.run_recorder
-from datagen.cluster.retry_policy import Trouble
+from datagen.cluster.retry_policy import ShardFailures
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
 from datagen.schemas.summaries import index_files, refresh
 from tests.made_runs import make_run, write
 
-TROUBLE = Trouble(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))
+TROUBLE = ShardFailures(attempts=("a", "b"), causes=("failed: x", "hung: y"), stacks=("at x", ""))
 
 
 def ends(run: Run) -> dict[str, LedgerEntry]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.cluster.attempt_guard import Meter, this_host
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
@@ -109,7 +109,7 @@ def drive_counted(
         OpenShards.keep = lambda self, missing: 0
     notes = f"{counted}-notes-{os.getpid()}"  # a killed driver leaves them behind
 
-    def make_task(order: Order) -> CountedRows:
+    def make_task(order: AttemptOrder) -> CountedRows:
         return CountedRows(
             place, counted, seconds, stubborn, order.shard, order.attempt, order.deadline_s, notes
         )

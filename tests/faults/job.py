@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
@@ -58,7 +58,7 @@ def main() -> int:
         Progress(as_json=True) as shown,
     ):
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             return RandomRows(place, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
         events = JobProgress(shown, run.layout.samples_per_shard)

@@ -12,7 +12,7 @@ from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
@@ -99,7 +99,7 @@ def _job(address: str, shards: int, executions: str) -> Run:
     manifest = manifest_of(small_spec(), LAYOUT)
     run = Run.create_or_open(open_storage(address), manifest, shards * LAYOUT.samples_per_shard)
 
-    def make_task(order: Order) -> Rows:
+    def make_task(order: AttemptOrder) -> Rows:
         return Rows(address, executions, order.shard, order.attempt, order.deadline_s)
 
     policy, executor = RetryPolicy(), InProcessExecutor(make_rows)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary, JobTotals
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings
@@ -43,7 +43,7 @@ def one_job(run: Run, seconds: float, on_tick: Callable[[Any, JobTotals], None])
     with notes_of_a_job() as notes, ray_executor(make_rows, RaySettings(workers=2)) as executor:
         import ray
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             return RandomRows(run.storage.url, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
         heard = Heard(on_tick=lambda totals: on_tick(ray, totals))

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobSummary, JobTotals
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
@@ -61,7 +61,7 @@ def play(
     notes = folder / "notes"
     notes.mkdir()
 
-    def make_task(order: Order) -> ScriptedTask:
+    def make_task(order: AttemptOrder) -> ScriptedTask:
         return ScriptedTask(
             order.shard,
             order.attempt,

@@ -8,7 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
@@ -36,7 +36,7 @@ def test_who_fills_the_memory_is_ended_and_tried_once_more(
     settings, recorder = RaySettings(workers=1), PaperRecorder()
     with notes_of_a_job() as notes, ray_cluster(settings) as ray:
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             tries = str(tmp_path / "tries")
             return ScriptedTask(0, order.attempt, 200, notes, ("fill_memory",), tries)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_totals import JobTotals
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
@@ -81,7 +81,7 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
     executor, recorder = RayExecutor(perform, machines.settings, machines.ray), PaperRecorder()
     with notes_of_a_job() as notes:
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             script = words.get(order.shard, ())
             # A stopped process has no clock; the driver's own deadline comes for it.
             return ScriptedTask(order.shard, order.attempt, 5.0, notes, script, str(tmp_path / "tries"))
@@ -141,7 +141,7 @@ def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path:
                 gone.append("second")
                 slots.remove_node(machines.second, allow_graceful=False)
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             # Long enough that the machine is gone before what it is at is done.
             return RandomRows(run.storage.url, 4.0, order.shard, order.attempt, order.deadline_s, notes)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.retry_policy import RetryPolicy
@@ -79,7 +79,7 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
     sources = run.manifest.sources
     ordered: set[int] = set()
 
-    def make_task(order: Order) -> FaultyTrials:
+    def make_task(order: AttemptOrder) -> FaultyTrials:
         is_first, words = order.shard not in ordered, WORDS.get(order.shard, ())
         ordered.add(order.shard)
         return FaultyTrials(

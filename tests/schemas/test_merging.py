@@ -13,7 +13,7 @@ from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
 from datagen.schemas.merged_runs import find_scene, label_counts, open_runs
-from datagen.schemas.merging import Result, merge_runs, plan_merge
+from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
 from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from datagen.schemas.record_files import read_record
 from datagen.schemas.run import Run
@@ -32,7 +32,7 @@ def few_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCHEMAS, "heuristic", small_schema())
 
 
-def merge(folder: Path | str, names: Sequence[str], out: str = "out") -> Result:
+def merge(folder: Path | str, names: Sequence[str], out: str = "out") -> MergeResult:
     return merge_runs(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
 
 

@@ -28,13 +28,13 @@ from datagen.schemas.whole_files import whole_file
 from datagen.train.dataset import DataOrigin
 from datagen.train.models import Model, build_model
 from datagen.train.training.torch_file_check import MAX_BYTES, refuse_foreign, refuse_odd_values
-from datagen.train.training.validation import Measured
+from datagen.train.training.validation import ValidationMetrics
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
 _MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
 
 
-class EpochRecord(Measured):
+class EpochRecord(ValidationMetrics):
     """What an epoch came to."""
 
     epoch: int  # counted from 1

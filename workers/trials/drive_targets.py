@@ -10,7 +10,7 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots.robot import Robot
-from datagen.workers.trials.time_parameterization import led, timed
+from datagen.workers.trials.time_parameterization import lag_compensated, time_parameterized
 
 PHASES = ("reach", "approach", "close", "lift", "hold")
 # Share of the joints' speed limits at which the arm travels: what arms are run at beside people and things.
@@ -23,7 +23,7 @@ FINGER_STIFFNESS, FINGER_DAMPING = 4000.0, 200.0
 
 
 @dataclass(frozen=True, eq=False)
-class Tick:
+class ControlPeriod:
     """One control period: where the drives' targets go to, evenly, in its course."""
 
     phase: str
@@ -33,7 +33,7 @@ class Tick:
     ends_phase: bool = False
 
 
-def script_of(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[Tick]:
+def drive_targets(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[ControlPeriod]:
     """The plan as ticks.
 
     The reach takes as long as the speed limits ask for, approach and lift at least their seconds.
@@ -45,16 +45,20 @@ def script_of(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[Tick]
 
     def move(
         phase: str, path_rad: F64, at_least_s: float, finger_m: float | None, wait_s: float
-    ) -> list[Tick]:
-        joints = timed(path_rad, speed, period_s, at_least_s)
-        targets = led(joints, period_s, lag_s)
+    ) -> list[ControlPeriod]:
+        joints = time_parameterized(path_rad, speed, period_s, at_least_s)
+        targets = lag_compensated(joints, period_s, lag_s)
         rows = list(range(1, len(joints))) + [len(joints) - 1] * _ticks_in(wait_s, period_s)
         last = len(rows) - 1
-        return [Tick(phase, targets[k], finger_m, joints[k], at == last) for at, k in enumerate(rows)]
+        return [
+            ControlPeriod(phase, targets[k], finger_m, joints[k], at == last) for at, k in enumerate(rows)
+        ]
 
-    def stay(phase: str, q_rad: F64, fingers_m: list[float | None]) -> list[Tick]:
+    def stay(phase: str, q_rad: F64, fingers_m: list[float | None]) -> list[ControlPeriod]:
         last = len(fingers_m) - 1
-        return [Tick(phase, q_rad, finger_m, q_rad, at == last) for at, finger_m in enumerate(fingers_m)]
+        return [
+            ControlPeriod(phase, q_rad, finger_m, q_rad, at == last) for at, finger_m in enumerate(fingers_m)
+        ]
 
     closing = _ticks_in(params.close_s, period_s)
     travelling = max(1, int(closing * _CLOSING_SHARE))

@@ -26,7 +26,12 @@ from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
 from datagen.workers.settling.sapien_bodies import sapien_pose
-from datagen.workers.trials.drive_targets import Tick, planned_rise_m, pressing_target_m, script_of
+from datagen.workers.trials.drive_targets import (
+    ControlPeriod,
+    drive_targets,
+    planned_rise_m,
+    pressing_target_m,
+)
 from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
 from datagen.workers.trials.maniskill_agent import agent_of
 from datagen.workers.trials.physics import (
@@ -282,8 +287,8 @@ def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
     return success
 
 
-def _script(task: GraspTask) -> list[Tick]:
-    return script_of(task.plan, task.prepared.robot, task.prepared.params)
+def _script(task: GraspTask) -> list[ControlPeriod]:
+    return drive_targets(task.plan, task.prepared.robot, task.prepared.params)
 
 
 def _poses(T: Sequence[F64], device: torch.device) -> Pose:

@@ -12,7 +12,7 @@ _GRID_RAD = 0.02  # spacing of the points at which speeds are decided
 _SAME_RAD = 1e-9
 
 
-def timed(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -> F64:
+def time_parameterized(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -> F64:
     """Joints (N, A) every `period_s` along a path of straight lines (M, A), from rest to rest.
 
     The fastest motion in which no joint exceeds its speed (A,), gains more than it in `SPEED_UP_S`,
@@ -68,7 +68,7 @@ def timed(path_rad: F64, speed_radps: F64, period_s: float, at_least_s: float) -
     return joints
 
 
-def led(joints_rad: F64, period_s: float, lag_s: float) -> F64:
+def lag_compensated(joints_rad: F64, period_s: float, lag_s: float) -> F64:
     """Targets (N, A) for spring-damper drives, which follow a moving target late by damping / stiffness.
 
     Each target is ahead by as much, so that the joints are where `joints_rad` (N, A) wants them.

@@ -23,7 +23,7 @@ _MOVED_ABOVE_M = 0.0005  # a moved target starts so far above where it would sta
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
+class MovableObjects:
     """The movable objects of a trial: object 0 is the target."""
 
     parts_m: tuple[tuple[F32, ...], ...]  # (K,) convex parts each, object frames
@@ -96,12 +96,12 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
     )
 
 
-def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> Things:
+def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> MovableObjects:
     """The objects as they truly are."""
     mass_kg, T_world_object = prepared.mass_kg.copy(), prepared.T_world_object.copy()
     mass_kg[0] *= disturbance.mass_scale
     T_world_object[0] = _moved_target(prepared, disturbance.T_target_moved)
-    return Things(prepared.parts_m, mass_kg, T_world_object)
+    return MovableObjects(prepared.parts_m, mass_kg, T_world_object)
 
 
 def _moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:

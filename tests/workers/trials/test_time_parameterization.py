@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.trials.time_parameterization import SPEED_UP_S, led, timed
+from datagen.workers.trials.time_parameterization import SPEED_UP_S, lag_compensated, time_parameterized
 
 PERIOD_S = 0.05
 SPEED = np.array([1.0, 0.5, 2.0])
@@ -23,7 +23,7 @@ corners = st.lists(st.tuples(*[st.floats(-2, 2, allow_subnormal=False)] * 3), mi
 @example(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.0, 0.0)]), 0.6)
 @given(corners, st.sampled_from([0.0, 0.6, 3.0]))
 def test_speeds_jumps_and_ends(path: np.ndarray, at_least_s: float) -> None:
-    q = timed(path, SPEED, PERIOD_S, at_least_s)
+    q = time_parameterized(path, SPEED, PERIOD_S, at_least_s)
     np.testing.assert_array_equal(q[0], path[0])
     np.testing.assert_array_equal(q[-1], path[-1])
     assert (len(q) - 1) * PERIOD_S >= at_least_s - 1e-9
@@ -42,15 +42,15 @@ def test_speeds_jumps_and_ends(path: np.ndarray, at_least_s: float) -> None:
 
 
 def test_a_long_line_runs_at_the_slowest_joints_speed() -> None:
-    q = timed(np.array([[0.0, 0, 0], [4.0, 4.0, 4.0]]), SPEED, PERIOD_S, 0.0)
+    q = time_parameterized(np.array([[0.0, 0, 0], [4.0, 4.0, 4.0]]), SPEED, PERIOD_S, 0.0)
     v = np.diff(q, axis=0) / PERIOD_S
     assert v.max() == pytest.approx(0.5, rel=0.02)
     assert len(v) * PERIOD_S == pytest.approx(4.0 / 0.5 + SPEED_UP_S, abs=2 * PERIOD_S)
 
 
 def test_led_targets_are_ahead_by_the_lag_and_end_where_the_path_does() -> None:
-    q = timed(np.array([[0.0, 0, 0], [4.0, 0, 0]]), SPEED, PERIOD_S, 0.0)
-    u = led(q, PERIOD_S, 0.1)
+    q = time_parameterized(np.array([[0.0, 0, 0], [4.0, 0, 0]]), SPEED, PERIOD_S, 0.0)
+    u = lag_compensated(q, PERIOD_S, 0.1)
     middle = len(q) // 2
     assert u[middle, 0] - q[middle, 0] == pytest.approx(0.1, rel=0.02)
     np.testing.assert_array_equal(u[[0, -1]], q[[0, -1]])
