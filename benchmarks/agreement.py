@@ -15,12 +15,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from datagen.reports.agreement import Labelled, agreement, confusion
-from datagen.reports.labelled import read_labelled
+from datagen.reports.label_arrays import read_labelled
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, Bools
-from datagen.workers.labels.heuristic import heuristic
+from datagen.workers.labels.distance_visibility_score import heuristic
 
 # Distances in reaches of the arm: nothing beyond one can be grasped.
 OVER_REACH = HeuristicParams(

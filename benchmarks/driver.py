@@ -11,17 +11,18 @@ import tempfile
 import time
 from pathlib import Path
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, utc_now
-from datagen.cluster.policy import Policy
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
-from datagen.cluster.task import Product
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.task import AttemptResult
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.cluster.bad_cluster import Silent, simulate
-from tests.cluster.simulated import PaperBooks
+from tests.cluster.simulated import PaperRecorder
 from tests.faults.scripted import ScriptedTask
 from tests.made_runs import make_run
 
@@ -51,9 +52,9 @@ def ledger(entries: int) -> float:
         return (time.perf_counter() - start_s) / entries * 1e3
 
 
-def nothing(task: ScriptedTask, meter: Meter) -> Product:
+def nothing(task: ScriptedTask, meter: Meter) -> AttemptResult:
     """The shortest shard there is."""
-    return Product(True, 1, 0, meter.cost())
+    return AttemptResult(True, 1, 0, meter.cost())
 
 
 def through_ray(shards: int) -> float:
@@ -62,12 +63,12 @@ def through_ray(shards: int) -> float:
     with ray_cluster(settings) as ray, tempfile.TemporaryDirectory() as notes:
         executor = RayExecutor(nothing, settings, ray)
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             return ScriptedTask(order.shard, order.attempt, order.deadline_s, notes)
 
         def run(count: int) -> None:
-            books, events = PaperBooks(keep_entries=False), Silent()
-            drive(range(count), make_task, executor, books, Policy(), events, StopRequest())
+            recorder, events = PaperRecorder(keep_entries=False), Silent()
+            drive(range(count), make_task, executor, recorder, RetryPolicy(), events, StopRequest())
 
         run(50)  # workers start here
         start_s = time.perf_counter()
@@ -88,13 +89,13 @@ def main() -> None:
         f"{'driver and simulated cluster':34} {options.shards:>9} shards {per_shard_ms:9.3f} ms/shard (CPU)"
     )
     print(f"{'  growth of peak memory':34} {'':>9}        {grown_mib:9.1f} MiB")
-    tally = summary.tally
+    totals = summary.totals
     ends = {
-        "committed": tally.committed,
-        "committed by lost workers": tally.superseded + tally.elsewhere,
-        "given up": tally.quarantined,
-        "attempts": sum(tally.outcomes.values()),
-    } | {f"attempts {outcome}": tally.outcomes[outcome] for outcome in sorted(tally.outcomes)}
+        "committed": totals.committed,
+        "committed by lost workers": totals.superseded + totals.elsewhere,
+        "given up": totals.quarantined,
+        "attempts": sum(totals.outcomes.values()),
+    } | {f"attempts {outcome}": totals.outcomes[outcome] for outcome in sorted(totals.outcomes)}
     for name, number in ends.items():
         print(f"{f'  {name}':34} {number:>9}")
     print(f"{'ledger entry, durable':34} {options.ledger:>9}        {ledger(options.ledger):9.3f} ms")

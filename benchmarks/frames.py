@@ -21,14 +21,14 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import NoiseParams, Source, Specification
 from datagen.train.prediction.frames import Pinhole, RgbdImage, SensorFrame, image_frame
 from datagen.train.prediction.ground import find_ground, floor_points
-from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import locate
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 
@@ -79,7 +79,7 @@ def _scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, dict[str, Sens
     spec = Specification(seed=options.seed, split="test", houses=house, objects=thing)
     world = assemble_world(spec, *opened, options.houses, options.objects)
     for index in range(options.scenes):
-        scene, _ = draw_scene(world, index, StageClock())
+        scene, _ = generate_scene(world, index, StageClock())
         exact = render_rays(scene.rays, scene.camera)
         noisy = add_noise(exact, NoiseParams(enabled=True), np.random.default_rng([options.seed, index]))
         frames: dict[str, SensorFrame | None] = {}

@@ -24,7 +24,7 @@ import numpy as np
 
 from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.floating_hand import HandTest, held_trials
-from datagen.workers.grasps.keep import scored_grasps
+from datagen.workers.grasps.grasp_cache import scored_grasps
 from datagen.workers.grasps.targets import Graspability, Targets, graspability
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel

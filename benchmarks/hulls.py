@@ -21,7 +21,7 @@ from sapien import physx
 from datagen.workers.geometry.mesh import F32
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects import open_objects
-from datagen.workers.objects.merging import merge_parts
+from datagen.workers.objects.part_merging import merge_parts
 from datagen.workers.settling.sapien_bodies import add_object, add_static
 
 

@@ -14,7 +14,7 @@ from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import mount_m, planar_distance_m, reach_m
 from datagen.train.dataset import SampleStream
 from datagen.train.observed_visibility import observed_visibility
-from datagen.workers.labels.heuristic import heuristic
+from datagen.workers.labels.distance_visibility_score import heuristic
 
 
 def main(places: list[str]) -> None:

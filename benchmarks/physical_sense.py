@@ -18,20 +18,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.options import scene_options
+from datagen.configuration.specify import specify
 from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
-from datagen.specifying.specify import specify
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
-from datagen.workers.labels.trials import ArmInScene, arm_in_scene, arm_of, draw_disturbances, try_candidate
-from datagen.workers.motion.plan import MotionPlan
-from datagen.workers.motion.scene import pose_of_base
+from datagen.workers.labels.arm_labelling import (
+    ArmInScene,
+    arm_in_scene,
+    arm_of,
+    draw_disturbances,
+    try_candidate,
+)
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.draw import draw_scene
-from datagen.workers.trials.execute import prepare_trials, run_trial
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance
+from datagen.workers.trials.trial_scene import prepare_trials
 from datagen.workers.world import assemble_world
 
 
@@ -40,7 +47,7 @@ class Case:
     """A planned candidate."""
 
     at: ArmInScene
-    candidates: Candidates
+    candidates: SceneCandidates
     row: int
     T_world_base: F64
     plan: MotionPlan
@@ -82,7 +89,7 @@ def planned_cases(options: argparse.Namespace) -> tuple[Specification, list[Case
     world = assemble_world(spec, houses, objects, options.houses, options.objects)
     cases: list[Case] = []
     for index in range(options.scenes):
-        scene, candidates = draw_scene(world, index, StageClock())
+        scene, candidates = generate_scene(world, index, StageClock())
         at = arm_in_scene(scene, candidates, 0, plan_only, StageClock())
         found = 0
         for row in range(len(candidates)):

@@ -23,21 +23,21 @@ import numpy as np
 
 from benchmarks.options import scene_options
 from benchmarks.robots import robots_folder
+from datagen.configuration.specify import specify
 from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import ArmParams
-from datagen.specifying.specify import specify
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
-from datagen.workers.grasps.keep import grasps_of
+from datagen.workers.grasps.grasp_cache import grasps_of
 from datagen.workers.houses import open_houses
-from datagen.workers.motion.candidate import plan_candidate
-from datagen.workers.motion.plan import PlanReport
-from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.motion.motion_plan import PlanReport
+from datagen.workers.motion.plan_candidate import plan_candidate
+from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects import open_objects
 from datagen.workers.robots import open_robot, robot_limits
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import World, assemble_world
 
@@ -72,7 +72,7 @@ def main() -> None:
     spent, problems = Spent(), []
     world = _world(options)
     for index in range(options.scenes):
-        with_scene = draw_scene(world, index, StageClock())
+        with_scene = generate_scene(world, index, StageClock())
         problems += _plan_grid(options, *with_scene, spent)
     _print_split(spent)
     if options.peer and problems:
@@ -93,7 +93,7 @@ def _world(options: argparse.Namespace) -> World:
 
 
 def _plan_grid(
-    options: argparse.Namespace, scene: Scene, candidates: Candidates, spent: Spent
+    options: argparse.Namespace, scene: Scene, candidates: SceneCandidates, spent: Spent
 ) -> list[dict[str, Any]]:
     """Plan every candidate of a scene; the plans that were found, as problems for the peer."""
     params = ArmParams()

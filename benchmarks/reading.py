@@ -29,8 +29,8 @@ from datagen.train.augment import Augmentation, ColourJitter, DepthHoles, PointD
 from datagen.train.batching import SAMPLE_FIELDS as SAMPLES
 from datagen.train.batching import SCENE_FIELDS as SCENES
 from datagen.train.dataset import SampleStream
-from datagen.train.opening import open_parts
 from datagen.train.reader import load_shard
+from datagen.train.run_parts import open_parts
 from tests.train.stream_runs import make_stream_run
 
 REPEATS = 5

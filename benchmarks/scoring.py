@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.models import Model, build_model
 from datagen.train.tensors import to_torch
 
@@ -129,14 +129,14 @@ def _batch(clouds: Clouds[Any], robots: int, candidates: int, scenes: int) -> Ba
     r, n = scenes * robots, scenes * robots * candidates
     return Batch(
         clouds=Clouds(**{name: values[:scenes] for name, values in vars(clouds).items()}),
-        robots=Robots(
+        robots=RobotInputs(
             np.repeat(np.arange(scenes), robots),
             *(
                 rng.uniform(low, high, r).astype(np.float32)
                 for low, high in ((0.8, 1.5), (0.5, 1.0), (0.7, 1.0))
             ),
         ),
-        candidates=Candidates(
+        candidates=CandidateInputs(
             np.repeat(np.arange(r), candidates), rng.uniform(-1, 1, (n, 2)).astype(np.float32)
         ),
         label=rng.integers(0, 2, n),

@@ -7,7 +7,7 @@ Whole runs through the functions of `datagen submit`, with Ray and a real store 
 folder; all figures come from the commit records. The steady rate of a job is the sum over its workers of
 labels per second from each worker's first commit to its last: it leaves out the start of Ray and
 the opening of sources, which are stated beside it. Jobs of `plan` and `sim` label whole grids; the
-first run on a machine also works out the grasps of the objects that it draws, later ones read them
+first run on a machine also job_runs out the grasps of the objects that it draws, later ones read them
 from the cache.
 """
 
@@ -29,15 +29,15 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.jobs.job import JobPlan, Work, make_missing, open_board
-from datagen.jobs.options import Placing
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
+from datagen.jobs.job import JobPlan, JobRun, make_missing, open_recorder
+from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.specify import layout_of, specify
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 
@@ -84,10 +84,10 @@ def run(
             spec, layout_of(spec, n), {"houses": options.houses, "objects": options.objects}
         )
         made = Run.create_or_open(open_storage(out), manifest, n)
-        work = Work(made, absolute(options.houses), absolute(options.objects))
-        plan = JobPlan(made.storage, out, [work], Placing(workers=workers), time.monotonic(), ())
+        work = JobRun(made, absolute(options.houses), absolute(options.objects))
+        plan = JobPlan(made.storage, out, [work], JobOptions(workers=workers), time.monotonic(), ())
         started_s = time.perf_counter()
-        summary = make_missing(plan, open_board(plan))
+        summary = make_missing(plan, open_recorder(plan))
         ended_s = time.perf_counter()
         if summary.end != "complete":
             raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Mend that first")

@@ -21,11 +21,17 @@ import numpy as np
 from benchmarks.physical_sense import Case, plan_options, planned_cases
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import DisturbanceParams, Specification, TrialParams
-from datagen.workers.labels.trials import arm_of, draw_disturbances
+from datagen.workers.labels.arm_labelling import arm_of, draw_disturbances
 from datagen.workers.trials import physics
-from datagen.workers.trials.execute import TrialScene, prepare_trials, run_trial
-from datagen.workers.trials.prepared import Things, pedestal_below, still_parts_near
+from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance, TrialResult
+from datagen.workers.trials.trial_scene import (
+    MovableObjects,
+    TrialScene,
+    pedestal_below,
+    prepare_trials,
+    still_parts_near,
+)
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ def build_time_s(cases: list[Case], prepared: list[TrialScene], trial: TrialPara
         physics.TrialWorld(
             still_parts_near(scene, case.T_world_base),
             pedestal_below(scene, case.T_world_base),
-            Things(scene.parts_m, scene.mass_kg, scene.T_world_object),
+            MovableObjects(scene.parts_m, scene.mass_kg, scene.T_world_object),
             scene.robot,
             scene.articulation,
             case.T_world_base,

@@ -17,17 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.options import scene_options
+from datagen.configuration.specify import specify
 from datagen.schemas.cost import StageClock
-from datagen.specifying.specify import specify
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
-from datagen.workers.rendering.embree_renderer import ray_stage
-from datagen.workers.rendering.frame import Stage
-from datagen.workers.rendering.pybullet_renderer import PybulletStage
-from datagen.workers.rendering.rays import RayStage, first_hits, into_frame
+from datagen.workers.rendering.embree_renderer import ray_scene
+from datagen.workers.rendering.frame import SceneGeometry
+from datagen.workers.rendering.pybullet_renderer import PybulletScene
+from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
 from datagen.workers.rendering.visibility import visible_pixels
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import assemble_world
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
@@ -77,27 +77,27 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
     embree, tiny = Spent(), Spent()
     rho, target_px, clear, in_surface = [], [], [], []
     for index in range(options.scenes):
-        scene, candidates = draw_scene(world, index, StageClock())
+        scene, candidates = generate_scene(world, index, StageClock())
         eyes_m = np.column_stack([candidates.base_xy_m, candidates.camera_height_m]).astype(np.float64)
-        stage = Stage(scene.house.house, scene.models, scene.T_world_object)
+        stage = SceneGeometry(scene.house.house, scene.models, scene.T_world_object)
 
-        bare = Stage(scene.house.house, (), np.zeros((0, 4, 4)))
+        bare = SceneGeometry(scene.house.house, (), np.zeros((0, 4, 4)))
         started_s = time.process_time()
-        ray_stage(bare)
+        ray_scene(bare)
         embree.house_s += time.process_time() - started_s
         started_s = time.process_time()
-        with PybulletStage(bare):
+        with PybulletScene(bare):
             tiny.house_s += time.process_time() - started_s
 
         started_s = time.process_time()
-        rays = ray_stage(stage)
+        rays = ray_scene(stage)
         loaded_s = time.process_time()
         by_embree = visible_pixels(rays, 0, eyes_m, window)
         embree.load_s += loaded_s - started_s
         embree.look_s += time.process_time() - loaded_s
 
         started_s = time.process_time()
-        with PybulletStage(stage) as loaded:
+        with PybulletScene(stage) as loaded:
             loaded.visible_pixels(0, eyes_m[:0], window)  # loads the target alone
             loaded_s = time.process_time()
             by_tiny = loaded.visible_pixels(0, eyes_m, window)
@@ -113,7 +113,7 @@ def look(options: argparse.Namespace) -> tuple[Looks, Spent, Spent]:
     return Looks(*joined), embree, tiny
 
 
-def stand_in_surfaces(rays: RayStage, eyes_m: F64) -> np.ndarray:
+def stand_in_surfaces(rays: RayScene, eyes_m: F64) -> np.ndarray:
     """Whether the first surface before each eye (N, 3) is seen from behind or nearer than NEAR_M.
 
     There a rasteriser is easily wrong: where it leaves out the backs of triangles, or what lies before

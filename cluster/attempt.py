@@ -6,10 +6,11 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import lru_cache
 
-from datagen.cluster.guard import Meter, this_host, utc_now
-from datagen.cluster.task import JobCannotGoOn, Product, ShardTask
+from datagen.cluster.attempt_guard import Meter, this_host
+from datagen.cluster.task import AttemptResult, JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.scene_rows import read_scenes
@@ -20,19 +21,19 @@ from datagen.workers.run_shard import run_shard
 from datagen.workers.world import World, open_world
 
 
-def run_attempt(task: ShardTask, meter: Meter) -> Product:
+def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     """Make the shard's arrays, write them, and commit them unless another attempt was first.
 
-    Raises JobCannotGoOn where the run or its sources cannot be opened or its disk is full; what
+    Raises JobCannotContinue where the run or its sources cannot be opened or its disk is full; what
     else goes wrong is raised as it is, and concerns this attempt alone unless a disk is full (`guarded`).
     """
     spec_hash = task.spec.hash()
-    run, world, source = open_task(task)
+    run, world, scenes_run = open_task(task)
     with ends_job():
         run.ledger.start(task.attempt, task.shard)
         if run.storage.exists(commit_key(task.shard)):  # by another driver, while this attempt was queued
-            return Product(False, 0, 0, meter.cost())
-    stored = None if source is None else read_scenes(source, task.scene_indices)
+            return AttemptResult(False, 0, 0, meter.cost())
+    stored = None if scenes_run is None else read_scenes(scenes_run, task.scene_indices)
     made = run_shard(task.spec, world, task.scene_indices, stored, run.schema.version)
     with ends_job(), made.clock.stage("write"):
         files = encode_shard(run.schema, run.layout, spec_hash, made.scene, made.sample)
@@ -55,30 +56,30 @@ def run_attempt(task: ShardTask, meter: Meter) -> Product:
     )
     with ends_job():
         won = run.commit(commit)
-    return Product(won, len(labels), positives, cost)
+    return AttemptResult(won, len(labels), positives, cost)
 
 
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
     """The run, the world of its sources, and the run whose scenes are labelled again, if there is one.
 
-    They are opened once a process. Raises JobCannotGoOn where that cannot be done here.
+    They are opened once a process. Raises JobCannotContinue where that cannot be done here.
     """
     with ends_job(every_input_error=True):
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
-        source = _open_source(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
-    return run, world, source
+        scenes_run = _open_scenes_run(task.scenes_from, task.spec.scenes_hash) if task.scenes_from else None
+    return run, world, scenes_run
 
 
 @contextmanager
 def ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotGoOn for a full or forbidden disk or, where asked, for any InputError."""
+    """Raise JobCannotContinue for a full or forbidden disk or, where asked, for any InputError."""
     try:
         yield
     except (InputError, OSError) as error:
         known = machine_error(error, (*FULL, *FORBIDDEN))
         if known is None and not (every_input_error and isinstance(error, InputError)):
             raise
-        raise JobCannotGoOn(str(known or error)) from error
+        raise JobCannotContinue(str(known or error)) from error
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large
@@ -93,9 +94,9 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
 
 
 @lru_cache(maxsize=1)
-def _open_source(place: str, scenes_hash: str) -> Run:
-    source = Run.open(place)
-    if source.manifest.spec.scenes_hash != scenes_hash:
+def _open_scenes_run(place: str, scenes_hash: str) -> Run:
+    scenes_run = Run.open(place)
+    if scenes_run.manifest.spec.scenes_hash != scenes_hash:
         mend = "Give --scenes-from the run that this one was started with"
         raise InputError(place, "spec_hash", "the run now has other scenes", mend)
-    return source
+    return scenes_run

@@ -5,7 +5,7 @@
         wait a moment for reports, and settle each: ledger, then done, retry or quarantine
         look after attempts that are silent beyond their deadline
         look for what other drivers have committed, once there was a sign of one
-        heed a request to stop
+        handle a request to stop
 
 The driver alone owns attempts: executors never repeat one by themselves.
 """
@@ -21,12 +21,13 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from datagen.cluster.executor import Executor
+from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.policy import (
+from datagen.cluster.retry_policy import (
     Durations,
-    Policy,
-    Trouble,
     at_once,
+    RetryPolicy,
+    ShardFailures,
     deadline_s,
     decide,
     ends_early,
@@ -35,19 +36,18 @@ from datagen.cluster.policy import (
     too_many_quarantined,
     window,
 )
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import End, JobSummary, Tally
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
-# Upper bound of one wait, so that a request to stop is heeded soon.
+# Upper bound of one wait, so that a request to stop is handled soon.
 _POLL_S = 0.25
 
 
 @dataclass(frozen=True)
-class Order:
+class AttemptOrder:
     """What the driver decides about an attempt before it starts."""
 
     shard: int
@@ -55,12 +55,12 @@ class Order:
     deadline_s: float
 
 
-class Books(Protocol):
+class Recorder(Protocol):
     """Where the driver writes down how attempts and shards ended."""
 
     def close(self, entry: LedgerEntry) -> None: ...
 
-    def quarantine(self, shard: int, trouble: Trouble) -> None: ...
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None: ...
 
     def commit_of(self, shard: int) -> Commit | None:
         """The shard's commit record, if there is one."""
@@ -78,8 +78,8 @@ class Events(Protocol):
         """An attempt was settled; `action` is the policy's decision."""
         ...
 
-    def tick(self, tally: Tally) -> None:
-        """Called often; the tally is the driver's own and changes."""
+    def tick(self, totals: JobTotals) -> None:
+        """Called often; the totals is the driver's own and changes."""
         ...
 
     def stopping(self, reason: str) -> None:
@@ -89,7 +89,7 @@ class Events(Protocol):
 
 @dataclass
 class _Flight:
-    order: Order
+    order: AttemptOrder
     number: int  # of this driver's attempts
     submitted_s: float
     check_s: float  # when to look after it next
@@ -100,20 +100,20 @@ class _Flight:
 
 def drive(
     shards: Sequence[int],
-    make_task: Callable[[Order], T],
+    make_task: Callable[[AttemptOrder], T],
     executor: Executor[T],
-    books: Books,
-    policy: Policy,
+    recorder: Recorder,
+    policy: RetryPolicy,
     events: Events,
     stop: StopRequest,
     clock: Callable[[], float] = time.monotonic,
 ) -> JobSummary:
     """Run every shard to its commit, or give it up; return how the job ended.
 
-    `clock` gives seconds and only grows. Raises InputError when the books cannot be written; then,
+    `clock` gives seconds and only grows. Raises InputError when the recorder cannot be written; then,
     and on any other exception, what is in flight is ended by force first.
     """
-    driver = _Driver(shards, make_task, executor, books, policy, events, stop, clock)
+    driver = _Driver(shards, make_task, executor, recorder, policy, events, stop, clock)
     try:
         return driver.run()
     finally:
@@ -124,19 +124,19 @@ class _Driver(Generic[T]):
     def __init__(
         self,
         shards: Sequence[int],
-        make_task: Callable[[Order], T],
+        make_task: Callable[[AttemptOrder], T],
         executor: Executor[T],
-        books: Books,
-        policy: Policy,
+        recorder: Recorder,
+        policy: RetryPolicy,
         events: Events,
         stop: StopRequest,
         clock: Callable[[], float],
     ) -> None:
-        self._make_task, self._executor, self._books = make_task, executor, books
+        self._make_task, self._executor, self._books = make_task, executor, recorder
         self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
-        self._tally = Tally(len(shards))
+        self._totals = JobTotals(len(shards))
         self._flights: dict[str, _Flight] = {}
-        self._troubled: dict[int, Trouble] = {}
+        self._troubled: dict[int, ShardFailures] = {}
         self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
         self._durations = Durations()
         self._numbered = 0
@@ -156,7 +156,7 @@ class _Driver(Generic[T]):
     def run(self) -> JobSummary:
         start_s = self._clock()
         while True:
-            self._heed_stop()
+            self._handle_stop()
             if self._end is None:
                 self._fill()
             if not self._flights and (self._end is not None or not self._due):
@@ -166,13 +166,13 @@ class _Driver(Generic[T]):
             self._look_after_silent()
             if self._clock() >= self._look_s:
                 self._look_for_others()
-            self._tally.in_flight = len(self._flights)
-            self._events.tick(self._tally)
-        failed = too_many_quarantined(self._policy, self._tally.quarantined, self._tally.shards)
+            self._totals.in_flight = len(self._flights)
+            self._events.tick(self._totals)
+        failed = too_many_quarantined(self._policy, self._totals.quarantined, self._totals.shards)
         end = self._end
-        if end is None or (end == "interrupted" and self._tally.finished == self._tally.shards):
+        if end is None or (end == "interrupted" and self._totals.finished == self._totals.shards):
             end = "failed" if failed else "complete"  # a stop that left nothing to do is none
-        return JobSummary(end, self._cause, self._tally, self._clock() - start_s)
+        return JobSummary(end, self._cause, self._totals, self._clock() - start_s)
 
     # Begin ---------------------------------------------------------------------------------
 
@@ -199,9 +199,9 @@ class _Driver(Generic[T]):
         return shard in self._troubled and is_suspect(self._troubled[shard])
 
     def _submit(self, shard: int) -> None:
-        trouble = self._troubled.get(shard, Trouble())
+        trouble = self._troubled.get(shard, ShardFailures())
         self._numbered += 1
-        order = Order(
+        order = AttemptOrder(
             shard=shard,
             attempt=f"{shard:06d}-{self._name}-{self._numbered:06d}",
             deadline_s=deadline_s(self._policy, self._durations, trouble),
@@ -212,7 +212,7 @@ class _Driver(Generic[T]):
             next(iter(self._flights.values())).alone = False
         self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s, not self._flights)
         self._next_check_s = min(self._next_check_s, check_s)
-        self._tally.retries += bool(trouble.attempts)
+        self._totals.retries += bool(trouble.attempts)
         self._executor.submit(self._make_task(order))
 
     def _patience_s(self) -> float:
@@ -234,12 +234,14 @@ class _Driver(Generic[T]):
         if report.outcome not in ("committed", "superseded"):
             report = self._what_the_run_says(report)
         shard = report.shard
-        successes = self._tally.committed + self._tally.superseded
-        decision = decide(self._policy, self._troubled.get(shard, Trouble()), report, successes, flight.alone)
+        successes = self._totals.committed + self._totals.superseded
+        decision = decide(
+            self._policy, self._troubled.get(shard, ShardFailures()), report, successes, flight.alone
+        )
         if report.outcome not in ("cancelled", "hung"):  # of those nobody answered
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
         self._books.close(_ledger_entry(report))
-        self._tally.count(report)
+        self._totals.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
         if report.outcome == "superseded":
@@ -252,9 +254,9 @@ class _Driver(Generic[T]):
         elif decision.action == "quarantine":
             self._troubled.pop(shard, None)
             self._books.quarantine(shard, decision.trouble)
-            self._tally.count_quarantined(shard)
-            if ends_early(self._policy, self._tally.quarantined, self._tally.shards):
-                self._begin_end("failed", f"{self._tally.quarantined} shards are quarantined")
+            self._totals.count_quarantined(shard)
+            if ends_early(self._policy, self._totals.quarantined, self._totals.shards):
+                self._begin_end("failed", f"{self._totals.quarantined} shards are quarantined")
         if decision.action == "abort" or (self._end is None and self._nothing_runs()):
             again = "" if decision.action == "abort" else "whatever begins is lost, at last by: "
             self._begin_end("aborted", again + report.cause)
@@ -262,7 +264,7 @@ class _Driver(Generic[T]):
         self._events.ended(report, decision.action)
 
     def _width(self) -> int:
-        return min(window(self._policy, self._executor.slots), self._tally.shards - self._tally.finished)
+        return min(window(self._policy, self._executor.slots), self._totals.shards - self._totals.finished)
 
     def _nothing_runs(self) -> bool:
         return nothing_runs(self._policy, self._lost_in_a_row, self._width())
@@ -298,7 +300,7 @@ class _Driver(Generic[T]):
     def _look_for_others(self) -> None:
         start_s = self._clock()
         dropped = self._open.keep(self._books.missing()) if len(self._open) else 0
-        self._tally.elsewhere += dropped
+        self._totals.elsewhere += dropped
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
         if not dropped:
@@ -338,7 +340,7 @@ class _Driver(Generic[T]):
 
     # Stop ----------------------------------------------------------------------------------
 
-    def _heed_stop(self) -> None:
+    def _handle_stop(self) -> None:
         if self._stop.drain and self._end is None:
             self._begin_end("interrupted", "asked to stop")
         if self._stop.force or self._clock() >= self._drain_until_s:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.cluster.tally import Tally
+from datagen.cluster.job_totals import JobTotals
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Pace, Progress, clock_text, whole
 
@@ -24,39 +24,39 @@ class JobProgress:
             style = "yellow" if action == "retry" else "red"
             self._shown.say("attempt_" + report.outcome, {**values, "action": action}, text, style)
 
-    def tick(self, tally: Tally) -> None:
-        self._pace.see(tally.labels)
-        done, of = self._done_before + tally.finished, self._done_before + tally.shards
-        self._shown.update("shards", done, of, lambda: self._figures(tally))
+    def tick(self, totals: JobTotals) -> None:
+        self._pace.see(totals.labels)
+        done, of = self._done_before + totals.finished, self._done_before + totals.shards
+        self._shown.update("shards", done, of, lambda: self._figures(totals))
 
     def stopping(self, reason: str) -> None:
         self._note = "  stopping"
         text = f"{reason}: waiting for what is in flight; Ctrl-C again ends it at once"
         self._shown.say("stopping", {"reason": reason}, text, "yellow")
 
-    def _figures(self, tally: Tally) -> tuple[str, dict[str, object]]:
-        rate, left_s = self._pace.per_s(), left_of(tally, self._pace, self._labels_per_shard)
-        cpu_s = tally.useful_cpu_s + tally.wasted_cpu_s
+    def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
+        rate, left_s = self._pace.per_s(), left_of(totals, self._pace, self._labels_per_shard)
+        cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
         # What is seldom there takes no room: a usual terminal has 80 columns.
-        given_up = f"  {tally.quarantined} quarantined" if tally.quarantined else ""
+        given_up = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
         text = (
             f"{rate:,.0f} labels/s  {clock_text(left_s)} left  "
-            f"{tally.retries} retries{given_up}  {cpu_s / 3600:.2f} core-h{self._note}"
+            f"{totals.retries} retries{given_up}  {cpu_s / 3600:.2f} core-h{self._note}"
         )
         return text, {
-            "shards_done": self._done_before + tally.finished,
-            "shards": self._done_before + tally.shards,
-            "labels": tally.labels,
+            "shards_done": self._done_before + totals.finished,
+            "shards": self._done_before + totals.shards,
+            "labels": totals.labels,
             "labels_per_s": round(rate, 1),
             "left_s": whole(left_s),
-            "in_flight": tally.in_flight,
-            "retries": tally.retries,
-            "quarantined": tally.quarantined,
+            "in_flight": totals.in_flight,
+            "retries": totals.retries,
+            "quarantined": totals.quarantined,
             "cpu_s": round(cpu_s, 1),
-            "wasted_wall_s": round(tally.wasted_wall_s, 1),
+            "wasted_wall_s": round(totals.wasted_wall_s, 1),
         }
 
 
-def left_of(tally: Tally, pace: Pace, labels_per_shard: int) -> float | None:
+def left_of(totals: JobTotals, pace: Pace, labels_per_shard: int) -> float | None:
     """Seconds until the last shard at the pace of labels; None while that is unknown."""
-    return pace.left_s((tally.shards - tally.finished) * labels_per_shard)
+    return pace.left_s((totals.shards - totals.finished) * labels_per_shard)

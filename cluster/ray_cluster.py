@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from datagen.cluster.cluster_folders import RAY, private_folder
 from datagen.cluster.environment import changed_environment
-from datagen.cluster.private_folder import RAY, private_folder
 from datagen.cluster.ray_local import START_MEND, slim_node
 from datagen.cluster.ray_settings import (
     OBJECT_STORE_BYTES,

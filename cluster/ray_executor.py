@@ -14,18 +14,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.guard import (
-    Meter,
-    Remains,
-    clear_notes,
-    collect_remains,
-    guarded,
-    obituary,
-    resident_bytes,
-)
+from datagen.cluster.attempt_guard import Meter, guarded, resident_bytes
+from datagen.cluster.post_mortem import PostMortem, clear_notes, collect_post_mortem, failure_report
 from datagen.cluster.ray_cluster import RaySettings, first_line, ray_cluster
-from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, remains_of
-from datagen.cluster.task import AttemptReport, Product, Task
+from datagen.cluster.ray_nodes import OtherNodes, Question, attempts_begun, end_attempts, post_mortems_of
+from datagen.cluster.task import AttemptReport, AttemptResult, Task
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Outcome
 
@@ -34,7 +27,7 @@ _BEGUN_SEEN_FOR_S = 1.0
 # A forced cancellation ends a worker that heeds Ray at once; after this, others are ended by their note.
 _HEEDS_RAY_WITHIN_S = 1.0
 # How long other machines are waited for; they may have to start a process first.
-_BEGUN_WITHIN_S, _REMAINS_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
+_BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
 
 T = TypeVar("T", bound=Task)
 
@@ -49,15 +42,17 @@ class _Death(Generic[T]):
 
 
 @dataclass
-class _Inquest(Generic[T]):
-    """Deaths without remains on this machine, and what the other machines say of them."""
+class _PostMortemCheck(Generic[T]):
+    """Deaths without a post-mortem on this machine, and what the other machines say of them."""
 
     deaths: list[_Death[T]]
     question: Question
 
 
 @contextmanager
-def ray_executor(function: Callable[[T, Meter], Product], settings: RaySettings) -> Generator[RayExecutor[T]]:
+def ray_executor(
+    function: Callable[[T, Meter], AttemptResult], settings: RaySettings
+) -> Generator[RayExecutor[T]]:
     """An executor over `ray_cluster(settings)`; a local cluster that dies is started anew."""
     with ExitStack() as stack:
 
@@ -82,7 +77,7 @@ class RayExecutor(Generic[T]):
 
     def __init__(
         self,
-        function: Callable[[T, Meter], Product],
+        function: Callable[[T, Meter], AttemptResult],
         settings: RaySettings,
         ray: Any,
         restart: Callable[[], Any] | None = None,
@@ -100,7 +95,7 @@ class RayExecutor(Generic[T]):
         self._options: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "max_calls": attempts}
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
-        self._inquests: list[_Inquest[T]] = []
+        self._post_mortem_checks: list[_PostMortemCheck[T]] = []
         self._killed: dict[str, float] = {}  # attempts to end, and when to do so by their notes elsewhere
         self._begun_elsewhere: set[str] = set()
         self._begun_until_s = 0.0
@@ -127,11 +122,11 @@ class RayExecutor(Generic[T]):
         self._jobs.add(task.notes)
 
     def wait(self, timeout_s: float) -> list[AttemptReport]:
-        asked = [ref for inquest in self._inquests for ref in inquest.question.silent]
+        asked = [ref for check in self._post_mortem_checks for ref in check.question.silent]
         if not self._tasks and not asked:
-            if not self._inquests:
+            if not self._post_mortem_checks:
                 time.sleep(timeout_s)
-            return self._ended_inquests()
+            return self._ended_post_mortem_checks()
         if dead := self.others.own.dead():
             return self._lose_all(dead)
         self._end_stubborn()
@@ -139,12 +134,12 @@ class RayExecutor(Generic[T]):
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready:  # take along whatever else has ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
-        for inquest in self._inquests:
-            self.others.hear(inquest.question, ready)
+        for check in self._post_mortem_checks:
+            self.others.hear(check.question, ready)
         ended = [self._answer(ref) for ref in ready if ref in self._tasks]
         reports = [answer for answer in ended if not isinstance(answer, _Death)]
-        reports += self._obituaries([answer for answer in ended if isinstance(answer, _Death)])
-        return reports + self._ended_inquests()
+        reports += self._failure_reports([answer for answer in ended if isinstance(answer, _Death)])
+        return reports + self._ended_post_mortem_checks()
 
     def has_begun(self, attempt: str) -> bool:
         ref = self._refs.get(attempt)
@@ -195,12 +190,12 @@ class RayExecutor(Generic[T]):
         ended = [self._answer(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
         reports = [answer for answer in ended if not isinstance(answer, _Death)]
         deaths = [answer for answer in ended if isinstance(answer, _Death)]
-        deaths += [death for inquest in self._inquests for death in inquest.deaths]
+        deaths += [death for check in self._post_mortem_checks for death in check.deaths]
         deaths += [
             _Death(task, "cancelled" if task.attempt in self._killed else "lost", cause)
             for task in self._tasks.values()
         ]
-        for known in (self._tasks, self._refs, self._killed, self._inquests):
+        for known in (self._tasks, self._refs, self._killed, self._post_mortem_checks):
             known.clear()
         ends_job = self._restart is None
         if self._restart is not None:
@@ -210,7 +205,7 @@ class RayExecutor(Generic[T]):
                 ends_job, cause = True, f"{cause}, and Ray cannot be started anew: {error}"
         for death in deaths:
             end_attempts(death.task.notes, [death.task.attempt])  # a worker may outlive its raylet
-            report = obituary(death.task, death.outcome, death.cause)
+            report = failure_report(death.task, death.outcome, death.cause)
             reports.append(replace(report, cause=cause, ends_job=True) if ends_job else report)
         return reports
 
@@ -233,41 +228,41 @@ class RayExecutor(Generic[T]):
         except e.RayError as error:  # node, raylet, owner or object gone: the shard is not to blame
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
 
-    def _obituaries(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
+    def _failure_reports(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
         """Reports of dead attempts from what they left here; other machines are asked about the rest."""
         reports: list[AttemptReport] = []
         unknown: dict[str, list[_Death[T]]] = defaultdict(list)
         has_others = bool(deaths) and bool(self.others.alive())
         for death in deaths:
-            remains = collect_remains(death.task.notes, death.task.attempt)
-            is_elsewhere = remains.note is None and death.outcome != "lost" and bool(death.task.notes)
+            here = collect_post_mortem(death.task.notes, death.task.attempt)
+            is_elsewhere = here.note is None and death.outcome != "lost" and bool(death.task.notes)
             if has_others and is_elsewhere:
                 unknown[death.task.notes].append(death)
             else:
-                reports.append(obituary(death.task, death.outcome, death.cause, remains))
+                reports.append(failure_report(death.task, death.outcome, death.cause, here))
         for notes, found in unknown.items():
             attempts = [death.task.attempt for death in found]
-            question = self.others.put(remains_of, notes, attempts, patience_s=_REMAINS_WITHIN_S)
-            self._inquests.append(_Inquest(found, question))
+            question = self.others.put(post_mortems_of, notes, attempts, patience_s=_POST_MORTEM_WITHIN_S)
+            self._post_mortem_checks.append(_PostMortemCheck(found, question))
         return reports
 
-    def _ended_inquests(self) -> list[AttemptReport]:
-        """Reports of those whose remains were found, or that no machine knows of."""
+    def _ended_post_mortem_checks(self) -> list[AttemptReport]:
+        """Reports of those whose post-mortem was found, or that no machine knows of."""
         reports: list[AttemptReport] = []
         now_s = time.monotonic()
-        for inquest in list(self._inquests):
-            question, left = inquest.question, dict[str, Remains]()
+        for check in list(self._post_mortem_checks):
+            question, left = check.question, dict[str, PostMortem]()
             for answer in question.answers.values():
                 left |= answer
-            if question.silent and len(left) < len(inquest.deaths) and now_s < question.until_s:
+            if question.silent and len(left) < len(check.deaths) and now_s < question.until_s:
                 continue
-            self._inquests.remove(inquest)
-            for death in inquest.deaths:
-                remains, outcome, cause = left.get(death.task.attempt), death.outcome, death.cause
+            self._post_mortem_checks.remove(check)
+            for death in check.deaths:
+                found, outcome, cause = left.get(death.task.attempt), death.outcome, death.cause
                 # A worker that died left its note on its machine. Where none has it, the machine went too.
-                if remains is None and outcome == "crashed":
+                if found is None and outcome == "crashed":
                     outcome, cause = "lost", "its worker is gone, and the machine that had it does not answer"
-                reports.append(obituary(death.task, outcome, cause, remains or Remains()))
+                reports.append(failure_report(death.task, outcome, cause, found or PostMortem()))
         return reports
 
     @staticmethod

@@ -19,11 +19,11 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationError
 
+from datagen.cluster.cluster_folders import RAY, new_folder, remove_folder, write_private
 from datagen.cluster.environment import is_of_the_shell
-from datagen.cluster.private_folder import RAY, new_folder, remove_folder, write_private
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
 from datagen.schemas.errors import InputError
-from datagen.schemas.private_folders import is_private
+from datagen.schemas.locked_folders import is_private
 from datagen.schemas.run_records import StoredRecord
 
 _START_WITHIN_S = 300.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.guard import Remains, collect_remains, read_note
+from datagen.cluster.post_mortem import PostMortem, collect_post_mortem, read_note
 
 _MUTE_S = 30.0  # a machine that did not answer is left alone for so long
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
@@ -143,9 +143,9 @@ def attempts_begun(notes: str, attempts: Sequence[str]) -> list[str]:
     return [attempt for attempt in attempts if read_note(notes, attempt) is not None]
 
 
-def remains_of(notes: str, attempts: Sequence[str]) -> dict[str, Remains]:
+def post_mortems_of(notes: str, attempts: Sequence[str]) -> dict[str, PostMortem]:
     """What dead workers of this machine left of the attempts; what is given is removed here."""
-    found = {attempt: collect_remains(notes, attempt) for attempt in attempts}
+    found = {attempt: collect_post_mortem(notes, attempt) for attempt in attempts}
     return {attempt: left for attempt, left in found.items() if left.note is not None}
 
 

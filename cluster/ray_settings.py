@@ -11,7 +11,7 @@ import socket
 from pathlib import Path
 
 import datagen
-from datagen.cluster.private_folder import OWNER
+from datagen.cluster.cluster_folders import OWNER
 
 OBJECT_STORE_BYTES = 80 * 2**20  # only reports travel, so the least that Ray accepts
 

@@ -54,7 +54,7 @@ class ShardTask:
 
 
 @dataclass(frozen=True)
-class Product:
+class AttemptResult:
     """What a task function answers when it reached its commit."""
 
     won: bool  # False when another attempt had committed the shard before
@@ -82,5 +82,5 @@ class AttemptReport:
     ends_job: bool = False
 
 
-class JobCannotGoOn(Exception):
+class JobCannotContinue(Exception):
     """Raised by a task function for what no retry can cure. Its text is one line with the mend."""

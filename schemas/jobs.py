@@ -17,7 +17,7 @@ import psutil
 from pydantic import BaseModel, Field
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
 from datagen.schemas.run_records import FORMAT_VERSION, StoredRecord
 from datagen.schemas.storage import Storage
 
@@ -30,7 +30,7 @@ _PID_SLACK_S = 5.0
 _JOB_FILE = re.compile(r"jobs/([0-9]{8}T[0-9]{6}-[0-9a-f]{8})\.json")
 
 
-Passing = TypeVar("Passing", bound=BaseModel)
+Replaced = TypeVar("Replaced", bound=BaseModel)
 
 
 class JobRecord(StoredRecord):
@@ -68,7 +68,7 @@ class JobState(StoredRecord):
     cause: str = ""
 
 
-class StopOrder(StoredRecord):
+class StopRecord(StoredRecord):
     """jobs/<id>.stop.json: somebody wants the job to stop."""
 
     format_version: int = FORMAT_VERSION
@@ -79,12 +79,12 @@ class StopOrder(StoredRecord):
 
 
 @dataclass(frozen=True)
-class Job:
+class StoredJob:
     """All that the place knows of one job."""
 
     record: JobRecord
     state: JobState | None  # None in the moment between its two first writes
-    order: StopOrder | None
+    order: StopRecord | None
 
     @property
     def id(self) -> str:
@@ -118,7 +118,7 @@ class Jobs:
             where = f"{self._place.url}/jobs/{record.id}.json"
             raise InputError(where, "", "this job has already begun", "Start it again: it gets another name")
 
-    def tell(self, state: JobState) -> None:
+    def put_state(self, state: JobState) -> None:
         """Replace what is known of a job."""
         self._place.put(f"jobs/{state.id}.state.json", encode_record(state))
 
@@ -126,14 +126,14 @@ class Jobs:
         """Ask a job to stop. A request to end at once is not taken back by a gentler one."""
         standing = self.stop_order(job)
         if standing is None or (at_once and not standing.now):
-            order = StopOrder(id=job, now=at_once, asked=now(), host=platform.node())
+            order = StopRecord(id=job, now=at_once, asked=utc_now(), host=platform.node())
             self._place.put(f"jobs/{job}.stop.json", encode_record(order))
 
-    def stop_order(self, job: str) -> StopOrder | None:
+    def stop_order(self, job: str) -> StopRecord | None:
         """The request to stop that stands for a job."""
-        return self._passing(f"jobs/{job}.stop.json", StopOrder)
+        return self._passing(f"jobs/{job}.stop.json", StopRecord)
 
-    def get(self, job: str) -> Job | None:
+    def get(self, job: str) -> StoredJob | None:
         """One job; None where there is none of this name. InputError where its record is damaged."""
         where = f"{self._place.url}/jobs/{job}.json"
         try:
@@ -145,16 +145,16 @@ class Jobs:
             return None
         if record.id != job:
             raise InputError(where, "id", f"{record.id}, not {job}", "Remove this foreign file")
-        return Job(record, self._passing(f"jobs/{job}.state.json", JobState), self.stop_order(job))
+        return StoredJob(record, self._passing(f"jobs/{job}.state.json", JobState), self.stop_order(job))
 
-    def all(self) -> list[Job]:
+    def all(self) -> list[StoredJob]:
         """Every job that began here, in order of time."""
         names = (_JOB_FILE.fullmatch(file.key) for file in self._place.list("jobs"))
         found = [job for name in names if name and (job := self.get(name[1])) is not None]
         # Names tell seconds only, and two jobs may begin within one.
         return sorted(found, key=lambda job: (job.record.started, job.record.id))
 
-    def _passing(self, key: str, model: type[Passing]) -> Passing | None:
+    def _passing(self, key: str, model: type[Replaced]) -> Replaced | None:
         # Replaced too often to be made durable: a power cut may tear it, which is as if it were absent.
         data = self._place.get(key, MAX_RECORD_BYTES)
         if data is None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 from pydantic import BaseModel
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
 from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
 from datagen.schemas.storage import Storage
 
@@ -28,7 +28,7 @@ class Ledger:
     def start(self, attempt: str, shard: int) -> None:
         """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
         record = AttemptStart(
-            attempt=attempt, shard=shard, started=now(), host=platform.node(), writer=secrets.token_hex(8)
+            attempt=attempt, shard=shard, started=utc_now(), host=platform.node(), writer=secrets.token_hex(8)
         )
         if not self._storage.put_new(start_key(attempt), encode_record(record)):
             place = f"{self._storage.url}/{start_key(attempt)}"

@@ -20,7 +20,7 @@ LINEAGE = "lineage.json"
 _Shard = Annotated[int, Field(ge=0, le=10**18)]
 
 
-class Origin(NamedTuple):
+class ShardOrigin(NamedTuple):
     """A run that made shards: where it lay when it was merged, and what made it. Sorted in this order."""
 
     address: str
@@ -51,7 +51,7 @@ class Origins:
 
     def __init__(self, run: Run) -> None:
         manifest = run.manifest
-        self.own = Origin(
+        self.own = ShardOrigin(
             address=run.storage.url,
             platform=manifest.platform,
             code_version=manifest.code_version,
@@ -59,7 +59,7 @@ class Origins:
         )
         lineage = read_record(run.storage, LINEAGE, Lineage)
         sources = lineage.sources if lineage else ()
-        self.named = tuple(Origin(**source.model_dump(exclude={"shards"})) for source in sources)
+        self.named = tuple(ShardOrigin(**source.model_dump(exclude={"shards"})) for source in sources)
         ranges = [
             (first, last, origin)
             for source, origin in zip(sources, self.named, strict=True)
@@ -73,7 +73,7 @@ class Origins:
         """Whether the run has a lineage."""
         return bool(self.named)
 
-    def of(self, shard: int) -> Origin:
+    def of(self, shard: int) -> ShardOrigin:
         """Where a shard comes from; the run itself where no lineage says otherwise."""
         k = bisect_right(self._firsts, shard) - 1
         if k >= 0 and shard <= self._ranges[k][1]:
@@ -81,7 +81,7 @@ class Origins:
         return self.own
 
 
-def encode_lineage(shards: Mapping[Origin, Iterable[int]]) -> bytes:
+def encode_lineage(shards: Mapping[ShardOrigin, Iterable[int]]) -> bytes:
     """The record's bytes from the shards of each origin."""
     sources = [LineageSource(**origin._asdict(), shards=_ranges(shards[origin])) for origin in sorted(shards)]
     return encode_record(Lineage(sources=tuple(sources)))
@@ -92,7 +92,7 @@ def lineage_summary(run: Run) -> list[dict[str, Any]]:
     origins = Origins(run)
     if not origins.is_merged:
         return []
-    found: dict[Origin, list[int]] = {origin: [] for origin in origins.named}
+    found: dict[ShardOrigin, list[int]] = {origin: [] for origin in origins.named}
     for shard in sorted(run.committed()):
         found.setdefault(origins.of(shard), []).append(shard)
     return [

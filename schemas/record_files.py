@@ -23,7 +23,7 @@ _TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64
 Record = TypeVar("Record", bound=BaseModel)
 
 
-def now() -> str:
+def utc_now() -> str:
     """The present time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 

@@ -6,7 +6,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import MAX_RECORD_BYTES, different_fields
 from datagen.schemas.run_records import Manifest
 from datagen.schemas.storage import Storage
-from datagen.schemas.storage.errors import OddFile
+from datagen.schemas.storage.errors import NotARegularFile
 
 
 def copy_key(key: str) -> str:
@@ -33,7 +33,7 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
         for file in storage.list(""):
             if not file.key.startswith(ours):
                 raise InputError(storage.url, file.key, problem, mend)
-    except OddFile as e:
+    except NotARegularFile as e:
         raise InputError(e.place, "", problem, mend) from e
 
 

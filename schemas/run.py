@@ -19,7 +19,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, now, read_record
+from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
 from datagen.schemas.root_records import publish, refuse_foreign, refuse_other
 from datagen.schemas.run_records import (
     FORMAT_VERSION,
@@ -35,7 +35,7 @@ from datagen.schemas.run_records import (
 )
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.storage.errors import StoreFailure
+from datagen.schemas.storage.errors import StoreUnavailable
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 # What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
@@ -143,7 +143,7 @@ class Run:
                 place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
                 raise InputError(place, "", problem, "Move it away")
             number, spec_hash = number + 1, self.manifest.spec_hash
-            plan = Plan(n=n, created=created or now(), spec_hash=spec_hash, number=number)
+            plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
             # Losing this race means that another plan appeared: look again.
             publish(self.storage, f"plans/{number}.json", encode_record(plan))
 
@@ -238,7 +238,7 @@ class Run:
         folder = shard_folder(shard, attempt)
         try:
             yield
-        except StoreFailure:
+        except StoreUnavailable:
             raise  # it would not delete either
         except InputError as error:
             with suppress(InputError):
@@ -252,7 +252,7 @@ class Run:
             raise
 
     def remove_attempt(self, shard: int, attempt: str) -> Removal:
-        """Remove an attempt's files, unless its shard's commit may name it (schemas/garbage.py says how)."""
+        """Remove an attempt's files, unless its shard's commit may name it (as `garbage_collection` says)."""
         folder = shard_folder(shard, attempt)
         mark = f"{folder}/{REMOVING}"
         self.storage.put(mark, b"")
@@ -277,8 +277,8 @@ class Run:
     def commit(self, commit: Commit) -> bool:
         """Publish a shard. False when another attempt has won; its files then are garbage.
 
-        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit
-        of an attempt whose files are removed as garbage meanwhile is taken back (schemas/garbage.py).
+        The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit of
+        an attempt whose files are removed as garbage meanwhile is withdrawn (as `garbage_collection` says).
         """
         if (problem := self._lack(commit, committing=True)) is not None:
             raise problem

@@ -113,7 +113,7 @@ class Summaries:
     def _in_order(self, keys: Sequence[str]) -> Iterator[Summary]:
         run, indexed = self._run, self._indexed
         absent = (key for key in keys if key not in indexed)
-        read = run.storage.in_order(partial(_read, run), absent)
+        read = run.storage.concurrent_map(partial(_read, run), absent)
         for key in keys:
             text = indexed.get(key)
             # A row that cannot be of its record does not count: the record says what is true.
@@ -143,7 +143,7 @@ def refresh(run: Run) -> int:
     missing = [key for key in stamps if key not in known]
     if not missing and len(replaced) <= bool(kept):
         return 0  # what is there would only be written again
-    read = zip(missing, run.storage.in_order(partial(_read, run), missing), strict=True)
+    read = zip(missing, run.storage.concurrent_map(partial(_read, run), missing), strict=True)
     new = ((key, (stamps[key], text)) for key, found in read if (text := _encode(run, key, found)))
     todo, written, count = chain(kept.items(), new), set[str](), -len(kept)
     while rows := dict(islice(todo, ROWS_PER_FILE)):

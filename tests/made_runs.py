@@ -14,7 +14,7 @@ from datagen.schemas.fields import Field, RecordSchema, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.keys import shard_folder
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import now
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Cost, FileEntry, Host, Layout, LedgerEntry, Manifest
 from datagen.schemas.shard_files import encode_shard
@@ -46,7 +46,7 @@ def manifest_of(spec: Specification, layout: Layout) -> Manifest:
         code_version="0",
         libraries={},
         platform="test",
-        created=now(),
+        created=utc_now(),
     )
 
 
@@ -74,7 +74,7 @@ def attempt(run: Run, shard: int, name: str) -> bool:
     outcome = "committed" if won else "superseded"
     run.ledger.end(
         LedgerEntry(
-            attempt=name, shard=shard, outcome=outcome, ended=now(), cost=commit.cost, host=commit.host
+            attempt=name, shard=shard, outcome=outcome, ended=utc_now(), cost=commit.cost, host=commit.host
         )
     )
     return won
@@ -109,7 +109,7 @@ def commit_of(
         files=files,
         cost=Cost(wall_s=1.0, cpu_s=1.0),
         host=Host(name="h", cpu="c", cores=1, memory_bytes=1),
-        created=now(),
+        created=utc_now(),
     )
 
 

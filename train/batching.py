@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 
 Rows = npt.NDArray[np.intp]
 
@@ -136,8 +136,8 @@ def make_batch(
             target_height_m=np.array([r["target_center_m"][2] for r in records], np.float32),
             target_radius_m=np.array([r["target_radius_m"] for r in records], np.float32),
         ),
-        robots=Robots(scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)),
-        candidates=Candidates(
+        robots=RobotInputs(scene_row[new].astype(np.int64), *(sampled(name)[new] for name in ROBOT_FIELDS)),
+        candidates=CandidateInputs(
             robot_row=(np.cumsum(new) - 1).astype(np.int64),
             base_xy_m=np.concatenate([v.base_xy_m for v in views]).astype(np.float32),
         ),

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
-from datagen.schemas.at_once import in_order
+from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.train.augment import Augmentation
 from datagen.train.batching import (
@@ -25,8 +25,8 @@ from datagen.train.batching import (
 )
 from datagen.train.epoch_plan import EpochPlan, batches_of, plan_epoch
 from datagen.train.inputs import Array, Batch
-from datagen.train.opening import open_parts
 from datagen.train.reader import JOIN_FIELDS, load_shard
+from datagen.train.run_parts import open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
 
 _CORE = (*SCENE_FIELDS, *SAMPLE_FIELDS, *JOIN_FIELDS)
@@ -40,7 +40,7 @@ class _Draw(IntEnum):
     AUGMENT = 2
 
 
-class Origin(TypedDict):
+class DataOrigin(TypedDict):
     """What a run is known by, in values that JSON can hold.
 
     `samples_sha256` is over the ids and labels of the samples that count, in stored order: the same for a
@@ -148,7 +148,7 @@ class SampleStream:
         """Digests of all objects in its scenes, targets and clutter."""
         return set(self._scenes.object_digests)
 
-    def origin(self) -> list[Origin]:
+    def origin(self) -> list[DataOrigin]:
         """What a checkpoint says of its data, a run at a time."""
         return [
             {
@@ -182,7 +182,7 @@ class SampleStream:
             return
         with ThreadPoolExecutor(1, "read-ahead") as pool:
             ahead = max(2, self.buffer_shards)
-            loaded = in_order(pool, ahead, self._load, self._reads(plan, int(plan.cuts[skip])))
+            loaded = concurrent_map(pool, ahead, self._load, self._reads(plan, int(plan.cuts[skip])))
             try:
                 held: dict[int, StoredScene] = {}
                 for first, past in zip(plan.cuts[skip:-1], plan.cuts[skip + 1 :], strict=True):

@@ -42,7 +42,7 @@ class Clouds(Generic[A]):
 
 
 @dataclass(frozen=True, eq=False)
-class Robots(Generic[A]):
+class RobotInputs(Generic[A]):
     """R robots, each with the cloud that it is given."""
 
     cloud_row: A  # (R,) int64, into Clouds
@@ -55,7 +55,7 @@ class Robots(Generic[A]):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates(Generic[A]):
+class CandidateInputs(Generic[A]):
     """N base positions, each of one robot."""
 
     robot_row: A  # (N,) int64, into Robots
@@ -73,8 +73,8 @@ class Batch(Generic[A]):
     """
 
     clouds: Clouds[A]
-    robots: Robots[A]
-    candidates: Candidates[A]
+    robots: RobotInputs[A]
+    candidates: CandidateInputs[A]
     label: A  # (N,) int64, 0 or 1
     sample_id: Array  # (N, 16) uint8, always numpy: names, not numbers
     extra: Mapping[str, Any] = field(default_factory=dict)
@@ -84,7 +84,7 @@ class Batch(Generic[A]):
 
 
 def mount_distance_m(
-    clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]
+    clouds: Clouds[Array], robots: RobotInputs[Array], candidates: CandidateInputs[Array]
 ) -> npt.NDArray[np.float64]:
     """Distance (N,) from each candidate's arm mount (x, y, base height) to the target's centre."""
     planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64), axis=1)

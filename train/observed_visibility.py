@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from datagen.train.inputs import Array, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, CandidateInputs, Clouds, RobotInputs
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -38,7 +38,9 @@ _PARTY = 32  # eyes that look at the target from about one side are dealt with t
 _AT_ONCE = 1 << 13  # pairs of eye and point: bounds memory, and stays in the cache
 
 
-def observed_visibility(clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]) -> F64:
+def observed_visibility(
+    clouds: Clouds[Array], robots: RobotInputs[Array], candidates: CandidateInputs[Array]
+) -> F64:
     """Estimated rho (N,) in [0, 1] of every candidate, from the points of its robot's cloud alone.
 
     0 where no point of the target was observed, and where the camera is inside the target's sphere.
@@ -55,7 +57,7 @@ def observed_visibility(clouds: Clouds[Array], robots: Robots[Array], candidates
     return rho
 
 
-def eyes(clouds: Clouds[Array], robots: Robots[Array], candidates: Candidates[Array]) -> F32:
+def eyes(clouds: Clouds[Array], robots: RobotInputs[Array], candidates: CandidateInputs[Array]) -> F32:
     """The cameras (N, 3) of the candidates, in their target's frame."""
     robot = candidates.robot_row
     height_m = robots.camera_height_m[robot] - clouds.target_height_m[robots.cloud_row[robot]]

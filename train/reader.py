@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.shard_reading import ShardPlace, StoredArray
-from datagen.train.opening import open_parts
+from datagen.train.run_parts import open_parts
 
 Array = npt.NDArray[Any]
 Columns = dict[str, Array]

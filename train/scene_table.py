@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.opening import Part
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
+from datagen.train.run_parts import RunPart
 
 I64 = npt.NDArray[np.int64]
 
@@ -33,7 +33,7 @@ TABLE_FIELDS = (
 class PartSummary:
     """What counts of one part. `samples_sha256` is over ids and labels of its samples, in stored order."""
 
-    part: Part
+    part: RunPart
     scenes: int
     negatives: int
     positives: int
@@ -61,7 +61,7 @@ class SceneTable:
 
 
 def read_scene_table(
-    parts: Sequence[Part], per_robot: int | None, houses: Callable[[str], bool] | None
+    parts: Sequence[RunPart], per_robot: int | None, houses: Callable[[str], bool] | None
 ) -> SceneTable:
     """The scenes of the houses that count. InputError where there is none, or a run is named twice."""
     _refuse_twins(parts)
@@ -125,7 +125,7 @@ def _texts(columns: Columns, name: str, row: int) -> set[str]:
     return {str(text) for text in np.atleast_1d(columns[name][row])}
 
 
-def _refuse_twins(parts: Sequence[Part]) -> None:
+def _refuse_twins(parts: Sequence[RunPart]) -> None:
     """Two places with one specification hold the same samples, which then would count twice."""
     seen: dict[str, str] = {}
     for part in parts:

@@ -46,7 +46,7 @@ def cache_folder() -> Path:
 
 
 @dataclass(frozen=True)
-class Shelf:
+class CacheFolder:
     """Named arrays in one folder of the cache, each file under the key of all that decides its content."""
 
     folder: str  # below the cache folder
@@ -64,7 +64,7 @@ class Shelf:
         return found
 
     def store(self, key: str, arrays: Arrays) -> None:
-        """Keeps arrays of the shelf's layout, where the folder takes them."""
+        """Keeps arrays of the layout, where the folder takes them."""
         path = self._path(key)
         if write_arrays(path, {**arrays, "key": np.array(key)}):
             drop_unused(path.parent, self.most_files)

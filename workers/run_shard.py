@@ -1,9 +1,9 @@
 """One shard, from its place in the sequence to checked arrays. Read this first.
 
-draw a house, a support, a target and clutter   (redrawn until it works)
+draw a house, a support, a target and clutter   (resampled until it works)
 settle them by physics
 sample base candidates
-observe one RGB-D frame                         (or recall scene and candidates from a store)
+observe one RGB-D frame                         (or reconstruct scene and candidates from a stored run)
 label the candidates
 check the batch against its schema
 """
@@ -23,12 +23,12 @@ from datagen.schemas.fields import SceneRows, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
 from datagen.workers.labels.source import LabelSource
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.scenes.draw import draw_scene
-from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import Scene, SettledScene
 from datagen.workers.world import World
 
@@ -46,11 +46,11 @@ class ShardResult:
 
 
 @dataclass(frozen=True, eq=False)
-class _Staged:
+class _UnlabelledScene:
     """A scene that waits for labels: what is looked at, and the rows that no label decides."""
 
     scene: SettledScene
-    candidates: Candidates
+    candidates: SceneCandidates
     record: Mapping[str, Any]
     redraws: Mapping[str, int]
 
@@ -74,39 +74,43 @@ def run_shard(
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
-    staged_scenes = (
-        (_draw(world, index, clock) for index in scene_indices)
+    scenes = (
+        (_generate(world, index, clock) for index in scene_indices)
         if stored is None
-        else (_recall(world, index, rows, clock) for index, rows in zip(scene_indices, stored, strict=True))
+        else (
+            _reconstruct(world, index, rows, clock) for index, rows in zip(scene_indices, stored, strict=True)
+        )
     )
-    for staged in staged_scenes:
-        labelled = source.label(staged.scene, staged.candidates, spec, clock)
-        common = candidate_columns(staged.scene.index, staged.candidates, spec_hash, source)
-        scene_rows.append(staged.record)
+    for unlabelled in scenes:
+        labelled = source.label(unlabelled.scene, unlabelled.candidates, spec, clock)
+        common = candidate_columns(unlabelled.scene.index, unlabelled.candidates, spec_hash, source)
+        scene_rows.append(unlabelled.record)
         sample_blocks.append(common | labelled)
-        redraws.update(staged.redraws)
+        redraws.update(unlabelled.redraws)
 
-    scenes = {f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields}
+    scene_columns = {
+        f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
+    }
     # All that the source gave: a column that no version knows is its defect.
     names = [name for name in sample_blocks[0] if name not in schema.later]
-    samples = {name: np.concatenate([b[name] for b in sample_blocks]) for name in names}
-    schema.check("scene", len(scene_rows), scenes)
-    schema.check("sample", sum(len(b["label"]) for b in sample_blocks), samples)
-    return ShardResult(scenes, samples, clock, dict(redraws))
+    sample_columns = {name: np.concatenate([b[name] for b in sample_blocks]) for name in names}
+    schema.check("scene", len(scene_rows), scene_columns)
+    schema.check("sample", sum(len(b["label"]) for b in sample_blocks), sample_columns)
+    return ShardResult(scene_columns, sample_columns, clock, dict(redraws))
 
 
-def _draw(world: World, index: int, clock: StageClock) -> _Staged:
-    scene, candidates = draw_scene(world, index, clock)
-    return _Staged(scene, candidates, scene_row(scene), scene.redraws)
+def _generate(world: World, index: int, clock: StageClock) -> _UnlabelledScene:
+    scene, candidates = generate_scene(world, index, clock)
+    return _UnlabelledScene(scene, candidates, scene_row(scene), scene.redraws)
 
 
-def _recall(world: World, index: int, rows: SceneRows, clock: StageClock) -> _Staged:
+def _reconstruct(world: World, index: int, rows: SceneRows, clock: StageClock) -> _UnlabelledScene:
     with clock.stage("draw"):
-        scene = recall_scene(world, rows.record)
+        scene = reconstruct_scene(world, rows.record)
     if scene.index != index:
         problem = f"scene {scene.index} is stored where scene {index} belongs"
         raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
-    return _Staged(scene, recall_candidates(rows.samples, scene), rows.record, {})
+    return _UnlabelledScene(scene, reconstruct_candidates(rows.samples, scene), rows.record, {})
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:
@@ -150,7 +154,7 @@ def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def candidate_columns(
-    scene_index: int, candidates: Candidates, spec_hash: str, source: LabelSource
+    scene_index: int, candidates: SceneCandidates, spec_hash: str, source: LabelSource
 ) -> Columns:
     """The columns that the candidates alone decide, one row a candidate."""
     n = len(candidates)

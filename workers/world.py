@@ -17,7 +17,7 @@ from datagen.workers.houses import ids_of_split, open_houses
 from datagen.workers.houses.house import House, HouseSource
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel, ObjectSource
-from datagen.workers.rendering.rays import RayMesh, RayStage, house_rays, object_rays
+from datagen.workers.rendering.rays import RayMesh, RayScene, house_rays, object_rays
 
 if TYPE_CHECKING:
     from datagen.workers.grasps.targets import Targets
@@ -117,11 +117,11 @@ class World:
         gripper = gripper_of(self.spec.arm.robot)
         return Targets(self.object_names, self.objects.load, gripper, self.spec.arm.grasps)
 
-    def stage(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayStage:
+    def ray_scene(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
         """A house with the named objects at these poses (K, 4, 4), ready for rays."""
         prepared = [self.object(name) for name in names]
         radii_m = np.array([p.model.radius_m for p in prepared])
-        return RayStage(house.rays, [p.rays for p in prepared], radii_m, T_world_object)
+        return RayScene(house.rays, [p.rays for p in prepared], radii_m, T_world_object)
 
 
 def open_world(spec: Specification, houses: str, objects: str) -> World:

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from datagen.schemas.keys import commit_key
-from datagen.schemas.record_files import encode_record, now
+from datagen.schemas.record_files import encode_record, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import AttemptStart, Cost, FileEntry, Host, LedgerEntry
 from datagen.schemas.shard_files import encode_shard
@@ -26,8 +26,8 @@ from tests.made_runs import commit_of, make_run, rows_of
 
 _ANSWERS = {
     "open + missing": ("from datagen.schemas.run import Run", "len(Run.open(place).missing())"),
-    "status": ("from datagen.reports.standing import status_report", "status_report(Run.open(place))"),
-    "audit": ("from datagen.reports.accounts import account_for", "account_for([Run.open(place)])"),
+    "status": ("from datagen.reports.run_status import status_report", "status_report(Run.open(place))"),
+    "audit": ("from datagen.reports.spending import account_for", "account_for([Run.open(place)])"),
 }
 _TIMED = """
 import json, sys, time
@@ -72,12 +72,12 @@ def make_large(folder: Path, commits: int) -> Run:
             attempt=attempt,
             shard=shard,
             outcome="committed",
-            started=now(),
-            ended=now(),
+            started=utc_now(),
+            ended=utc_now(),
             cost=cost,
             host=host,
         )
-        start = AttemptStart(attempt=attempt, shard=shard, started=now(), host="node")
+        start = AttemptStart(attempt=attempt, shard=shard, started=utc_now(), host="node")
         (folder / commit_key(shard)).write_bytes(encode_record(commit))
         (folder / f"ledger/{attempt}.start.json").write_bytes(encode_record(start))
         (folder / f"ledger/{attempt}.json").write_bytes(encode_record(end))

@@ -17,7 +17,7 @@ _MANISKILL = "https://huggingface.co/datasets/haosulab"
 
 
 @dataclass(frozen=True)
-class Asset:
+class CatalogueEntry:
     """One download. `file` is its name in caches and on mirrors, unique in the catalogue."""
 
     name: str
@@ -33,8 +33,8 @@ class Asset:
     max_unpacked_bytes: int = 10 * _GB
 
 
-def _houses(split: str, sha256: str, size: int) -> Asset:
-    return Asset(
+def _houses(split: str, sha256: str, size: int) -> CatalogueEntry:
+    return CatalogueEntry(
         name=f"procthor-10k/{split}",
         file=f"procthor-10k-{split}.jsonl.gz",
         url=f"https://media.githubusercontent.com/media/allenai/procthor-10k/{_PROCTHOR_10K}/{split}.jsonl.gz",
@@ -62,7 +62,7 @@ _SCANNED = [
 ]  # fmt: skip
 
 _ALL = (
-    Asset(
+    CatalogueEntry(
         name="ycb",
         file="mani_skill2_ycb.zip",
         url=f"{_MANISKILL}/ManiSkill2/resolve/main/data/mani_skill2_ycb.zip",
@@ -76,7 +76,7 @@ _ALL = (
     _houses("train", "ee3c4aa14b4d8f0895fecfb5fdaca59395427ca1018b2f9aeeedbc61e5824587", 53_314_510),
     _houses("val", "d808540514e26b6726cd2790490e669b572eeb94febb5188a2f403591dd21721", 5_094_681),
     _houses("test", "9a9fa6f134e76fe87f3fd92c00883651cf9fadf4e9ad4072d6d73be229f001dc", 5_022_093),
-    Asset(
+    CatalogueEntry(
         name="procthor-10k/asset-sizes",
         file="asset-database.json",
         url=f"https://raw.githubusercontent.com/allenai/procthor/{_PROCTHOR}/procthor/databases/asset-database.json",
@@ -84,7 +84,7 @@ _ALL = (
         into="procthor",
         about="sizes of the AI2-THOR assets that ProcTHOR houses are furnished with",
     ),
-    Asset(
+    CatalogueEntry(
         name="ai2thor",
         file="ai2thor.zip",
         url=f"{_MANISKILL}/AI2THOR/resolve/main/ai2thor.zip",
@@ -96,7 +96,7 @@ _ALL = (
         max_unpacked_bytes=200 * _GB,
     ),
     *(
-        Asset(
+        CatalogueEntry(
             name=f"ycb-scans/{key}",
             file=f"{key}_google_16k.tgz",
             url=f"{_YCB_SCANS}/{key}_google_16k.tgz",
@@ -111,10 +111,10 @@ _ALL = (
     ),
 )
 
-CATALOGUE: dict[str, Asset] = {asset.name: asset for asset in _ALL}
+CATALOGUE: dict[str, CatalogueEntry] = {asset.name: asset for asset in _ALL}
 
 
-def select(names: tuple[str, ...] | list[str]) -> list[Asset]:
+def select(names: tuple[str, ...] | list[str]) -> list[CatalogueEntry]:
     """Assets by name or by group (`procthor-10k`, `ycb-scans`), in catalogue order, each once.
 
     Raises KeyError with the first unknown name.

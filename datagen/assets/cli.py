@@ -19,7 +19,7 @@ from rich.progress import (
 )
 
 from datagen.assets import lock as locks
-from datagen.assets.catalogue import CATALOGUE, Asset, select
+from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
 from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
@@ -142,7 +142,7 @@ def fetch_assets(
         disable=json or not console.is_terminal,
     )
 
-    def one(asset: Asset) -> Fetched:
+    def one(asset: CatalogueEntry) -> Fetched:
         task = bar.add_task(asset.name, total=asset.size)
         return fetch(
             asset,
@@ -165,11 +165,11 @@ def fetch_assets(
     return 0
 
 
-def _trust(asset: Asset) -> str:
+def _trust(asset: CatalogueEntry) -> str:
     return "published digest" if asset.sha256 else "first use"
 
 
-def _shown() -> list[Asset]:
+def _shown() -> list[CatalogueEntry]:
     """The catalogue with only the first of the many scans, to keep the table short."""
     scans = [asset for asset in CATALOGUE.values() if asset.name.startswith("ycb-scans/")]
     return [asset for asset in CATALOGUE.values() if asset not in scans[1:]]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 
 _CHUNK_BYTES = 2**18
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
@@ -30,7 +30,7 @@ Progress = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
-class Policy:
+class DownloadPolicy:
     """How patient a download is. `pause` waits between tries."""
 
     tries: int = 6  # in a row without a new byte
@@ -40,7 +40,7 @@ class Policy:
     pause: Callable[[float], None] = field(default=time.sleep)
 
 
-class _Passing(Exception):
+class _TransientFailure(Exception):
     """A failure worth another try."""
 
 
@@ -65,7 +65,7 @@ def download(
     size: int | None,
     max_bytes: int,
     progress: Progress,
-    policy: Policy | None = None,
+    policy: DownloadPolicy | None = None,
 ) -> str:
     """Brings `url` to the file `target` and returns its sha256.
 
@@ -76,18 +76,18 @@ def download(
     an atomic rename. Raises InputError naming the address: final answers such as 404, too large,
     wrong size or digest, no more tries.
     """
-    policy = policy or Policy()
+    policy = policy or DownloadPolicy()
     if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
         raise InputError(url, "", "not an http or https address", "Give one with --mirror")
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = _Part(target, url)
+    part = _PartialFile(target, url)
     failures = 0
     while True:
         before = part.length
         resumed = before > 0
         try:
             _transfer(url, part, size, max_bytes, sha256 is not None, progress, policy.timeout_s)
-        except _Passing as error:
+        except _TransientFailure as error:
             failures = 0 if part.length > before else failures + 1
             if failures >= policy.tries:
                 raise InputError(
@@ -116,7 +116,7 @@ def download(
             )
 
 
-class _Part:
+class _PartialFile:
     """The unfinished file and what its content is tied to."""
 
     def __init__(self, target: Path, url: str) -> None:
@@ -159,14 +159,14 @@ class _Part:
 
 def _transfer(
     url: str,
-    part: _Part,
+    part: _PartialFile,
     size: int | None,
     max_bytes: int,
     has_digest: bool,
     progress: Progress,
     timeout_s: float,
 ) -> None:
-    """One request that appends to the part until the body ends. Raises _Passing or InputError."""
+    """One request that appends to the part until the body ends. Raises _TransientFailure or InputError."""
     start = part.length
     # Without a validator only a known digest can tell whether the halves belong together.
     if start and not (part.validator or has_digest):
@@ -199,9 +199,9 @@ def _transfer(
         error.close()
         if error.code == 416:
             part.discard()
-            raise _Passing("the server refused to continue") from error
+            raise _TransientFailure("the server refused to continue") from error
         if error.code in _PASSING:
-            raise _Passing(f"HTTP {error.code}") from error
+            raise _TransientFailure(f"HTTP {error.code}") from error
         raise InputError(
             url,
             "",
@@ -209,7 +209,7 @@ def _transfer(
             "Use --mirror with a server that has it",
         ) from error
     except (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError) as error:
-        raise _Passing(str(getattr(error, "reason", "") or error) or type(error).__name__) from error
+        raise _TransientFailure(str(getattr(error, "reason", "") or error) or type(error).__name__) from error
 
 
 def _continues(answer: Any, start: int) -> bool:
@@ -230,7 +230,13 @@ def _validator(answer: Any) -> str:
 
 
 def _append(
-    answer: Any, part: _Part, url: str, start: int, total: int | None, max_bytes: int, progress: Progress
+    answer: Any,
+    part: _PartialFile,
+    url: str,
+    start: int,
+    total: int | None,
+    max_bytes: int,
+    progress: Progress,
 ) -> None:
     here = start
     progress(here, total)
@@ -246,4 +252,4 @@ def _append(
             out.write(chunk)
             progress(here, total)
     if total is not None and here < total:
-        raise _Passing(f"the connection broke at {here:,} of {total:,} bytes")
+        raise _TransientFailure(f"the connection broke at {here:,} of {total:,} bytes")

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from datagen.assets.catalogue import CATALOGUE, Asset
-from datagen.assets.download import Policy, Progress, download
+from datagen.assets.catalogue import CATALOGUE, CatalogueEntry
+from datagen.assets.download import DownloadPolicy, Progress, download
 from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
@@ -28,14 +28,14 @@ class Fetched:
 
 
 def fetch(
-    asset: Asset,
+    asset: CatalogueEntry,
     folder: Path,
     *,
     cache: Path,
     mirror: str | None = None,
     offline: bool = False,
     progress: Progress = lambda here, total: None,
-    policy: Policy | None = None,
+    policy: DownloadPolicy | None = None,
 ) -> Fetched:
     """Downloads one asset (or takes it from the cache), unpacks it and records it in the lock.
 
@@ -72,9 +72,9 @@ def fetch(
 
 
 def fetch_all(
-    assets: list[Asset],
+    assets: list[CatalogueEntry],
     folder: Path,
-    fetch_one: Callable[[Asset], Fetched],
+    fetch_one: Callable[[CatalogueEntry], Fetched],
     report: Callable[[Fetched], None],
 ) -> list[Fetched]:
     """Fetches in order after checking that the disk can hold what is known of the sizes."""
@@ -95,7 +95,7 @@ def fetch_all(
     return done
 
 
-def _install(asset: Asset, kept: Path, folder: Path) -> list[str]:
+def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
     """Puts the download in its place; returns the files relative to `folder`."""
     home = folder / asset.into
     if asset.archive:
@@ -106,7 +106,7 @@ def _install(asset: Asset, kept: Path, folder: Path) -> list[str]:
     return [(PurePosixPath(asset.into) / asset.file).as_posix()]
 
 
-def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: Asset, files: list[str]) -> None:
+def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEntry, files: list[str]) -> None:
     table = {old.path: old for old in lock.files}
     for relative in files:
         path = folder / relative

@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular, read_regular
 from datagen.schemas.run_records import Digest, StoredRecord
+from datagen.schemas.untrusted_files import open_regular, read_regular
 from datagen.schemas.whole_files import whole_file
 
 LOCK_NAME = "assets.lock.json"

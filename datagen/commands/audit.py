@@ -10,14 +10,14 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.reports.accounts import Account, Books, account_for
 from datagen.reports.agreement import common_candidates, compare, outcome_report
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
-from datagen.reports.labelled import join_labelled, read_labelled
-from datagen.reports.specified import is_disturbed
+from datagen.reports.label_arrays import join_labelled, read_labelled
+from datagen.reports.specification_summary import is_disturbed
+from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.cost import STAGES
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 
@@ -135,42 +135,42 @@ def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:
     return {"outcomes": outcome_report(labelled.at(labelled.is_in(candidates)))}
 
 
-def audit_report(books: Books, source: str) -> dict[str, Any]:
+def audit_report(spending: Spending, source: str) -> dict[str, Any]:
     """The audit as plain values; times in seconds, sizes in bytes."""
-    labels = books.labels
+    labels = spending.labels
     stages: dict[str, dict[str, float]] = {
-        stage: {"wall_s": books.useful.stage_wall_s[stage], "cpu_s": books.useful.stage_cpu_s[stage]}
+        stage: {"wall_s": spending.useful.stage_wall_s[stage], "cpu_s": spending.useful.stage_cpu_s[stage]}
         for stage in STAGES
-        if stage in books.useful.stage_wall_s
+        if stage in spending.useful.stage_wall_s
     }
     stages["other"] = {
-        "wall_s": books.useful.unnamed_wall_s,
-        "cpu_s": max(0.0, books.useful.cpu_s - sum(books.useful.stage_cpu_s.values())),
+        "wall_s": spending.useful.unnamed_wall_s,
+        "cpu_s": max(0.0, spending.useful.cpu_s - sum(spending.useful.stage_cpu_s.values())),
     }
-    waste = {outcome: _account(account) for outcome, account in sorted(books.waste.items())}
-    per_label_s = books.wall_s_per_label
+    waste = {outcome: _account(account) for outcome, account in sorted(spending.waste.items())}
+    per_label_s = spending.wall_s_per_label
     return {
         "label_source": source,
         "labels": labels,
-        "positives": books.positives,
-        "positive_share": books.positives / labels if labels else None,
-        "scenes": books.scenes,
-        "redraws": dict(sorted(books.redraws.items())),
-        "useful": _account(books.useful),
-        "relabelled_from": {f"{clock}_s": books.useful.source_s[clock] for clock in ("wall", "cpu")},
+        "positives": spending.positives,
+        "positive_share": spending.positives / labels if labels else None,
+        "scenes": spending.scenes,
+        "redraws": dict(sorted(spending.redraws.items())),
+        "useful": _account(spending.useful),
+        "relabelled_from": {f"{clock}_s": spending.useful.source_s[clock] for clock in ("wall", "cpu")},
         "stages": stages,
         "waste": waste,
-        "waste_share": 1 - books.useful.wall_s / books.total_wall_s if books.total_wall_s else None,
-        "attempts_running": books.running,
+        "waste_share": 1 - spending.useful.wall_s / spending.total_wall_s if spending.total_wall_s else None,
+        "attempts_running": spending.running,
         "wall_s_per_label": per_label_s,
-        "bytes_per_label": books.useful.written_bytes / labels if labels else None,
+        "bytes_per_label": spending.useful.written_bytes / labels if labels else None,
         "projection": {
             "labels": PAPER_LABELS,
             "worker_days": per_label_s * PAPER_LABELS / 86400 if per_label_s is not None else None,
             "paper_days": PAPER_DAYS.get(source),
-            "bytes": books.useful.written_bytes / labels * PAPER_LABELS if labels else None,
+            "bytes": spending.useful.written_bytes / labels * PAPER_LABELS if labels else None,
         },
-        "machines": dict(books.machines),
+        "machines": dict(spending.machines),
     }
 
 

@@ -14,16 +14,16 @@ from cyclopts import Parameter
 from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.reports.specified import specification_record
+from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams, Specification
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, in_set
 
 if TYPE_CHECKING:
-    from datagen.train.calibration import Agreement, Trials
     from datagen.train.evaluation.bootstrap import Estimate
+    from datagen.train.heuristic_fit import Agreement, Trials
 
 Sets = Literal["grid", "clear", "in-range"]
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
@@ -75,7 +75,7 @@ def calibrate(
     """
     _refuse_odd(out, bootstrap, seed)
     specs, warnings = _specifications(runs, candidates, split_check)
-    from datagen.train.calibration import FOLDS, FORMS, refuse_too_little
+    from datagen.train.heuristic_fit import FOLDS, FORMS, refuse_too_little
 
     if specs[0].heuristic.alpha == 1 and not fit_alpha:
         problem = "1 in these runs: distance has no weight, and nothing to fit"
@@ -166,7 +166,7 @@ def _read(places: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Tr
     """The labels of all runs over the named set of candidates."""
     import numpy as np
 
-    from datagen.train.calibration import Trials
+    from datagen.train.heuristic_fit import Trials
     from datagen.train.reader import SampleReader
 
     reader = SampleReader(places, ("house_id",), _SAMPLE_FIELDS, allow_incomplete)
@@ -197,7 +197,7 @@ def _calibrate(
     seed: int,
     step: Any,
 ) -> _Calibrated:
-    from datagen.train.calibration import agreements, fit, fit_leaving_houses_out
+    from datagen.train.heuristic_fit import agreements, fit, fit_leaving_houses_out
 
     def refit(some: Trials) -> HeuristicParams:
         return fit(some, before, forms, objective, fit_alpha)

@@ -15,10 +15,10 @@ from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
-from datagen.jobs.report import health_line, job_report
+from datagen.jobs.job_report import health_line, job_report
 from datagen.schemas.errors import InputError
-from datagen.schemas.jobs import Job, Jobs
-from datagen.schemas.merged import open_runs
+from datagen.schemas.jobs import Jobs, StoredJob
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import open_storage
 
 _LOOK_S = 1.0
@@ -79,7 +79,7 @@ def cancel(
     return 1 if living else 0
 
 
-def _await_end(jobs: Jobs, job: Job, say: Callable[[str], None]) -> Job:
+def _await_end(jobs: Jobs, job: StoredJob, say: Callable[[str], None]) -> StoredJob:
     """The job when it has ended, is dead, or does not answer."""
     since_s, told, stopped = time.monotonic(), "", False
     while True:
@@ -103,11 +103,11 @@ def _await_end(jobs: Jobs, job: Job, say: Callable[[str], None]) -> Job:
         time.sleep(_LOOK_S)
 
 
-def _answers(job: Job) -> bool:
+def _answers(job: StoredJob) -> bool:
     return job.state is not None and (bool(job.state.stopping) or job.state.phase == "sealing")
 
 
-def _stop_submission(job: Job) -> None:
+def _stop_submission(job: StoredJob) -> None:
     """End a detached job through Ray; where Ray is gone too, so is the job."""
     try:
         jobs_api_of(job.record.jobs_api).stop(job.record.submission)

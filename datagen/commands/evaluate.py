@@ -63,30 +63,35 @@ def evaluate(
     # Imported here: other verbs wait neither for these nor for torch.
     import numpy as np
 
-    from datagen.evaluating.contestants import open_models
-    from datagen.evaluating.lineup import line_up, read_heuristic
-    from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
-    from datagen.evaluating.report import evaluation_report
-    from datagen.evaluating.tables import print_evaluation
+    from datagen.evaluation_report.baseline_methods import baseline_methods, read_heuristic
+    from datagen.evaluation_report.evaluated_runs import (
+        candidate_sets_of,
+        open_evaluated_runs,
+        refuse_seen_houses,
+        split_paths,
+    )
+    from datagen.evaluation_report.methods import open_models
+    from datagen.evaluation_report.report import evaluation_report
+    from datagen.evaluation_report.terminal import print_evaluation
     from datagen.train.evaluation.columns import gather
 
     _refuse_odd(bootstrap, seed, threads, html)
-    checkpoints, runs = tell_apart(places)
+    checkpoints, runs = split_paths(places)
     if threads is not None:
         from datagen.train.scorers import use_threads
 
         use_threads(threads)
-    opened = open_places(runs, allow_incomplete)
-    sets = sets_of(opened, candidates or [])
+    opened = open_evaluated_runs(runs, allow_incomplete)
+    sets = candidate_sets_of(opened, candidates or [])
     models = open_models(checkpoints)
     if not allow_seen_houses:
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
-    lineup = line_up(
+    baseline_set = baseline_methods(
         baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
     )
-    contestants = [*lineup.baselines, *models]
-    if not contestants:
+    evaluated = [*baseline_set.baselines, *models]
+    if not evaluated:
         mend = "Name a checkpoint, or leave --baselines out"
         raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
     with counting("scenes", json) as seen:
@@ -99,21 +104,21 @@ def evaluate(
 
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
-        gathered = gather(batches, {c.name: c.scorer for c in contestants}, rng, seen=step)
-    houses = lineup.houses.union(*(model.houses for model in models))
+        gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
+    houses = baseline_set.houses.union(*(model.houses for model in models))
     report = evaluation_report(
         gathered,
-        contestants,
+        evaluated,
         opened,
         sets,
         seen_houses=houses,
         fit=fit or [],
-        left_out=lineup.left_out,
+        left_out=baseline_set.left_out,
         resamples=bootstrap,
         seed=seed,
     )
     if html is not None:
-        from datagen.evaluating.page import page_of
+        from datagen.evaluation_report.page import page_of
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(report, gathered).encode())

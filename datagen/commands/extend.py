@@ -8,17 +8,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
-from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.jobs.options import HERE, JobOptions, absolute_place, opening, refuse_odd_n
+from datagen.jobs.start_job import open_job_run, source_words, start_job
+from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
-from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 
 
 def extend(
@@ -26,31 +26,31 @@ def extend(
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
     given: Sources = AS_FOUND,
-    placing: Placing = HERE,
+    job_options: JobOptions = HERE,
 ) -> int:
     """Want n labels of a run and make those that are missing; shards that exist keep their bytes.
 
     Merged runs share the further labels evenly, in whole shards.
     """
-    placing.refuse_bad()
+    job_options.refuse_bad()
     refuse_odd_n(n)
-    words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
-    if placing.detach and placing.address != "local":
-        return detach_job(words, run, placing)
-    with opening(words, placing) as began_s:
+    words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]
+    if job_options.detach and job_options.address != "local":
+        return detach_job(words, run, job_options)
+    with opening(words, job_options) as began_s:
         place = open_storage(run, create=False)
         runs = open_runs(place)
-        works = [open_work(part, given, placing.address) for part in runs]
+        job_runs = [open_job_run(part, given, job_options.address) for part in runs]
         wanted = longer(runs, n, run)
-        for part, work, more in zip(runs, works, wanted, strict=True):
-            if work.scenes_from:
-                stored = StoredScenes(Run.open(work.scenes_from), work.houses, work.objects)
+        for part, job_run, more in zip(runs, job_runs, wanted, strict=True):
+            if job_run.scenes_from:
+                stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
                 refuse_too_few(stored, part.layout, more)
         for part, more in zip(runs, wanted, strict=True):
             part.grow(more)
-    if placing.detach:
-        return detach_job(words, run, placing)
-    return go_on(place, run, works, placing, began_s, given)
+    if job_options.detach:
+        return detach_job(words, run, job_options)
+    return start_job(place, run, job_runs, job_options, began_s, given)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.cluster.books import refresh_index
+from datagen.cluster.run_recorder import refresh_index
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import print_json, print_rows, size
 from datagen.schemas.errors import InputError
-from datagen.schemas.garbage import KINDS, Garbage, Seen, Swept, find_garbage, sweep
-from datagen.schemas.merged import open_runs
+from datagen.schemas.garbage_collection import KINDS, Garbage, Seen, Swept, find_garbage, sweep
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import counting
 from datagen.schemas.storage import Storage, open_storage
 

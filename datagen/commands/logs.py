@@ -16,7 +16,7 @@ from datagen.jobs.detach import jobs_api_of
 from datagen.reports.events import Event, Known, events_of
 from datagen.schemas.errors import InputError, printable
 from datagen.schemas.jobs import Jobs
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import Storage, open_storage
 
 _LOOK_S = 2.0

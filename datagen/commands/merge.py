@@ -11,11 +11,11 @@ from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
-from datagen.reports.accounts import account_for
+from datagen.reports.spending import account_for
 from datagen.schemas.lineage import lineage_summary
-from datagen.schemas.merged import open_runs, wanted
-from datagen.schemas.merging import Merge, Result, carry_out, plan_merge
-from datagen.schemas.merging.writing import Written
+from datagen.schemas.merged_runs import label_counts, open_runs
+from datagen.schemas.merging import MergePlan, MergeResult, merge_runs, plan_merge
+from datagen.schemas.merging.writing import WrittenUnion
 from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
 
@@ -38,7 +38,7 @@ def merge(
         with steps("commits read", commits, json) as step:
             planned = plan_merge(runs, out, step)
         with steps("records written", planned.records, json) as step:
-            result = carry_out(planned, step)
+            result = merge_runs(planned, step)
     report = merge_report(planned, result)
     if json:
         print_json(report)
@@ -47,24 +47,24 @@ def merge(
     return 0
 
 
-def merge_report(planned: Merge, result: Result) -> dict[str, Any]:
+def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
     """What was merged as plain values; times in seconds."""
     parts = open_runs(result.place)
     done = {w.run.storage.url: w for w in result.written}
-    books = account_for(parts)
+    spending = account_for(parts)
     return {
         "out": result.place.url,
-        "labels": wanted(parts).labels,
-        "n": wanted(parts).n,
+        "labels": label_counts(parts).labels,
+        "n": label_counts(parts).n,
         "sealed": result.sealed,
-        "total_wall_s": books.total_wall_s,
-        "useful_wall_s": books.useful.wall_s,
+        "total_wall_s": spending.total_wall_s,
+        "useful_wall_s": spending.useful.wall_s,
         "runs": [_part(run, done.get(run.storage.url)) for run in parts],
     }
 
 
-def _part(run: Run, written: Written | None) -> dict[str, Any]:
-    spec, want = run.manifest.spec, wanted([run])
+def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
+    spec, want = run.manifest.spec, label_counts([run])
     return {
         "run": run.storage.url,
         "spec_hash": run.manifest.spec_hash,

@@ -76,7 +76,7 @@ def predict(
     # Imported here: training's libraries take seconds, and other verbs need none of them.
     from datagen.train.prediction import RobotSize, load_scorer
     from datagen.train.prediction import predict as scored
-    from datagen.train.prediction.answer import document, told
+    from datagen.train.prediction.prediction_report import document, told
 
     lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():

@@ -15,7 +15,7 @@ from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import Storage, open_storage
 
 
@@ -64,7 +64,7 @@ def relabel(
 
 
 def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: float, json: bool) -> int:
-    summary, labels, positives = done.summary, done.summary.tally.labels, done.summary.tally.positives
+    summary, labels, positives = done.summary, done.summary.totals.labels, done.summary.totals.positives
     report = {
         "run": place.url,
         "source": run,

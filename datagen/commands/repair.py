@@ -1,4 +1,4 @@
-"""`datagen repair`: what `verify` finds, mended from second copies or by making bad shards again."""
+"""`datagen repair`: what `verify` finds, repaired from second copies or by making bad shards again."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from datagen.commands.verify import finding_row, print_findings
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.schemas.checking.mending import Mended, RemakeShard, mend_place
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.checking.repair import RegenerateShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.remaking.shards import Origin
+    from datagen.regeneration.shards import OpenedSources
 
 
 def repair(
@@ -36,7 +36,7 @@ def repair(
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
-    """Check a run as verify does, mend what can be mended, and check again.
+    """Check a run as verify does, mend what can be repaired, and check again.
 
     Records come back from their second copies, files of shards by making only the bad shards again; a
     file is written only with the very bytes that were committed. All other files stay as they are. It can
@@ -47,29 +47,29 @@ def repair(
     place = open_storage(run, probe=False, create=False)
     with (
         counting("shards checked", as_json=json) as seen,
-        _remaking(given, workers) as remake,
+        _regenerator(given, workers) as regenerate_shard,
     ):
-        mended = mend_place(place, remake, max(1, workers), seen)
-    left = [finding for finding in mended.left if finding.is_damage]
-    report = _report(run, mended)
+        repaired = repair_runs(place, regenerate_shard, max(1, workers), seen)
+    left = [finding for finding in repaired.left if finding.is_damage]
+    report = _report(run, repaired)
     if json:
         print_json(report)
     else:
-        _print(report, mended)
+        _print(report, repaired)
     return 1 if left else 0
 
 
 @contextmanager
-def _remaking(given: Sources, workers: int) -> Generator[RemakeShard]:
+def _regenerator(given: Sources, workers: int) -> Generator[RegenerateShard]:
     """How shards are made again: in this process, or in so many others."""
     if workers == 0:
-        yield lambda run, shard: _remake(run, shard, given)
+        yield lambda run, shard: _regenerate(run, shard, given)
         return
     # Workers are spawned when the first shard is bad, and not before.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_signals)
     try:
-        yield lambda run, shard: pool.submit(_remake, run, shard, given).result()
+        yield lambda run, shard: pool.submit(_regenerate, run, shard, given).result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
@@ -78,65 +78,68 @@ def _leave_signals() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
 
 
-def _remake(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
+def _regenerate(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed here."""
     # Simulators are imported only where a shard is bad.
-    from datagen.remaking.shards import remade_files, remake
+    from datagen.regeneration.shards import regenerate_shard, regenerated_files
 
-    return remade_files(run, remake(run, shard, _origin(run.storage.url, given)))
+    return regenerated_files(run, regenerate_shard(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
-def _origin(place: str, given: Sources) -> Origin:
-    from datagen.remaking.shards import open_origin
+def _origin(place: str, given: Sources) -> OpenedSources:
+    from datagen.regeneration.shards import open_sources
 
-    return open_origin(Run.open(place), given)
+    return open_sources(Run.open(place), given)
 
 
-def _report(run: str, mended: Mended) -> dict[str, Any]:
+def _report(run: str, repaired: Repaired) -> dict[str, Any]:
     return {
         "run": run,
-        "clean": not any(finding.is_damage for finding in mended.left),
-        "records": sorted(set(mended.records)),
-        "files_from_copies": sorted(set(mended.copied_files)),
-        "files_made_again": sorted(set(mended.remade_files)),
-        "shards_made_again": sorted(set(mended.remade_shards)),
-        "sealed_files": sorted(set(mended.sealed_files)),
-        "sealed_anew": mended.resealed,
-        "files_untouched": mended.untouched,
-        "files_changed_by_others": mended.changed,
-        "apart_from_here": _apart(mended),
-        "left": [finding_row(finding) for finding in mended.left],
+        "clean": not any(finding.is_damage for finding in repaired.left),
+        "records": sorted(set(repaired.records)),
+        "files_from_copies": sorted(set(repaired.copied_files)),
+        "files_made_again": sorted(set(repaired.regenerated_files)),
+        "shards_made_again": sorted(set(repaired.regenerated_shards)),
+        "sealed_files": sorted(set(repaired.sealed_files)),
+        "sealed_anew": repaired.resealed,
+        "files_untouched": repaired.untouched,
+        "files_changed_by_others": repaired.changed,
+        "apart_from_here": _apart(repaired),
+        "left": [finding_row(finding) for finding in repaired.left],
     }
 
 
-def _apart(mended: Mended) -> list[str]:
-    """In what this machine is not the one that made the run, where remade bytes were not the committed."""
-    if not any("other bytes" in finding.mend for finding in mended.left):
+def _apart(repaired: Repaired) -> list[str]:
+    """In what this machine is not the one that made the run, where regenerated bytes differ."""
+    if not any("other bytes" in finding.mend for finding in repaired.left):
         return []
-    from datagen.remaking.scenes import what_differs_here
+    from datagen.regeneration.scenes import what_differs_here
 
-    texts = [text for run in mended.checked.runs for text in what_differs_here(run)]
+    texts = [text for run in repaired.checked.runs for text in what_differs_here(run)]
     return list(dict.fromkeys(texts))
 
 
-def _print(report: dict[str, Any], mended: Mended) -> None:
+def _print(report: dict[str, Any], repaired: Repaired) -> None:
     made, of_shards = len(report["files_made_again"]), report["shards_made_again"]
     rows = [
         ("records", f"{len(report['records'])} put back from copies and other records"),
         ("files", f"{len(report['files_from_copies'])} put back from copies"),
         ("", f"{made} made again" + (f", of shards {listed(of_shards)}" if of_shards else "")),
-        ("sealed", "anew" if mended.resealed else f"{counted(len(report['sealed_files']), 'file')} mended"),
-        ("all others", f"the bytes and times that they had: {counted(mended.untouched, 'file')}"),
+        (
+            "sealed",
+            "anew" if repaired.resealed else f"{counted(len(report['sealed_files']), 'file')} repaired",
+        ),
+        ("all others", f"the bytes and times that they had: {counted(repaired.untouched, 'file')}"),
     ]
-    if mended.changed:
+    if repaired.changed:
         rows.append(
-            ("changed", f"{counted(len(mended.changed), 'file')} meanwhile, not by this: is a job at work?")
+            ("changed", f"{counted(len(repaired.changed), 'file')} meanwhile, not by this: is a job at work?")
         )
-    if any("other bytes" in finding.mend for finding in mended.left):
+    if any("other bytes" in finding.mend for finding in repaired.left):
         apart = "; ".join(report["apart_from_here"]) or "nothing that the run's records tell of"
         rows.append(("differs here", apart))
-    left = sum(finding.is_damage for finding in mended.left)
+    left = sum(finding.is_damage for finding in repaired.left)
     state = f"{counted(left, 'finding')} left" if left else "clean"
     print_rows(f"{state}: {report['run']}", rows)
-    print_findings("left", mended.left, len(mended.left))
+    print_findings("left", repaired.left, len(repaired.left))

@@ -9,24 +9,24 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
+from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AsJson, RunPlace, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
-from datagen.remaking.alone import replay_shard
-from datagen.remaking.scenes import chosen_rows, open_replayer, what_differs_here
-from datagen.remaking.shards import Origin, open_origin
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.remaking.stages import RECOMPUTED, StageComparison, compare_stages
+from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
+from datagen.regeneration.shards import OpenedSources, open_sources
+from datagen.regeneration.single_shard import replay_shard
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.regeneration.stage_comparison import RECOMPUTED, StageComparison, compare_stages
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import sample_ids
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import Step, steps
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.specifying.arms import refuse_missing_packages
-from datagen.workers.scenes.recall import recall_scene
+from datagen.workers.scenes.reconstruct import reconstruct_scene
 
 _PREFIX_AT_LEAST = 6
 _SHOWN = 5
@@ -76,10 +76,10 @@ def replay(
     if shard is not None:
         if out is not None:
             raise InputError("--out", str(out), "a shard has no picture", "Take it out, or give --scene")
-        return replay_shard(run, found, shard, open_origin(found, given), json)
+        return replay_shard(run, found, shard, open_sources(found, given), json)
     assert index is not None
     stored = read_scene(found, index)
-    return _compare(run, found, stored, row, open_origin(found, given, needs_scenes=False), out, json)
+    return _compare(run, found, stored, row, open_sources(found, given, needs_scenes=False), out, json)
 
 
 def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:
@@ -135,7 +135,13 @@ def _only(place: str, runs: list[Run], option: str) -> Run:
 
 
 def _compare(
-    place: str, run: Run, stored: SceneRows, row: int | None, origin: Origin, out: Path | None, json: bool
+    place: str,
+    run: Run,
+    stored: SceneRows,
+    row: int | None,
+    origin: OpenedSources,
+    out: Path | None,
+    json: bool,
 ) -> int:
     replayer = open_replayer(run, origin)
     scene = int(stored.record["scene_index"])
@@ -159,8 +165,8 @@ def _compare(
         "picture": None if out is None else str(out),
     }
     if out is not None:
-        again = recall_scene(replayer.world, (drawn or stored).record)
-        before = recall_scene(replayer.world, stored.record)
+        again = reconstruct_scene(replayer.world, (drawn or stored).record)
+        before = reconstruct_scene(replayer.world, stored.record)
         draw_replay(report, run.manifest.spec, (before, stored), (again, drawn or stored), row, out)
     if json:
         print_json(report)

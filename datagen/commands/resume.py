@@ -11,10 +11,10 @@ from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place, opening
-from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.schemas.merged import open_runs
+from datagen.jobs.options import HERE, JobOptions, absolute_place, opening
+from datagen.jobs.start_job import open_job_run, source_words, start_job
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.storage import open_storage
 
@@ -27,24 +27,24 @@ def resume(
         Parameter(negative=(), help="Try the shards in quarantine again; their records stay as history."),
     ] = False,
     given: Sources = AS_FOUND,
-    placing: Placing = HERE,
+    job_options: JobOptions = HERE,
 ) -> int:
     """Make every missing shard of a run, and seal it: of what was begun, nothing is made twice.
 
     Of merged runs every part is resumed, one after the other.
     """
-    placing.refuse_bad()
+    job_options.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
-    words += placing.words()
-    if placing.detach and placing.address != "local":
-        return detach_job(words, run, placing)
-    with opening(words, placing) as began_s:
+    words += job_options.words()
+    if job_options.detach and job_options.address != "local":
+        return detach_job(words, run, job_options)
+    with opening(words, job_options) as began_s:
         place = open_storage(run, create=False)
         runs = open_runs(place)
-        works = [open_work(part, given, placing.address) for part in runs]
-        if placing.detach:
-            return detach_job(words, run, placing)
+        job_runs = [open_job_run(part, given, job_options.address) for part in runs]
+        if job_options.detach:
+            return detach_job(words, run, job_options)
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
             sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return go_on(place, run, works, placing, began_s, given)
+    return start_job(place, run, job_runs, job_options, began_s, given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted, listed, print_rows
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.sealing import SEALED, SealedRoot, sealed_root
 from datagen.schemas.sealing import seal as seal_place
 from datagen.schemas.sealing import unseal as unseal_place

@@ -8,16 +8,16 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import RunPlace, refuse_output
 from datagen.console.printing import print_rows
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
-from datagen.remaking.sources import AS_FOUND, AssetSources
+from datagen.regeneration.sources import AS_FOUND, AssetSources
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import find_scene, open_runs
+from datagen.schemas.merged_runs import find_scene, open_runs
 from datagen.schemas.scene_rows import read_scene
-from datagen.specifying.arms import refuse_missing_packages
-from datagen.workers.scenes.recall import recall_scene
+from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import open_world
 
 _BEST = "best"
@@ -53,7 +53,7 @@ def show(
     rows = read_scene(opened, of_run)
     houses = given.houses or sources.get("houses", "builtin")
     world = open_world(spec, houses, given.objects or sources.get("objects", "builtin"))
-    shown = Shown(run, spec, rows, recall_scene(world, rows.record))
+    shown = Shown(run, spec, rows, reconstruct_scene(world, rows.record))
     if of_trial:
         # Imported here, so that scenes can be seen without what plans and executes.
         from datagen.drawing.trial_picture import draw_trial

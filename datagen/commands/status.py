@@ -9,8 +9,8 @@ from cyclopts import Parameter
 from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.jobs.report import health_line, jobs_report
-from datagen.reports.standing import place_report
+from datagen.jobs.job_report import health_line, jobs_report
+from datagen.reports.run_status import runs_report
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 
@@ -26,7 +26,7 @@ def status(
     Of merged runs the sums, and one line a part.
     """
     place = open_storage(run, probe=False, create=False)
-    report = place_report(place, stacks)
+    report = runs_report(place, stacks)
     if json:
         print_json(report | {"jobs": jobs_report(place)})
     else:

@@ -7,26 +7,31 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from datagen.configuration.arms import refuse_missing_packages
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
+from datagen.configuration.stored_scenes import (
+    layout_again,
+    open_stored_scenes,
+    refuse_too_few,
+    specify_again,
+)
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, refuse_unusable_engines
-from datagen.jobs.job import Work
-from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.jobs.job import JobRun
+from datagen.jobs.options import HERE, JobOptions, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.jobs.start_job import refuse_unusable_engines, start_job
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.storage import open_storage
-from datagen.specifying.arms import refuse_missing_packages
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.specify import layout_of, specify
-from datagen.specifying.stored_scenes import layout_again, open_stored_scenes, refuse_too_few, specify_again
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world, open_world
 
 # Options that stored scenes have decided.
@@ -89,7 +94,7 @@ def submit(
     ] = None,
     noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
-    placing: Placing = HERE,
+    job_options: JobOptions = HERE,
 ) -> int:
     """Make labels: start a run, or go on with the one that is in the folder.
 
@@ -100,7 +105,7 @@ def submit(
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # refuses an unknown one
     refuse_odd_n(n)
-    placing.refuse_bad()
+    job_options.refuse_bad()
     said = {
         "--n": n,
         "--out": absolute_place(out),
@@ -119,9 +124,9 @@ def submit(
         "--noise": noise,
         "--config": config and config.expanduser().absolute(),
     }
-    words = ["submit", label_source, *words_of(said), *placing.words()]
-    if placing.detach and placing.address != "local":
-        return detach_job(words, out, placing)  # sources lie where the cluster is
+    words = ["submit", label_source, *words_of(said), *job_options.words()]
+    if job_options.detach and job_options.address != "local":
+        return detach_job(words, out, job_options)  # sources lie where the cluster is
     options = {
         "seed": seed,
         "split": split,
@@ -131,13 +136,13 @@ def submit(
         "observation.renderer": renderer,
         "observation.noise.enabled": True if noise else None,
     }
-    with opening(words, placing) as began_s:
+    with opening(words, job_options) as began_s:
         if scenes_from is None:
             houses, objects = houses or "builtin", objects or "builtin"
             house_source, object_source = open_houses(houses), open_objects(objects)
             spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
             world = assemble_world(spec, house_source, object_source, houses, objects)
-            refuse_unusable_engines(spec, placing.address)
+            refuse_unusable_engines(spec, job_options.address)
             if _layout_there(out) is None:
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
@@ -148,7 +153,7 @@ def submit(
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
             open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
-            refuse_unusable_engines(spec, placing.address)
+            refuse_unusable_engines(spec, job_options.address)
             source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
             schema_version = stored.run.manifest.schema_version
             refuse_too_few(stored, layout, n)
@@ -157,10 +162,10 @@ def submit(
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
         run = Run.create_or_open(open_storage(out), manifest, n)
-    if placing.detach:
-        return detach_job(words, out, placing)
-    work = Work(run, sources["houses"], sources["objects"], source_url)
-    return go_on(run.storage, out, [work], placing, began_s)
+    if job_options.detach:
+        return detach_job(words, out, job_options)
+    job_run = JobRun(run, sources["houses"], sources["objects"], source_url)
+    return start_job(run.storage, out, [job_run], job_options, began_s)
 
 
 def _layout_there(out: str) -> Layout | None:
@@ -178,7 +183,7 @@ def _layout_there(out: str) -> Layout | None:
 def _refuse_no_scene(world: World, houses: str) -> None:
     """Draw a new run's first scene here: sources that give none are refused before anything is written."""
     try:
-        draw_scene(world, 0, StageClock())
+        generate_scene(world, 0, StageClock())
     except InputError as error:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 

@@ -18,7 +18,7 @@ from datagen.training.options import model_sizes, read_augmentation, share_cores
 
 if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead, EpochRecord
-    from datagen.train.training.stages import Job
+    from datagen.train.training.training_setup import TrainingJob
 
 Whole = Annotated[int | None, WHOLE_NUMBER]
 
@@ -82,7 +82,7 @@ def train(
     from datagen.train.training.checkpoints import read_checkpoint
     from datagen.train.training.devices import choose_device
     from datagen.train.training.options import STAGES, Options
-    from datagen.train.training.stages import Job
+    from datagen.train.training.training_setup import TrainingJob
 
     chosen = STAGES[stage]
     _refuse_odd_init(stage, init, chosen.from_checkpoint)
@@ -104,7 +104,7 @@ def train(
     )
     options.refuse_bad()
     where, n_processes = choose_device(device, processes)
-    job = Job(
+    job = TrainingJob(
         options,
         tuple(runs),
         tuple(val or ()),
@@ -129,11 +129,11 @@ def _refuse_odd_init(stage: str, init: Path | None, needs_one: bool) -> None:
         raise InputError("datagen train", "--init", problem, "Leave it out, or train stage2")
 
 
-def _train(job: Job, processes: int) -> bool:
+def _train(job: TrainingJob, processes: int) -> bool:
     """Whether it came to its end; else it was interrupted."""
     from datagen.train.training.launching import interruptible, train_in_processes
     from datagen.train.training.ranks import Ranks
-    from datagen.train.training.stages import train_job
+    from datagen.train.training.training_setup import train_job
 
     with interruptible() as stopping:
         if processes == 1:

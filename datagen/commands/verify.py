@@ -14,9 +14,9 @@ from cyclopts import Parameter
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.remaking.sources import AS_FOUND, Sources
+from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.place import Checked, check_place
 from datagen.schemas.errors import InputError, printable
 from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
@@ -50,7 +50,7 @@ def verify(
     place = open_storage(run, probe=False, create=False)
     checked, found = Checked(), Found()
     with counting("shards checked", as_json=json) as seen:
-        found.take(check_place(place, checked, seen))
+        found.take(check_runs(place, checked, seen))
     chosen = secrets.randbits(32) if seed is None else seed
     recomputed = deep > 0 and not found.damage
     if recomputed:
@@ -87,14 +87,14 @@ class Found:
 def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
     """Samples recomputed and scenes redrawn, shared out among the runs."""
     # Simulators are imported only where they are needed.
-    from datagen.remaking.deep import deep_findings
-    from datagen.remaking.shards import open_origin
+    from datagen.regeneration.deep_check import deep_findings
+    from datagen.regeneration.shards import open_sources
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))
     shares[: count % len(runs)] += 1
     for run, share in zip(runs, shares.tolist(), strict=True):
-        origin = open_origin(run, given, needs_scenes=False)
+        origin = open_sources(run, given, needs_scenes=False)
         folder = run.storage.url.removeprefix(place.url).strip("/")
         for finding in deep_findings(run, share, origin, rng):
             yield replace(finding, key=f"{folder}/{finding.key}".strip("/"))
@@ -113,7 +113,7 @@ def finding_row(finding: Finding) -> dict[str, Any]:
 
 
 def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
-    books = checked.books
+    totals = checked.totals
     return {
         "run": run,
         "clean": not found.damage,
@@ -124,12 +124,12 @@ def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
         "sealed": checked.is_sealed,
         "seal_is_stale": found.counts["stale"] > 0,
         "ledger": {
-            "attempts": books.attempts,
-            "running": books.unfinished,
-            "without_account": books.without_account,
-            "wall_s": books.committed_wall_s + books.wasted_wall_s,
-            "commits_wall_s": books.committed_wall_s,
-            "waste_wall_s": books.wasted_wall_s,
+            "attempts": totals.attempts,
+            "running": totals.unfinished,
+            "without_account": totals.without_account,
+            "wall_s": totals.committed_wall_s + totals.wasted_wall_s,
+            "commits_wall_s": totals.committed_wall_s,
+            "waste_wall_s": totals.wasted_wall_s,
         },
         "counts": dict(sorted(found.counts.items())),
         "findings": [finding_row(finding) for finding in found.kept],
@@ -137,16 +137,16 @@ def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:
 
 
 def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
-    books = checked.books
-    wall_s = books.committed_wall_s + books.wasted_wall_s
-    files, attempts = counted(checked.files, "file"), counted(books.attempts, "attempt")
+    totals = checked.totals
+    wall_s = totals.committed_wall_s + totals.wasted_wall_s
+    files, attempts = counted(checked.files, "file"), counted(totals.attempts, "attempt")
     rows = [
         ("shards", f"{checked.shards:,}, {files} of {size(checked.bytes)}, every byte"),
         ("samples", f"{checked.samples:,}; each id is that of its specification, scene and candidate"),
         (
             "ledger",
-            f"{attempts}: {seconds(wall_s)} = {seconds(books.committed_wall_s)} in commits"
-            f" + {seconds(books.wasted_wall_s)} waste",
+            f"{attempts}: {seconds(wall_s)} = {seconds(totals.committed_wall_s)} in commits"
+            f" + {seconds(totals.wasted_wall_s)} waste",
         ),
         ("sealed", "yes" if checked.is_sealed else "no"),
     ]

@@ -20,7 +20,7 @@ from datagen.drawing.scene_picture import best_clear, draw_frame, object_outline
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")
@@ -30,7 +30,7 @@ _BEST_COLOUR, _H_COLOUR = "gold", "#49c0f0"
 
 def draw_arm_picture(
     title: str,
-    recalled: RecalledScene,
+    recalled: ReconstructedScene,
     frame: Frame,
     record: Columns,
     samples: Columns,
@@ -92,7 +92,7 @@ def _draw_maps(
     figure: Any,
     outcome_ax: Axes,
     score_ax: Axes,
-    recalled: RecalledScene,
+    recalled: ReconstructedScene,
     record: Columns,
     samples: Columns,
     robots: Sequence[Robot],
@@ -125,7 +125,7 @@ def _draw_maps(
 
 
 def _write_numbers(
-    axes: Axes, recalled: RecalledScene, record: Columns, samples: Columns, robots: Sequence[Robot]
+    axes: Axes, recalled: ReconstructedScene, record: Columns, samples: Columns, robots: Sequence[Robot]
 ) -> None:
     axes.set_axis_off()
     label, by_h = np.asarray(samples["label"]), np.asarray(samples["heuristic_label"])

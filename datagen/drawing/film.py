@@ -13,8 +13,8 @@ from datagen.drawing.posed_robot import RobotBodies
 from datagen.workers.geometry.mesh import F64, U8
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayMesh, RayStage
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.rendering.rays import RayMesh, RayScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
@@ -50,7 +50,7 @@ _PHASE_WORDS = {
 class Film:
     """A trial that is ready to be looked at."""
 
-    recalled: RecalledScene
+    recalled: ReconstructedScene
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
@@ -58,7 +58,7 @@ class Film:
     wide: Shot
     near: Shot
 
-    def stage(self, moment: int) -> RayStage:
+    def stage(self, moment: int) -> RayScene:
         """Objects, then the robot's bodies, as they stand at a moment; no house."""
         return _stage(self.recalled, self.bodies, self.T_world_base, self.recording, moment)
 
@@ -73,7 +73,7 @@ class Film:
 
 
 def film_of(
-    recalled: RecalledScene,
+    recalled: ReconstructedScene,
     bodies: RobotBodies,
     T_world_base: F64,
     recording: Recording,
@@ -136,11 +136,11 @@ class Lens:
     def __init__(self, shot: Shot, sharpness: int, outlined: bool) -> None:
         self.sharpness, self.outlined = sharpness, outlined
         self.camera = scaled_camera(shot.camera, sharpness)
-        empty = RayStage(shot.house, [], np.zeros(0), np.zeros((0, 4, 4)))
+        empty = RayScene(shot.house, [], np.zeros(0), np.zeros((0, 4, 4)))
         self.house = cast_pixels(empty, self.camera, np.arange(self.camera.width_px * self.camera.height_px))
         self.nothing: RayMesh = nothing()
 
-    def picture(self, stage: RayStage) -> U8:
+    def picture(self, stage: RayScene) -> U8:
         """The house with the stage's bodies in it, (height, width, 3)."""
         rgb, depth_m = self.house.rgb.copy(), self.house.depth_m.copy()
         depth_m[depth_m == 0] = np.inf
@@ -148,7 +148,7 @@ class Lens:
         for k, T in enumerate(stage.T_world_object):
             # Each body is looked for only where it can be: most cover a small part of the picture.
             rows = _window(self.camera, T[:3, 3], float(stage.radii_m[k]))
-            alone = RayStage(self.nothing, [stage.objects[k]], stage.radii_m[k : k + 1], T[None])
+            alone = RayScene(self.nothing, [stage.objects[k]], stage.radii_m[k : k + 1], T[None])
             front = cast_pixels(alone, self.camera, rows)
             nearer = (front.depth_m > 0) & (front.depth_m < depth_m[rows])
             seen = rows[nearer]
@@ -179,10 +179,10 @@ def pictures(film: Film, moments: Sequence[int], sharpness: int) -> Iterator[tup
 
 
 def _stage(
-    recalled: RecalledScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
-) -> RayStage:
+    recalled: ReconstructedScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
+) -> RayScene:
     robot = bodies.poses(T_world_base, recording.q_rad[moment], float(recording.opening_m[moment]))
-    return RayStage(
+    return RayScene(
         nothing(),
         [*recalled.rays.objects, *bodies.rays],
         np.concatenate([recalled.rays.radii_m, bodies.radii_m]),

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.houses.house import Body, House
+from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayMesh, RayStage, occluded, ray_mesh
+from datagen.workers.rendering.rays import RayMesh, RayScene, occluded, ray_mesh
 
 _AZIMUTHS, _ELEVATIONS_DEG = 20, (20.0, 42.0)
 _PROBE_PX = 56  # width of the pictures by which views are compared
@@ -42,7 +42,7 @@ class Subject:
     `forward` (3,) is the direction across which one should look.
     """
 
-    moments: Sequence[RayStage]
+    moments: Sequence[RayScene]
     focus: Sequence[tuple[Rows, float]]
     points_m: F64
     forward: F64
@@ -106,7 +106,7 @@ def _share_seen(house: RayMesh, subject: Subject, probe: Camera) -> float:
     pixels = np.arange(probe.width_px * probe.height_px)
     total = 0.0
     for moment in subject.moments:
-        full = RayStage(house, moment.objects, moment.radii_m, moment.T_world_object)
+        full = RayScene(house, moment.objects, moment.radii_m, moment.T_world_object)
         body = cast_pixels(full, probe, pixels).body - 1
         for rows, weight in subject.focus:
             alone = cast_pixels(_only(moment, rows), probe, pixels).body > 0
@@ -115,18 +115,20 @@ def _share_seen(house: RayMesh, subject: Subject, probe: Camera) -> float:
     return total / len(subject.moments)
 
 
-def _only(stage: RayStage, rows: Rows) -> RayStage:
+def _only(stage: RayScene, rows: Rows) -> RayScene:
     keep = list(rows)
-    return RayStage(
+    return RayScene(
         stage.house, [stage.objects[k] for k in keep], stage.radii_m[keep], stage.T_world_object[keep]
     )
 
 
-def _is_wall(body: Body) -> bool:
+def _is_wall(body: StaticBody) -> bool:
     return body.kind == "wall" and max(float(p[:, 2].max()) for p in body.convex_parts_m) > _WALL_M
 
 
-def _blocking(walls: Sequence[Body], camera: Camera, points_m: F64, distance_m: float) -> list[Body]:
+def _blocking(
+    walls: Sequence[StaticBody], camera: Camera, points_m: F64, distance_m: float
+) -> list[StaticBody]:
     """Walls before what must be seen, or before the picture's middle ground."""
     T = camera.T_world_camera
     half = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) / 2
@@ -137,13 +139,13 @@ def _blocking(walls: Sequence[Body], camera: Camera, points_m: F64, distance_m: 
     directions = (ends_m - T[:3, 3]).astype(np.float32)
     limits = np.ones(len(ends_m), np.float32)
 
-    def before(wall: Body) -> npt.NDArray[np.bool_]:
+    def before(wall: StaticBody) -> npt.NDArray[np.bool_]:
         return occluded(ray_mesh(wall.visual), origins, directions, limits)
 
     return [wall for wall in walls if before(wall).any()]
 
 
-def _rays_without(house: House, left_out: Sequence[Body]) -> RayMesh:
+def _rays_without(house: House, left_out: Sequence[StaticBody]) -> RayMesh:
     names = {body.body_id for body in left_out}
     kept = [body.visual for body in house.bodies if body.body_id not in names]
     return ray_mesh(concatenate(kept)) if kept else nothing()

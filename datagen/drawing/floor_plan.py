@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
-from datagen.workers.houses.house import Body, House
+from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.rendering.frame import Camera
 
 _HEAD_ROOM_M = 1.9  # what hangs higher, such as the wall over a door, hides nothing from above
@@ -91,10 +91,10 @@ def frame_axes(axes: Axes, centre_m: F64, half_m: float) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _height_m(body: Body) -> float:
+def _height_m(body: StaticBody) -> float:
     return max((float(p[:, 2].max()) for p in body.convex_parts_m), default=0.0)
 
 
-def _mean_colour(body: Body) -> tuple[float, float, float]:
+def _mean_colour(body: StaticBody) -> tuple[float, float, float]:
     r, g, b = body.visual.face_rgb.mean(axis=0) / 255
     return (float(r), float(g), float(b))

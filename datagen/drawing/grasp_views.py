@@ -12,14 +12,14 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 
+from datagen.workers.furniture.solids import box, join
 from datagen.workers.geometry.mesh import F32, F64, U8, Mesh
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.houses.solids import box, join
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
-from datagen.workers.rendering.rays import RayStage, ray_mesh
+from datagen.workers.rendering.rays import RayScene, ray_mesh
 from datagen.workers.robots.robot import Gripper
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles meet a grasp to 0.5 mm and 0.5 degrees only
 _FAR_M = 6.0  # so far away that the view is nearly parallel
@@ -71,7 +71,7 @@ def hand_outline(gripper: Gripper) -> F64:
 
 
 def draw_grasps(
-    views: tuple[Axes, Axes], recalled: RecalledScene, support: Mesh, gripper: Gripper, used: UsedGrasps
+    views: tuple[Axes, Axes], recalled: ReconstructedScene, support: Mesh, gripper: Gripper, used: UsedGrasps
 ) -> ScalarMappable | None:
     """Draw the grasps from above and from the observer's side; returns the scale of the counts.
 
@@ -86,7 +86,7 @@ def draw_grasps(
         "from the observer's side": centre_m + _FAR_M * np.array([*(0.97 * towards), 0.24]),
     }
     rays = recalled.rays
-    stage = RayStage(ray_mesh(support), rays.objects, rays.radii_m, rays.T_world_object)
+    stage = RayScene(ray_mesh(support), rays.objects, rays.radii_m, rays.T_world_object)
     scale = None
     if len(used.count):
         scale = ScalarMappable(Normalize(0, float(used.count.max())), colormaps["plasma"])

@@ -15,10 +15,10 @@ from datagen.drawing.scene_picture import draw_frame, object_outlines
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
-from datagen.workers.scenes.draw import render_frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.generate import render_frame
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
-Side = tuple[RecalledScene, SceneRows]
+Side = tuple[ReconstructedScene, SceneRows]
 
 
 def draw_replay(
@@ -34,7 +34,7 @@ def draw_replay(
     for column, (name, side) in enumerate((("stored", stored), ("drawn again", made))):
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
-        draw_frame(axes[0, column], render_frame(spec.observation, recalled.stage, recalled.camera, rng))
+        draw_frame(axes[0, column], render_frame(spec.observation, recalled.geometry, recalled.camera, rng))
         axes[0, column].set_title(f"{name}: RGB frame, target outlined")
         _draw_plan(axes[1, column], recalled, rows, centre, row)
         axes[1, column].set_title(f"{name}: candidates by label")
@@ -47,7 +47,9 @@ def draw_replay(
     figure.savefig(out)
 
 
-def _draw_plan(axes: Axes, recalled: RecalledScene, rows: SceneRows, centre: Any, row: int | None) -> None:
+def _draw_plan(
+    axes: Axes, recalled: ReconstructedScene, rows: SceneRows, centre: Any, row: int | None
+) -> None:
     xy = np.asarray(rows.samples["base_xy_m"], np.float64)
     draw_house(axes, recalled.house.house)
     draw_objects(axes, object_outlines(recalled))
@@ -62,7 +64,7 @@ def _draw_plan(axes: Axes, recalled: RecalledScene, rows: SceneRows, centre: Any
     )
 
 
-def _draw_over(axes: Axes, stored: RecalledScene, made: RecalledScene, centre: Any) -> None:
+def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene, centre: Any) -> None:
     """Both on one plan: where they are equal, no blue is to be seen under the dashes."""
     for recalled, style, colour, name in (
         (stored, "-", "#2f6fdd", "stored"),

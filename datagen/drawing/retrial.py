@@ -9,13 +9,13 @@ import numpy as np
 from datagen.drawing.film import Told, told_moments
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.labels.trials import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.labels.arm_labelling import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
+from datagen.workers.motion.arm_collision import surroundings
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.motion.rrt_connect import dense
-from datagen.workers.motion.surroundings import surroundings
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.trial import Recording, TrialResult
@@ -47,7 +47,7 @@ class Retrial:
         return None if self.shown is None else self.trial.results[self.shown]
 
 
-def try_again(scene: SettledScene, candidates: Candidates, row: int, spec: Specification) -> Retrial:
+def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
     """Plan, and for `sim` execute, candidate `row`; the same outcome as stored, with its poses.
 
     Of several executions the last that ended as the candidate did is shown.

@@ -23,13 +23,13 @@ from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.rendering.frame import Frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
 
 
 def draw_scene_picture(
-    title: str, recalled: RecalledScene, frame: Frame, record: Columns, samples: Columns, out: Path
+    title: str, recalled: ReconstructedScene, frame: Frame, record: Columns, samples: Columns, out: Path
 ) -> None:
     """Write the picture of a scene; `samples` are its candidates, one row each."""
     figure = Figure(figsize=(19, 11), dpi=100, layout="constrained")
@@ -71,7 +71,7 @@ def best_clear(score: Any, clear: Any) -> int | None:
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
 
 
-def object_outlines(recalled: RecalledScene) -> list[F64]:
+def object_outlines(recalled: ReconstructedScene) -> list[F64]:
     """Outlines (K, 2) of the placed objects seen from above, world; the first is the target."""
     outlines = []
     for model, T in zip(recalled.models, recalled.T_world_object, strict=True):
@@ -112,7 +112,7 @@ def _draw_cloud(axes: Any, record: Columns) -> None:
     axes.set_title(f"cloud around the target, {n} points, target in red")
 
 
-def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples: Columns) -> None:
+def _write_numbers(axes: Axes, recalled: ReconstructedScene, record: Columns, samples: Columns) -> None:
     axes.set_axis_off()
     rho, label = np.asarray(samples["visibility"]), np.asarray(samples["label"])
     clear = np.asarray(samples["base_is_clear"])

@@ -12,8 +12,8 @@ from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots import open_robot
-from datagen.workers.scenes.draw import render_frame
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.generate import render_frame
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Lines = list[tuple[str, str]]
 
@@ -25,7 +25,7 @@ class Shown:
     run: str
     spec: Specification
     rows: SceneRows
-    recalled: RecalledScene
+    recalled: ReconstructedScene
 
     @property
     def title(self) -> str:
@@ -35,7 +35,7 @@ class Shown:
     def frame(self) -> Frame:
         """The RGB-D frame, rendered again."""
         rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
-        return render_frame(self.spec.observation, self.recalled.stage, self.recalled.camera, rng)
+        return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
     def place(self, row: int) -> str:
         """Where a candidate's base is."""

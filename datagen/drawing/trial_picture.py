@@ -21,8 +21,8 @@ from datagen.drawing.retrial import Retrial, try_again
 from datagen.drawing.shown import Lines, Shown
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
-from datagen.workers.labels.trials import arm_of
-from datagen.workers.scenes.recall import recall_candidates
+from datagen.workers.labels.arm_labelling import arm_of
+from datagen.workers.scenes.reconstruct import reconstruct_candidates
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
@@ -33,7 +33,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
     retrial = try_again(
-        shown.recalled, recall_candidates(shown.rows.samples, shown.recalled), row, shown.spec
+        shown.recalled, reconstruct_candidates(shown.rows.samples, shown.recalled), row, shown.spec
     )
     outcome, robot = retrial.trial.outcome, retrial.robot
     moving = out.suffix.lower() == ".gif"

@@ -10,14 +10,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from datagen.cluster.cluster_folders import write_private
 from datagen.cluster.environment import JOB_ENVIRONMENT, is_of_the_shell
-from datagen.cluster.private_folder import write_private
 from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
 from datagen.jobs.job import JOBS_API, SUBMISSION
-from datagen.jobs.options import Placing
+from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
 
@@ -25,7 +25,7 @@ _BEGUN_WITHIN_S = 60.0
 _LOOK_S = 0.3
 
 
-def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
+def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> int:
     """Let the command of these words run as a Ray job, and say how to follow it.
 
     With the address `local`, on a head of this machine that is started where none runs. Comes back once
@@ -33,16 +33,16 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
     reached or refuses it.
     """
     submission = f"datagen-{new_job_id()}"
-    address = [] if placing.workers == 0 else ["--address", "auto"]
-    if placing.address == "local":
-        head = ensure_head(placing.workers or len(os.sched_getaffinity(0)))
+    address = [] if job_options.workers == 0 else ["--address", "auto"]
+    if job_options.address == "local":
+        head = ensure_head(job_options.workers or len(os.sched_getaffinity(0)))
         jobs = open_ray_jobs(head.jobs_api, head.token)
         # The very program that was called: the head runs on its machine, for its user.
         entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words, *address])
         file = hand_over(jobs, Path(head.folder), submission)
         environment = {SUBMISSION: submission, JOBS_API: jobs.url, JOB_ENVIRONMENT: str(file)}
     else:
-        jobs = open_ray_jobs(placing.address)
+        jobs = open_ray_jobs(job_options.address)
         entrypoint = shlex.join(["datagen", *words, *address])  # as the cluster's image has it
         environment = {SUBMISSION: submission, JOBS_API: jobs.url}
     jobs.submit(entrypoint, submission, environment)
@@ -55,7 +55,7 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
         ("", command_line(["logs", place, "--follow"])),
         ("stop", command_line(["cancel", place])),
     ]
-    if placing.address == "local":
+    if job_options.address == "local":
         rows.append(("Ray stays", f"for later jobs; {command_line(['cancel', '--head'])} ends it"))
     print_rows(f"detached: {command_line(words)}", rows)
     return 0

@@ -26,7 +26,7 @@ _DETACH = (
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Placing:
+class JobOptions:
     """Where and how a job runs; nothing of this changes a sample."""
 
     workers: Annotated[
@@ -64,7 +64,7 @@ class Placing:
         return words_of({"--address": None if self.address == "local" else self.address})
 
 
-HERE = Placing()
+HERE = JobOptions()
 
 
 def refuse_odd_n(n: int) -> None:
@@ -74,13 +74,13 @@ def refuse_odd_n(n: int) -> None:
 
 
 @contextmanager
-def opening(words: Sequence[str], placing: Placing) -> Generator[float]:
+def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
     """Show that sources are being opened, and tell whoever interrupts that how to go on.
 
     Gives the moment at which it began, by the monotonic clock.
     """
     began_s = time.monotonic()
-    with resumable([*words, *placing.address_words()]), Progress(placing.json) as shown:
+    with resumable([*words, *job_options.address_words()]), Progress(job_options.json) as shown:
         shown.phase("opening houses and objects")
         yield began_s
 

@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter
-from datagen.cluster.inprocess import InProcessExecutor
-from datagen.cluster.policy import Policy
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.job_totals import JobSummary, empty_summary
 from datagen.cluster.progress import JobProgress
-from datagen.cluster.stop import StopRequest, stop_on_signals
-from datagen.cluster.tally import JobSummary, no_work
-from datagen.cluster.task import Product
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest, stop_on_signals
+from datagen.cluster.task import AttemptResult
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
@@ -28,8 +30,6 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
-from datagen.specifying.manifest import manifest_of
-from datagen.specifying.stored_scenes import StoredScenes, specify_again
 from datagen.workers.labels import load_label_source
 
 
@@ -38,7 +38,7 @@ class Relabelled:
     """What a call did, over all runs of the place."""
 
     runs: list[Run] = field(default_factory=list)
-    summary: JobSummary = field(default_factory=no_work)
+    summary: JobSummary = field(default_factory=empty_summary)
     flips: Flips = field(default_factory=Flips)
     absent: int = 0  # planned shards that the source has not
 
@@ -157,15 +157,19 @@ def _relabel_run(
 ) -> JobSummary:
     """The shards of one run, one after the other in this process: files are linked, not computed."""
 
-    def work(task: RelabelTask, meter: Meter) -> Product:
+    def work(task: RelabelTask, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter, flips)
 
-    def make_task(order: Order) -> RelabelTask:
+    def make_task(order: AttemptOrder) -> RelabelTask:
         return RelabelTask(order.shard, order.attempt, order.deadline_s)
 
     done, per_shard = len(run.planned()) - len(run.missing()), run.layout.samples_per_shard
     shown.phase("relabelling")
-    books, executor, events = RunBooks(run), InProcessExecutor(work), JobProgress(shown, per_shard, done)
-    summary = drive(missing, make_task, executor, books, Policy(), events, stop)
+    recorder, executor, events = (
+        RunRecorder(run),
+        InProcessExecutor(work),
+        JobProgress(shown, per_shard, done),
+    )
+    summary = drive(missing, make_task, executor, recorder, RetryPolicy(), events, stop)
     close_lost_attempts(run)
     return summary

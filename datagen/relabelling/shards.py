@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from datagen.cluster.attempt import ends_job
-from datagen.cluster.guard import Meter, this_host, utc_now
-from datagen.cluster.task import Product
+from datagen.cluster.attempt_guard import Meter, this_host
+from datagen.cluster.task import AttemptResult
 from datagen.schemas.cost import StageClock
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.keys import shard_folder
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
 from datagen.schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
 from datagen.schemas.shard_reading import read_committed
-from datagen.workers.labels import heuristic as formula
+from datagen.workers.labels import distance_visibility_score as formula
 
 Columns = dict[str, np.ndarray[Any, Any]]
 
@@ -46,11 +47,11 @@ class Flips:
     to_bad: int = 0
 
 
-def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> Product:
+def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> AttemptResult:
     """Label a committed shard of `source` by the rule of `run`, and commit it there.
 
     Files whose bytes stay are adopted; written are labels, scores and ids. Raises InputError for a
-    damaged file, JobCannotGoOn for a full or forbidden disk.
+    damaged file, JobCannotContinue for a full or forbidden disk.
     """
     clock = StageClock()
     with ends_job():
@@ -83,7 +84,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         won = run.commit(commit)
     flips.to_good += int((made["label"] > stored["label"]).sum())
     flips.to_bad += int((made["label"] < stored["label"]).sum())
-    return Product(won, before.samples, positives, cost)
+    return AttemptResult(won, before.samples, positives, cost)
 
 
 def _relabelled(run: Run, stored: Columns) -> Columns:

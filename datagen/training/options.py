@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
+from datagen.configuration.specify import parse_toml, read_toml
 from datagen.schemas.errors import InputError, choices
-from datagen.specifying.specify import parse_toml, read_toml
 
 if TYPE_CHECKING:
     from datagen.train.augment import Augmentation

@@ -29,7 +29,7 @@ class Restore:
 
 
 @dataclass(frozen=True)
-class Remake:
+class Regenerate:
     """Compute the shard of this run again; its file must have the committed size and digest."""
 
     run: Run
@@ -48,7 +48,7 @@ class Reseal:
     data: bytes | None = None
 
 
-Cure = Restore | Remake | Reseal
+Cure = Restore | Regenerate | Reseal
 
 
 @dataclass(frozen=True)

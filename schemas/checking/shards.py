@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.schemas.checking.finding import Finding, Remake, curable
+from datagen.schemas.checking.finding import Finding, Regenerate, curable
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.identity import sample_ids
@@ -150,7 +150,7 @@ def _bytes_of(
                 data, problem = None, "sha256: other bytes than were committed"
     if not problem:
         return data, []
-    return None, [curable(key, "file", problem, Remake(run, commit.shard, entry), commit.shard)]
+    return None, [curable(key, "file", problem, Regenerate(run, commit.shard, entry), commit.shard)]
 
 
 def _check_metadata(

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged import open_runs, wanted
+from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
 from datagen.schemas.merging.resharding import common_layout
-from datagen.schemas.merging.writing import Written, begin_union, replace_record, write_union
+from datagen.schemas.merging.writing import WrittenUnion, begin_union, replace_record, write_union
 from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
 from datagen.schemas.root_records import refuse_foreign
 from datagen.schemas.run import Run
@@ -24,7 +24,7 @@ _ELSEWHERE = "Choose a new --out, and name this one among the runs that are merg
 
 
 @dataclass(frozen=True, eq=False)
-class Merge:
+class MergePlan:
     """Runs that can be merged, and what they give: one union a specification, by ascending hash."""
 
     out: str
@@ -44,15 +44,15 @@ class Merge:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class MergeResult:
     """A merge that was done; `sealed` is the store's address, "" where nothing is committed."""
 
     place: Storage
-    written: tuple[Written, ...]
+    written: tuple[WrittenUnion, ...]
     sealed: str
 
 
-def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> Merge:
+def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> MergePlan:
     """Look at everything and write nothing; `tick` is called for every commit that was read.
 
     A run that stands at `out` counts as one of the sources. InputError when there is nothing to merge, when
@@ -84,10 +84,10 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
         for spec_hash in hashes
         if spec_hash not in here or len(groups[spec_hash]) > 1
     )
-    return Merge(out, tuple(existing), unions, hashes)
+    return MergePlan(out, tuple(existing), unions, hashes)
 
 
-def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
+def merge_runs(merge: MergePlan, tick: Callable[[], None] = lambda: None) -> MergeResult:
     """Write a planned merge and seal it; `tick` is called for every shard and every attempt.
 
     Doing it again finishes what was cut short, and changes nothing where it is done.
@@ -101,12 +101,12 @@ def carry_out(merge: Merge, tick: Callable[[], None] = lambda: None) -> Result:
     if not merge.is_ordinary:
         replace_record(place, MERGED, encode_record(Merged(parts=merge.hashes)))
     written = [write_union(union, run, tick) for union, run in zip(merge.unions, runs, strict=True)]
-    return Result(place, tuple(written), _seal(place))
+    return MergeResult(place, tuple(written), _seal(place))
 
 
 def _seal(place: Storage) -> str:
     """Seal the place unless it is sealed as it stands."""
-    if not wanted(open_runs(place)).labels:
+    if not label_counts(open_runs(place)).labels:
         return ""
     root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
     if place.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:

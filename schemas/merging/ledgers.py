@@ -32,7 +32,7 @@ class UnitedAttempt:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _NamedAttempt:
     """Where a source speaks of an attempt: its name there, and the piece of it that is meant."""
 
     source: int
@@ -64,8 +64,8 @@ def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[Uni
             yield UnitedAttempt(name, start, min(ends, key=_account_first) if ends else None)
 
 
-def _places(union: Union) -> dict[str, list[_Place]]:
-    found: dict[str, list[_Place]] = {}
+def _places(union: Union) -> dict[str, list[_NamedAttempt]]:
+    found: dict[str, list[_NamedAttempt]] = {}
     of_source: list[dict[str, int]] = [{} for _ in union.runs]
     for holdings in (union.kept.values(), *union.spare.values()):
         for holding in holdings:
@@ -80,14 +80,16 @@ def _places(union: Union) -> dict[str, list[_Place]]:
             pieces = cut.shards(shard) if cut.pieces > 1 and shard is not None else (None,)
             for piece in pieces:
                 name = attempt if piece is None else cut.name(attempt, piece)
-                found.setdefault(name, []).append(_Place(source, attempt, piece))
+                found.setdefault(name, []).append(_NamedAttempt(source, attempt, piece))
     return found
 
 
 class _Records:
     """What the sources say of some attempts, and the commits of what these made."""
 
-    def __init__(self, union: Union, places: Iterable[_Place], holdings: Iterable[Holding | None]) -> None:
+    def __init__(
+        self, union: Union, places: Iterable[_NamedAttempt], holdings: Iterable[Holding | None]
+    ) -> None:
         self._union = union
         self._starts: dict[tuple[int, str], AttemptStart] = {}
         self._ends: dict[tuple[int, str], LedgerEntry] = {}
@@ -110,7 +112,7 @@ class _Records:
         found = self._commits.get((holding.source, holding.of))
         return self._union.commit_of(holding) if found is None else found
 
-    def starts(self, name: str, places: Iterable[_Place]) -> list[AttemptStart]:
+    def starts(self, name: str, places: Iterable[_NamedAttempt]) -> list[AttemptStart]:
         """What the sources have of an attempt's begin, as the union names and numbers it."""
         found: list[AttemptStart] = []
         for place in places:
@@ -122,7 +124,7 @@ class _Records:
                 found.append(start.model_copy(update={"attempt": name, "shard": shard}))
         return found
 
-    def ends(self, name: str, places: Iterable[_Place]) -> list[LedgerEntry]:
+    def ends(self, name: str, places: Iterable[_NamedAttempt]) -> list[LedgerEntry]:
         """What the sources have of an attempt's end, as the union names and numbers it."""
         found: list[LedgerEntry] = []
         for place in places:

@@ -12,7 +12,7 @@ from itertools import groupby
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import shard_folder
 from datagen.schemas.ledger import end_key, start_key
-from datagen.schemas.lineage import LINEAGE, Origin, Origins, encode_lineage
+from datagen.schemas.lineage import LINEAGE, Origins, ShardOrigin, encode_lineage
 from datagen.schemas.merging.ledgers import UnitedAttempt, united_attempts
 from datagen.schemas.merging.plan import Holding, Union
 from datagen.schemas.outcomes import REDRAW_CAUSES
@@ -28,7 +28,7 @@ Tick = Callable[[], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
+class WrittenUnion:
     """What became of a union. `there` are shards that its place had before."""
 
     run: Run
@@ -58,7 +58,7 @@ def begin_union(union: Union, storage: Storage) -> Run:
     return run
 
 
-def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
+def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUnion:
     """Write the union into its run; `tick` is called for every shard and every attempt.
 
     InputError where a source lacks a committed file, or one that must be cut is damaged.
@@ -82,7 +82,7 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> Written:
     for shard in sorted(given_up.keys() - run.quarantined()):
         run.quarantine(given_up[shard])
     replace_record(run.storage, LINEAGE, encode_lineage(_lineage(union)))
-    return Written(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
+    return WrittenUnion(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
 
 
 def replace_record(storage: Storage, key: str, record: bytes) -> None:
@@ -161,7 +161,7 @@ def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) 
                 _put(run.storage, key, encode_record(record), key in there)
 
     count = 0
-    for _ in run.storage.in_order(put, united_attempts(union, given_up)):
+    for _ in run.storage.concurrent_map(put, united_attempts(union, given_up)):
         count += 1
         tick()
     return count
@@ -188,10 +188,10 @@ def _given_up(union: Union) -> dict[int, QuarantineRecord]:
     return {shard: record for shard, record in found.items() if shard not in union.kept}
 
 
-def _lineage(union: Union) -> dict[Origin, list[int]]:
+def _lineage(union: Union) -> dict[ShardOrigin, list[int]]:
     """The shards of each origin. Where several sources have a shard from one attempt, the first by order."""
     origins = [Origins(run) for run in union.runs]
-    shards: dict[Origin, list[int]] = {}
+    shards: dict[ShardOrigin, list[int]] = {}
     for source, known in enumerate(origins):
         if known.is_merged:
             shards |= {origin: [] for origin in known.named}

@@ -9,7 +9,7 @@ from hashlib import sha256
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
 from datagen.schemas.keys import part_folder, shard_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Layout
 from datagen.schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
@@ -144,7 +144,7 @@ def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
         run.check_files(commit)
         return commit
 
-    return run.storage.in_order(check, commits)
+    return run.storage.concurrent_map(check, commits)
 
 
 def _refuse_other_arrays(first: Run, run: Run) -> None:

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from datagen.schemas.at_once import in_order
+from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.storage.errors import FileTooLarge, storage_error
 from datagen.schemas.storage.local_files import LocalFiles
@@ -70,7 +70,7 @@ class Storage:
         """Write many files whole, as `put` does each; remote storage takes several at once."""
         for key in files:
             _checked(self.url, key)
-        _exhaust(self.in_order(lambda item: self.put(*item), files.items()))
+        _exhaust(self.concurrent_map(lambda item: self.put(*item), files.items()))
 
     def put_new(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the key exists; False when it does with other bytes.
@@ -97,9 +97,9 @@ class Storage:
 
         Remote storage reads several at once; at most some tens of files are held.
         """
-        return self.in_order(lambda key: (key, self.get(key, limit_bytes)), keys)
+        return self.concurrent_map(lambda key: (key, self.get(key, limit_bytes)), keys)
 
-    def in_order(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def concurrent_map(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """What `do`, which asks this storage, gives for each item, in their order; the first failure ends it.
 
         Remote storage is asked several things at once, so that `do` must use none of the verbs for many.
@@ -107,7 +107,7 @@ class Storage:
         """
         if isinstance(self._files, LocalFiles):
             return map(do, items)
-        return in_order(_threads(), _AT_ONCE, do, items)
+        return concurrent_map(_threads(), _AT_ONCE, do, items)
 
     def exists(self, key: str) -> bool:
         """Whether the file exists."""
@@ -171,7 +171,7 @@ class Storage:
         Where one of the two is remote, several are under way at once.
         """
         asked = source if isinstance(self._files, LocalFiles) else self
-        _exhaust(asked.in_order(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
+        _exhaust(asked.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
 
     def sync(self, keys: Iterable[str]) -> None:
         """Make files and the folders that name them survive a power cut.

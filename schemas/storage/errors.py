@@ -37,14 +37,14 @@ _ENDPOINT_MEND = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
 
 
-class StoreFailure(InputError):
+class StoreUnavailable(InputError):
     """An object store that refuses or does not answer, after all that was worth repeating.
 
     It concerns whoever uses the store, not one shard: a job that meets it cannot go on.
     """
 
 
-class OddFile(InputError):
+class NotARegularFile(InputError):
     """A link, a pipe, a socket or a device, or folders within folders without end."""
 
 
@@ -53,16 +53,16 @@ class FileTooLarge(InputError):
 
 
 @dataclass(frozen=True)
-class StoreTrouble:
+class RequestFailure:
     """What went wrong in one request to an object store. `passing`: another try may succeed."""
 
     problem: str
     mend: str
     passing: bool
 
-    def at(self, place: str) -> StoreFailure:
+    def at(self, place: str) -> StoreUnavailable:
         """The error to raise."""
-        return StoreFailure(place, "", self.problem, self.mend)
+        return StoreUnavailable(place, "", self.problem, self.mend)
 
 
 def storage_error(place: str | Path, error: OSError) -> InputError:
@@ -91,7 +91,7 @@ def too_large(place: str, size: int, limit_bytes: int) -> FileTooLarge:
     )
 
 
-def store_trouble(error: Exception) -> StoreTrouble:
+def store_trouble(error: Exception) -> RequestFailure:
     """What an exception of the object store's client means.
 
     Of its text only the status, the server's error code and the kind of failure are told on: addresses
@@ -102,40 +102,40 @@ def store_trouble(error: Exception) -> StoreTrouble:
     code = _found(rf"<Code>({_TRUSTED})</Code>", text)
     if "//169.254." in text:  # where a machine of a cloud asks for its role
         asked_too_often = status.startswith("5") or status == "429"
-        return StoreTrouble("no credentials are set", _KEYS_MEND, passing=asked_too_often)
+        return RequestFailure("no credentials are set", _KEYS_MEND, passing=asked_too_often)
     if code == "NoSuchBucket":
         mend = "Make the bucket first, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
-        return StoreTrouble("no such bucket", mend, passing=False)
+        return RequestFailure("no such bucket", mend, passing=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
         mend = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
-        return StoreTrouble("the bucket is in another region", mend, passing=False)
+        return RequestFailure("the bucket is in another region", mend, passing=False)
     if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
-        return StoreTrouble(f"access denied ({code or status})", _KEYS_MEND, passing=False)
+        return RequestFailure(f"access denied ({code or status})", _KEYS_MEND, passing=False)
     if status and not status.startswith("2"):
         shown = f"{status} {code}" if code else status
         if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
             mend = f"Wait until the store has recovered, {_RESUME}"
-            return StoreTrouble(f"the store answers {shown}", mend, passing=True)
+            return RequestFailure(f"the store answers {shown}", mend, passing=True)
         mend = "Check that AWS_ENDPOINT_URL is an S3 store and knows this request"
-        return StoreTrouble(f"the store refuses ({shown})", mend, passing=False)
+        return RequestFailure(f"the store refuses ({shown})", mend, passing=False)
     if code:  # a copy that fails late answers 200 with an error in its body
         mend = f"Wait until the store has recovered, {_RESUME}"
-        return StoreTrouble(f"the store answers {code}", mend, passing=True)
+        return RequestFailure(f"the store answers {code}", mend, passing=True)
     return _trouble_on_the_way(text)
 
 
-def _trouble_on_the_way(text: str) -> StoreTrouble:
+def _trouble_on_the_way(text: str) -> RequestFailure:
     kind = _found(r"HttpError \{\s*kind: ([A-Za-z]+)", text)
     if kind == "Connect":
         why = "its name is not known" if "dns error" in text else "the connection fails"
-        return StoreTrouble(f"the store cannot be reached ({why})", _ENDPOINT_MEND, passing=True)
+        return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_MEND, passing=True)
     if kind == "Timeout":
         mend = f"Check the network, or allow more with DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
-        return StoreTrouble("the store does not answer in time", mend, passing=True)
+        return RequestFailure("the store does not answer in time", mend, passing=True)
     if kind in ("Request", "Interrupted", "Decode"):
-        return StoreTrouble("the store breaks off its answers", _ENDPOINT_MEND, passing=True)
+        return RequestFailure("the store breaks off its answers", _ENDPOINT_MEND, passing=True)
     mend = "Check that AWS_ENDPOINT_URL is an S3 store"
-    return StoreTrouble("the store's answer is not that of an S3 store", mend, passing=False)
+    return RequestFailure("the store's answer is not that of an S3 store", mend, passing=False)
 
 
 def _found(pattern: str, text: str) -> str:

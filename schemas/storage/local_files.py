@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from datagen.schemas.storage.errors import OddFile, storage_error, too_large
+from datagen.schemas.storage.errors import NotARegularFile, storage_error, too_large
 from datagen.schemas.storage.stored_file import StoredFile
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -238,7 +238,7 @@ class LocalFiles:
     def _list(self, folder: int, prefix: str, depth: int) -> Iterator[StoredFile]:
         if depth > _MAX_DEPTH:
             mend = "It was not written by this program: remove it"
-            raise OddFile(f"{self.folder}/{prefix}", "", "folders within folders without end", mend)
+            raise NotARegularFile(f"{self.folder}/{prefix}", "", "folders within folders without end", mend)
         with os.scandir(folder) as entries:
             for entry in entries:
                 key = prefix + entry.name
@@ -259,12 +259,12 @@ class LocalFiles:
                     yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
 
     def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
-        """Raise OddFile for what is neither a file nor a folder."""
+        """Raise NotARegularFile for what is neither a file nor a folder."""
         kind = _KINDS.get(stat.S_IFMT(mode))
         if kind is not None:
             place = f"{self.folder}/{key}"
             mend = "Remove it; where it stands for a file that you trust, put a copy of that file there"
-            raise OddFile(place, "", f"{where or 'is '}{kind}, and a run has none", mend)
+            raise NotARegularFile(place, "", f"{where or 'is '}{kind}, and a run has none", mend)
 
     def _copy(self, key: str, draft: str, into: int) -> None:
         fd = self._open_file(key)

@@ -19,7 +19,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.storage.errors import StoreTrouble, store_trouble, too_large
+from datagen.schemas.storage.errors import RequestFailure, store_trouble, too_large
 from datagen.schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
 from datagen.schemas.storage.stored_file import StoredFile
 
@@ -61,7 +61,7 @@ class RemoteObjects:
             except AlreadyExistsError as e:
                 # Also said while another request is at this name, which may come to nothing.
                 if "409 Conflict" in str(e) and not self.exists(key):
-                    raise _Passing("the store answers 409") from e
+                    raise _TransientTrouble("the store answers 409") from e
                 return False
             return True
 
@@ -77,7 +77,7 @@ class RemoteObjects:
                 raise too_large(f"{self.url}/{key}", size, limit_bytes)
             data = bytes(found.bytes())
             if len(data) != size:
-                raise _Passing("the store breaks off its answers")
+                raise _TransientTrouble("the store breaks off its answers")
             return data
 
         try:
@@ -163,7 +163,7 @@ class RemoteObjects:
             except InputError:
                 raise
             except _FAILURES as e:
-                trouble = e.trouble if isinstance(e, _Passing) else store_trouble(e)
+                trouble = e.trouble if isinstance(e, _TransientTrouble) else store_trouble(e)
                 if isinstance(e, FileNotFoundError) and trouble.problem != "no such bucket":
                     raise
                 tries += 1
@@ -173,9 +173,9 @@ class RemoteObjects:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
 
-class _Passing(OSError):
+class _TransientTrouble(OSError):
     """Trouble that the client does not take for any."""
 
     def __init__(self, problem: str) -> None:
-        self.trouble = StoreTrouble(problem, "Submit again when the store has recovered", passing=True)
+        self.trouble = RequestFailure(problem, "Submit again when the store has recovered", passing=True)
         super().__init__(problem)

@@ -9,14 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy, Trouble
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary, JobTotals
+from datagen.cluster.retry_policy import RetryPolicy, ShardFailures
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, Host
 from datagen.schemas.shard_ranges import ShardRanges
-from tests.cluster.simulated import FakeClock, Heard, PaperBooks, report_of
+from tests.cluster.simulated import FakeClock, Heard, PaperRecorder, report_of
 
 # Share of attempts, and how they end. What is silent never ends by itself.
 TROUBLES = ((0.004, "crashed"), (0.003, "failed"), (0.001, "out_of_memory"), (0.001, "silent"))
@@ -38,15 +38,15 @@ class BadCluster:
         self.clock, self.rng = clock, random.Random(seed)
         self.done = bytearray(shards)
         self.poisoned = set(self.rng.sample(range(shards), shards // 500))
-        self.books = _Books(self)
+        self.recorder = _Books(self)
         self.outcomes: Counter[str] = Counter()
         self.useful_s = self.wasted_s = 0.0
         self.failures: Counter[tuple[int, str]] = Counter()  # by shard and budget, of open shards
         self._slots_a_node, self._alive = slots_a_node, [True] * nodes
         self._slow = {node for node in range(nodes) if self.rng.random() < SLOW_NODES}
         self._free = [node for node in range(nodes) for _ in range(slots_a_node)]
-        self._queue: deque[Order] = deque()
-        self._running: dict[str, tuple[Order, int]] = {}
+        self._queue: deque[AttemptOrder] = deque()
+        self._running: dict[str, tuple[AttemptOrder, int]] = {}
         self._events: list[tuple[float, int, str, object]] = []
         self._numbered = 0
         self._ready: list[AttemptReport] = []
@@ -61,7 +61,7 @@ class BadCluster:
         self._numbered += 1
         heapq.heappush(self._events, (self.clock.now_s + in_s, self._numbered, kind, what))
 
-    def submit(self, order: Order) -> None:
+    def submit(self, order: AttemptOrder) -> None:
         self._queue.append(order)
         self._start()
 
@@ -135,7 +135,7 @@ class BadCluster:
             zombie = self.rng.random() < ZOMBIES and order.shard not in self.poisoned
             if zombie and self.rng.random() < 0.5 and self._commit(order.shard):
                 # It committed before its node went: the driver finds the record and counts its cost.
-                self.books.commits[order.shard] = commit = commit_by(order)
+                self.recorder.commits[order.shard] = commit = commit_by(order)
                 self._count(order.shard, "committed", commit.cost.wall_s)
             elif self.done[order.shard]:
                 self._count(order.shard, "superseded", 0.5)
@@ -146,9 +146,9 @@ class BadCluster:
             self._ready.append(report_of(order, "lost", 0.5))
         self._at(NODE_GONE_S, "return", node)
 
-    def _zombie(self, order: Order) -> None:
-        if order.shard not in self.books.given_up and self._commit(order.shard):
-            self.books.commits[order.shard] = commit_by(order)
+    def _zombie(self, order: AttemptOrder) -> None:
+        if order.shard not in self.recorder.given_up and self._commit(order.shard):
+            self.recorder.commits[order.shard] = commit_by(order)
 
     def _return(self, node: int) -> None:
         self._alive[node] = True
@@ -166,33 +166,33 @@ class BadCluster:
         self._ready.append(replace(report_of(order, "cancelled", 0.0), cause="ended by force"))
 
 
-class _Books(PaperBooks):
-    """Books that only count; a quarantine must be deserved."""
+class _Books(PaperRecorder):
+    """A recorder that only counts; a quarantine must be deserved."""
 
     def __init__(self, cluster: BadCluster) -> None:
         super().__init__(keep_entries=False)
         self._cluster = cluster
 
-    def quarantine(self, shard: int, trouble: Trouble) -> None:
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         of = self._cluster.failures
         spent = (of[shard, "failures"] >= 3, of[shard, "lost"] >= 10, of[shard, "out_of_memory"] >= 2)
         assert any(spent) and not self._cluster.done[shard]
         assert len(trouble.attempts) == sum(of[shard, name] for name in ("failures", "lost", "out_of_memory"))
         assert shard not in self.given_up
-        self.given_up[shard] = Trouble()
+        self.given_up[shard] = ShardFailures()
 
     def commit_of(self, shard: int) -> Commit | None:
         if shard in self.commits:
             return self.commits[shard]
         if not self._cluster.done[shard]:
             return None
-        return commit_by(Order(shard, "another", 0.0))
+        return commit_by(AttemptOrder(shard, "another", 0.0))
 
     def missing(self) -> ShardRanges:
         return ShardRanges.of(np.flatnonzero(np.frombuffer(self._cluster.done, np.uint8) == 0))
 
 
-def commit_by(order: Order) -> Commit:
+def commit_by(order: AttemptOrder) -> Commit:
     host = Host(name="h", cpu="c", cores=1, memory_bytes=1)
     return Commit(
         shard=order.shard, attempt=order.attempt, spec_hash="0" * 64, scenes=1, samples=10, positives=3,
@@ -208,30 +208,32 @@ class Silent(Heard):
 
 
 def simulate(
-    shards: int, seed: int, nodes: int = 16, on_tick: object = lambda tally: None
+    shards: int, seed: int, nodes: int = 16, on_tick: object = lambda totals: None
 ) -> tuple[JobSummary, BadCluster]:
     """Drive the shards to their end and check the result against the cluster's own count."""
     clock = FakeClock()
     cluster = BadCluster(clock, shards, seed, nodes)
     heard = Silent(on_tick=on_tick)  # type: ignore[arg-type]
-    summary = drive(range(shards), lambda o: o, cluster, cluster.books, Policy(), heard, StopRequest(), clock)
+    summary = drive(
+        range(shards), lambda o: o, cluster, cluster.recorder, RetryPolicy(), heard, StopRequest(), clock
+    )
     check(summary, cluster, shards)
     return summary, cluster
 
 
 def check(summary: JobSummary, cluster: BadCluster, shards: int) -> None:
-    """Every shard is done once or given up; the tally is what the cluster counted."""
-    tally: Tally = summary.tally
+    """Every shard is done once or given up; the totals is what the cluster counted."""
+    totals: JobTotals = summary.totals
     done = np.frombuffer(cluster.done, np.uint8)
     assert summary.end == "complete" and summary.remaining == 0
-    assert int(done.max()) == 1 and int(done.sum()) + len(cluster.books.given_up) == shards
-    assert not any(done[shard] for shard in cluster.books.given_up)
-    assert cluster.poisoned <= set(cluster.books.given_up) and tally.quarantined == len(
-        cluster.books.given_up
+    assert int(done.max()) == 1 and int(done.sum()) + len(cluster.recorder.given_up) == shards
+    assert not any(done[shard] for shard in cluster.recorder.given_up)
+    assert cluster.poisoned <= set(cluster.recorder.given_up) and totals.quarantined == len(
+        cluster.recorder.given_up
     )
-    assert tally.outcomes == cluster.outcomes == cluster.books.closed
-    assert tally.committed == cluster.outcomes["committed"] and tally.labels == 10 * tally.committed
-    assert tally.superseded == cluster.outcomes["superseded"]
-    assert tally.committed + tally.superseded + tally.elsewhere == int(done.sum())
-    for said, counted in ((tally.useful_wall_s, cluster.useful_s), (tally.wasted_wall_s, cluster.wasted_s)):
+    assert totals.outcomes == cluster.outcomes == cluster.recorder.closed
+    assert totals.committed == cluster.outcomes["committed"] and totals.labels == 10 * totals.committed
+    assert totals.superseded == cluster.outcomes["superseded"]
+    assert totals.committed + totals.superseded + totals.elsewhere == int(done.sum())
+    for said, counted in ((totals.useful_wall_s, cluster.useful_s), (totals.wasted_wall_s, cluster.wasted_s)):
         assert abs(said - counted) <= 1e-9 * counted + 1e-6

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from typing import TypeVar
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.shard_ranges import ShardRanges
-from tests.cluster.simulated import FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
+from tests.cluster.simulated import FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 
 T = TypeVar("T")
 SHARD_S, LOOK_S = 5.0, 0.01
@@ -54,7 +54,7 @@ class Executor(SimulatedExecutor):
         super().__init__(clock, self.begin, slots, keep_orders=True)
         self.shared, self.turns, self.driver = shared, turns, driver
 
-    def begin(self, order: Order, n: int) -> Fate:
+    def begin(self, order: AttemptOrder, n: int) -> Fate:
         now_s = self.clock.now_s
         if self.shared.is_done(order.shard, now_s):
             return ("superseded", LOOK_S)
@@ -69,8 +69,8 @@ class Executor(SimulatedExecutor):
         return ended
 
 
-class Books(PaperBooks):
-    """The books of one driver over what all have committed."""
+class SharedRecorder(PaperRecorder):
+    """The recorder of one driver over what all have committed."""
 
     def __init__(self, shared: Shared, clock: FakeClock) -> None:
         super().__init__()
@@ -88,11 +88,11 @@ def drive_together(drivers: int, shards: int, slots: int = 2) -> list[JobSummary
 
     def one(driver: int) -> None:
         executor = Executor(shared, turns, driver, clocks[driver], slots)
-        books, clock = Books(shared, clocks[driver]), clocks[driver]
+        recorder, clock = SharedRecorder(shared, clocks[driver]), clocks[driver]
         try:
             turns.wait_for(driver)
             ended[driver] = drive(
-                range(shards), _same, executor, books, Policy(), Heard(), StopRequest(), clock
+                range(shards), _same, executor, recorder, RetryPolicy(), Heard(), StopRequest(), clock
             )
         finally:
             turns.end(driver)
@@ -111,7 +111,7 @@ def _same(order: T) -> T:
 
 def waste(summaries: list[JobSummary]) -> tuple[int, float]:
     """Attempts that were wasted, and the share of all time that they took."""
-    wasted = sum(summary.tally.outcomes.total() - summary.tally.committed for summary in summaries)
-    useful_s = sum(summary.tally.useful_wall_s for summary in summaries)
-    wasted_s = sum(summary.tally.wasted_wall_s for summary in summaries)
+    wasted = sum(summary.totals.outcomes.total() - summary.totals.committed for summary in summaries)
+    useful_s = sum(summary.totals.useful_wall_s for summary in summaries)
+    wasted_s = sum(summary.totals.wasted_wall_s for summary in summaries)
     return wasted, wasted_s / (useful_s + wasted_s)

@@ -7,9 +7,10 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from datagen.cluster.driver import Order
 from datagen.cluster.policy import Policy, Trouble
-from datagen.cluster.tally import Tally
+from datagen.cluster.driver import AttemptOrder
+from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.retry_policy import ShardFailures
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
 from datagen.schemas.shard_ranges import ShardRanges
@@ -30,7 +31,7 @@ class FakeClock:
         return self.now_s
 
 
-def report_of(order: Order, outcome: str, wall_s: float) -> AttemptReport:
+def report_of(order: AttemptOrder, outcome: str, wall_s: float) -> AttemptReport:
     """A worker's answer; an outcome with `!` ends the job."""
     committed = outcome == "committed"
     return AttemptReport(
@@ -53,21 +54,21 @@ class SimulatedExecutor:
     """
 
     clock: FakeClock
-    fate: Callable[[Order, int], Fate]
+    fate: Callable[[AttemptOrder, int], Fate]
     slots: int = 4
     twice: bool = False
     deaf: bool = False  # kills are never confirmed
     notes: bool = True  # whether it can tell what has begun
     most_in_flight: int = 0
-    orders: list[Order] = field(default_factory=list)
+    orders: list[AttemptOrder] = field(default_factory=list)
     keep_orders: bool = False
     _tries: Counter[int] = field(default_factory=Counter[int])
-    _queue: list[Order] = field(default_factory=list)
-    _running: dict[str, Order] = field(default_factory=dict)
+    _queue: list[AttemptOrder] = field(default_factory=list)
+    _running: dict[str, AttemptOrder] = field(default_factory=dict)
     _ends: list[tuple[float, str, str, float]] = field(default_factory=list)
     _ready: list[AttemptReport] = field(default_factory=list)
 
-    def submit(self, order: Order) -> None:
+    def submit(self, order: AttemptOrder) -> None:
         self._queue.append(order)
         if self.keep_orders:
             self.orders.append(order)
@@ -117,12 +118,12 @@ class SimulatedExecutor:
 
 
 @dataclass
-class PaperBooks:
-    """Books that only count, and remember the commits that a test gives them."""
+class PaperRecorder:
+    """A recorder that only counts, and remember the commits that a test gives them."""
 
     keep_entries: bool = True
     entries: list[LedgerEntry] = field(default_factory=list)
-    given_up: dict[int, Trouble] = field(default_factory=dict)
+    given_up: dict[int, ShardFailures] = field(default_factory=dict)
     commits: dict[int, Commit] = field(default_factory=dict)
     closed: Counter[str] = field(default_factory=Counter)
 
@@ -131,7 +132,7 @@ class PaperBooks:
         if self.keep_entries:
             self.entries.append(entry)
 
-    def quarantine(self, shard: int, trouble: Trouble) -> None:
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None:
         self.given_up[shard] = trouble
 
     def commit_of(self, shard: int) -> Commit | None:
@@ -147,13 +148,13 @@ class Heard:
 
     actions: list[tuple[int, str, str]] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
-    on_tick: Callable[[Tally], None] = lambda tally: None
+    on_tick: Callable[[JobTotals], None] = lambda totals: None
 
     def ended(self, report: AttemptReport, action: str) -> None:
         self.actions.append((report.shard, report.outcome, action))
 
-    def tick(self, tally: Tally) -> None:
-        self.on_tick(tally)
+    def tick(self, totals: JobTotals) -> None:
+        self.on_tick(totals)
 
     def stopping(self, reason: str) -> None:
         self.reasons.append(reason)

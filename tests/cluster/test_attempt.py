@@ -13,8 +13,8 @@ import pytest
 
 from datagen.cluster import attempt
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.guard import Meter, guarded
-from datagen.cluster.task import JobCannotGoOn, ShardTask
+from datagen.cluster.attempt_guard import Meter, guarded
+from datagen.cluster.task import JobCannotContinue, ShardTask
 from datagen.schemas.keys import commit_copy_key, commit_key, shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
@@ -34,11 +34,11 @@ def test_a_run_or_sources_that_cannot_be_opened_end_the_job(tmp_path: Path) -> N
     spec, layout = small_spec(), Layout(scenes_per_shard=2, candidates_per_scene=5)
     task = ShardTask(str(tmp_path / "none"), spec, layout, 3, "a", "builtin", "builtin", 60)
     assert list(task.scene_indices) == [6, 7]
-    with pytest.raises(JobCannotGoOn, match="no such folder"):
+    with pytest.raises(JobCannotContinue, match="no such folder"):
         run_attempt(task, Meter())
     run = make_run(tmp_path / "run", shards=())
     other = ShardTask(run.storage.url, small_spec(seed=9), layout, 0, "a", "builtin", "builtin", 60)
-    with pytest.raises(JobCannotGoOn, match="another specification"):
+    with pytest.raises(JobCannotContinue, match="another specification"):
         run_attempt(other, Meter())
 
 

@@ -8,161 +8,161 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary, JobTotals
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.stop_request import StopRequest
 from datagen.schemas.errors import InputError
 from datagen.schemas.run_records import Commit, Cost, Host, LedgerEntry
 from tests.cluster.bad_cluster import simulate
-from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
+from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 
 
 def run_script(
-    script: dict[int, list[str]], shards: int = 6, policy: Policy = LENIENT
-) -> tuple[JobSummary, PaperBooks, SimulatedExecutor, Heard]:
+    script: dict[int, list[str]], shards: int = 6, policy: RetryPolicy = LENIENT
+) -> tuple[JobSummary, PaperRecorder, SimulatedExecutor, Heard]:
     """Shards end as the script says, attempt by attempt, and commit when it has no more to say."""
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         words = script.get(order.shard, [])
         word = words[n - 1] if n <= len(words) else "committed"
         return (word, None if word == "silent" else 5.0)
 
     clock = FakeClock()
     executor = SimulatedExecutor(clock, fate, keep_orders=True)
-    books, heard = PaperBooks(), Heard()
-    summary = drive(range(shards), lambda o: o, executor, books, policy, heard, StopRequest(), clock)
-    return summary, books, executor, heard
+    recorder, heard = PaperRecorder(), Heard()
+    summary = drive(range(shards), lambda o: o, executor, recorder, policy, heard, StopRequest(), clock)
+    return summary, recorder, executor, heard
 
 
 @pytest.mark.parametrize("word", ["crashed", "hung", "failed", "out_of_memory", "lost"])
 def test_one_failure_is_repeated_and_then_forgotten(word: str) -> None:
-    summary, books, _, heard = run_script({3: [word]})
+    summary, recorder, _, heard = run_script({3: [word]})
     assert summary.end == "complete" and summary.exit_code == 0
-    assert summary.tally.committed == 6 and summary.tally.retries == 1
-    assert books.closed == {"committed": 6, word: 1}
+    assert summary.totals.committed == 6 and summary.totals.retries == 1
+    assert recorder.closed == {"committed": 6, word: 1}
     assert [a for a in heard.actions if a[0] == 3] == [(3, word, "retry"), (3, "committed", "done")]
-    assert summary.tally.labels == 60 and summary.tally.positives == 18
+    assert summary.totals.labels == 60 and summary.totals.positives == 18
 
 
 def test_three_failures_of_any_kind_quarantine_the_shard_with_its_story() -> None:
-    summary, books, _, _ = run_script({2: ["crashed", "hung", "failed"]})
-    trouble = books.given_up[2]
+    summary, recorder, _, _ = run_script({2: ["crashed", "hung", "failed"]})
+    trouble = recorder.given_up[2]
     assert trouble.causes == ("crashed: scripted crashed", "hung: scripted hung", "failed: scripted failed")
     assert len(set(trouble.attempts)) == 3
-    assert summary.tally.quarantined_shards == [2] and summary.tally.committed == 5
+    assert summary.totals.quarantined_shards == [2] and summary.totals.committed == 5
     assert summary.end == "complete"  # within the lenient share
 
 
 def test_lost_machines_have_their_own_budget() -> None:
-    summary, books, _, _ = run_script({1: ["lost"] * 9 + ["crashed"] * 2})
-    assert summary.tally.committed == 6 and not books.given_up
-    _, books, _, _ = run_script({1: ["lost"] * 11})
-    assert set(books.given_up) == {1}
+    summary, recorder, _, _ = run_script({1: ["lost"] * 9 + ["crashed"] * 2})
+    assert summary.totals.committed == 6 and not recorder.given_up
+    _, recorder, _, _ = run_script({1: ["lost"] * 11})
+    assert set(recorder.given_up) == {1}
 
 
 def test_out_of_memory_is_tried_once_more() -> None:
     summary, _, _, _ = run_script({4: ["out_of_memory"]})
-    assert summary.tally.committed == 6
-    _, books, executor, _ = run_script({4: ["out_of_memory"] * 5})
-    assert set(books.given_up) == {4}
+    assert summary.totals.committed == 6
+    _, recorder, executor, _ = run_script({4: ["out_of_memory"] * 5})
+    assert set(recorder.given_up) == {4}
     assert len([o for o in executor.orders if o.shard == 4]) == 2
 
 
 def test_the_share_of_quarantined_shards_decides_the_exit_status() -> None:
     bad = {2: ["failed"] * 3}
-    assert run_script(bad, 100, Policy(max_quarantined_share=0.01))[0].exit_code == 0
-    assert run_script(bad, 99, Policy(max_quarantined_share=0.01))[0].exit_code == 1
+    assert run_script(bad, 100, RetryPolicy(max_quarantined_share=0.01))[0].exit_code == 0
+    assert run_script(bad, 99, RetryPolicy(max_quarantined_share=0.01))[0].exit_code == 1
 
 
 def test_a_job_whose_every_shard_fails_ends_early() -> None:
     script = {shard: ["failed"] * 3 for shard in range(5000)}
-    summary, books, _, heard = run_script(script, 5000, Policy(give_up_after=20))
+    summary, recorder, _, heard = run_script(script, 5000, RetryPolicy(give_up_after=20))
     assert summary.end == "failed" and summary.exit_code == 1
-    assert 51 <= len(books.given_up) < 60 and heard.reasons == ["51 shards are quarantined"]
-    assert summary.remaining == 5000 - summary.tally.quarantined
+    assert 51 <= len(recorder.given_up) < 60 and heard.reasons == ["51 shards are quarantined"]
+    assert summary.remaining == 5000 - summary.totals.quarantined
 
 
 def test_a_full_disk_ends_the_job_at_once() -> None:
-    summary, books, _, heard = run_script({shard: ["failed!"] for shard in range(500) if shard % 5}, 500)
+    summary, recorder, _, heard = run_script({shard: ["failed!"] for shard in range(500) if shard % 5}, 500)
     assert summary.end == "aborted" and summary.exit_code == 2 and summary.cause == "scripted failed!"
-    assert summary.tally.finished < 20 and not books.given_up
+    assert summary.totals.finished < 20 and not recorder.given_up
     assert "abort" in {action for _, _, action in heard.actions}
 
 
 def test_a_silent_attempt_is_ended_by_the_driver_and_counts_as_hung() -> None:
-    policy = Policy(initial_deadline_s=100, max_quarantined_share=1.0)
-    summary, books, executor, _ = run_script({0: ["silent"]}, policy=policy)
-    assert summary.tally.committed == 6 and books.closed["hung"] == 1
+    policy = RetryPolicy(initial_deadline_s=100, max_quarantined_share=1.0)
+    summary, recorder, executor, _ = run_script({0: ["silent"]}, policy=policy)
+    assert summary.totals.committed == 6 and recorder.closed["hung"] == 1
     first, second = (o for o in executor.orders if o.shard == 0)
     assert second.deadline_s == 2 * first.deadline_s == 200
-    cause = next(e.cause for e in books.entries if e.outcome == "hung")
+    cause = next(e.cause for e in recorder.entries if e.outcome == "hung")
     assert "deadline of 100 s" in cause
 
 
 def test_an_attempt_that_no_worker_began_is_lost_and_not_hung() -> None:
-    clock, books = FakeClock(), PaperBooks()
+    clock, recorder = FakeClock(), PaperRecorder()
     executor = SimulatedExecutor(
         clock, lambda o, n: ("committed", None if (o.shard, n) == (0, 1) else 1.0), notes=False
     )
-    policy = Policy(initial_deadline_s=100)
-    summary = drive(range(3), lambda o: o, executor, books, policy, Heard(), StopRequest(), clock)
-    assert summary.tally.committed == 3 and books.closed == {"committed": 3, "lost": 1}
+    policy = RetryPolicy(initial_deadline_s=100)
+    summary = drive(range(3), lambda o: o, executor, recorder, policy, Heard(), StopRequest(), clock)
+    assert summary.totals.committed == 3 and recorder.closed == {"committed": 3, "lost": 1}
 
 
 def test_an_executor_that_never_confirms_a_kill_does_not_hold_the_driver() -> None:
-    clock, books = FakeClock(), PaperBooks()
+    clock, recorder = FakeClock(), PaperRecorder()
     executor = SimulatedExecutor(
         clock, lambda o, n: ("committed", None if (o.shard, n) == (0, 1) else 1.0), deaf=True
     )
-    summary = drive(range(3), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
-    assert summary.tally.committed == 3 and books.closed["hung"] == 1
+    summary = drive(range(3), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
+    assert summary.totals.committed == 3 and recorder.closed["hung"] == 1
 
 
 def test_a_worker_that_died_after_its_commit_has_committed() -> None:
-    books, clock, name = PaperBooks(), FakeClock(), {}
+    recorder, clock, name = PaperRecorder(), FakeClock(), {}
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         if order.shard == 1:
             name[1] = order.attempt
-            books.commits[1] = commit_by(1, order.attempt)
+            recorder.commits[1] = commit_by(1, order.attempt)
             return ("crashed", 1.0)
         if order.shard == 2:
-            books.commits[2] = commit_by(2, "another")
+            recorder.commits[2] = commit_by(2, "another")
             return ("lost", 1.0)
         return ("committed", 1.0)
 
     executor = SimulatedExecutor(clock, fate)
-    summary = drive(range(4), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
-    assert books.closed == {"committed": 3, "superseded": 1} and summary.tally.retries == 0
+    summary = drive(range(4), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
+    assert recorder.closed == {"committed": 3, "superseded": 1} and summary.totals.retries == 0
     assert summary.end == "complete"
-    entry = next(e for e in books.entries if e.attempt == name[1])
-    assert entry.cost == books.commits[1].cost and entry.cause == ""
-    assert summary.tally.labels == 2 * 10 + 77
+    entry = next(e for e in recorder.entries if e.attempt == name[1])
+    assert entry.cost == recorder.commits[1].cost and entry.cause == ""
+    assert summary.totals.labels == 2 * 10 + 77
 
 
 def test_a_worker_that_lost_the_answer_to_its_commit_has_committed() -> None:
-    books, clock = PaperBooks(), FakeClock()
+    recorder, clock = PaperRecorder(), FakeClock()
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         if order.shard == 1:
-            books.commits[1] = commit_by(1, order.attempt)
+            recorder.commits[1] = commit_by(1, order.attempt)
             return ("failed!", 1.0)
         if order.shard == 2 and n == 1:
-            books.commits[2] = commit_by(2, "another")
+            recorder.commits[2] = commit_by(2, "another")
             return ("failed", 1.0)
         return ("superseded" if order.shard == 2 else "committed", 1.0)
 
     executor = SimulatedExecutor(clock, fate)
-    summary = drive(range(4), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
+    summary = drive(range(4), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
     assert summary.end == "complete"
-    assert books.closed == {"committed": 3, "failed": 1, "superseded": 1}
+    assert recorder.closed == {"committed": 3, "failed": 1, "superseded": 1}
 
 
 def test_a_shard_that_somebody_else_cancels_is_made_all_the_same() -> None:
-    summary, books, _, heard = run_script({3: ["cancelled"]})
-    assert summary.end == "complete" and summary.tally.committed == 6
-    assert books.closed == {"committed": 6, "lost": 1} and (3, "lost", "retry") in heard.actions
+    summary, recorder, _, heard = run_script({3: ["cancelled"]})
+    assert summary.end == "complete" and summary.totals.committed == 6
+    assert recorder.closed == {"committed": 6, "lost": 1} and (3, "lost", "retry") in heard.actions
 
 
 def commit_by(shard: int, attempt: str) -> Commit:
@@ -174,31 +174,31 @@ def commit_by(shard: int, attempt: str) -> Commit:
 
 
 def stopping_at(
-    shard_count: int, asks: int, policy: Policy, wall_s: float
-) -> tuple[JobSummary, PaperBooks, float]:
-    clock, books, stop = FakeClock(), PaperBooks(), StopRequest()
+    shard_count: int, asks: int, policy: RetryPolicy, wall_s: float
+) -> tuple[JobSummary, PaperRecorder, float]:
+    clock, recorder, stop = FakeClock(), PaperRecorder(), StopRequest()
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", wall_s))
     asked_at: list[float] = []
 
-    def on_tick(tally: Tally) -> None:
-        if tally.committed >= 10 and not asked_at:
+    def on_tick(totals: JobTotals) -> None:
+        if totals.committed >= 10 and not asked_at:
             asked_at.append(clock.now_s)
             for _ in range(asks):
                 stop.ask()
 
     summary = drive(
-        range(shard_count), lambda o: o, executor, books, policy, Heard(on_tick=on_tick), stop, clock
+        range(shard_count), lambda o: o, executor, recorder, policy, Heard(on_tick=on_tick), stop, clock
     )
-    return summary, books, clock.now_s - asked_at[0]
+    return summary, recorder, clock.now_s - asked_at[0]
 
 
 def test_one_request_drains_and_two_end_at_once() -> None:
-    summary, books, _ = stopping_at(1000, 1, LENIENT, 5.0)
+    summary, recorder, _ = stopping_at(1000, 1, LENIENT, 5.0)
     assert summary.end == "interrupted" and summary.exit_code == 130
-    assert books.closed["cancelled"] == 0 and 10 < summary.tally.committed <= 10 + 2 * 4 + 4
-    summary, books, took_s = stopping_at(1000, 2, LENIENT, 5.0)
-    assert summary.end == "interrupted" and books.closed["cancelled"] > 0 and took_s < 1
-    assert summary.remaining == 1000 - summary.tally.committed
+    assert recorder.closed["cancelled"] == 0 and 10 < summary.totals.committed <= 10 + 2 * 4 + 4
+    summary, recorder, took_s = stopping_at(1000, 2, LENIENT, 5.0)
+    assert summary.end == "interrupted" and recorder.closed["cancelled"] > 0 and took_s < 1
+    assert summary.remaining == 1000 - summary.totals.committed
 
 
 def test_a_stop_that_leaves_nothing_to_do_is_none() -> None:
@@ -208,27 +208,29 @@ def test_a_stop_that_leaves_nothing_to_do_is_none() -> None:
 
 
 def test_draining_is_bounded() -> None:
-    _, books, took_s = stopping_at(1000, 1, Policy(drain_s=30), 500.0)
-    assert books.closed["cancelled"] > 0 and took_s == pytest.approx(30, abs=2)
+    _, recorder, took_s = stopping_at(1000, 1, RetryPolicy(drain_s=30), 500.0)
+    assert recorder.closed["cancelled"] > 0 and took_s == pytest.approx(30, abs=2)
 
 
 def test_the_window_bounds_what_is_in_flight() -> None:
     for slots in (1, 3, 8):
         clock = FakeClock()
         executor = SimulatedExecutor(clock, lambda o, n: ("committed", 1.0), slots=slots)
-        drive(range(200), lambda o: o, executor, PaperBooks(), Policy(), Heard(), StopRequest(), clock)
+        drive(
+            range(200), lambda o: o, executor, PaperRecorder(), RetryPolicy(), Heard(), StopRequest(), clock
+        )
         assert executor.most_in_flight == 2 * slots
 
 
 def test_books_that_cannot_be_written_end_what_is_in_flight() -> None:
-    class FullBooks(PaperBooks):
+    class FullBooks(PaperRecorder):
         def close(self, entry: LedgerEntry) -> None:
             raise InputError("RUN/ledger", "", "No space left on device", "Free disk space")
 
     clock = FakeClock()
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", 1.0))
     with pytest.raises(InputError, match="No space left"):
-        drive(range(50), lambda o: o, executor, FullBooks(), Policy(), Heard(), StopRequest(), clock)
+        drive(range(50), lambda o: o, executor, FullBooks(), RetryPolicy(), Heard(), StopRequest(), clock)
     assert executor.in_flight == 0
 
 
@@ -245,23 +247,23 @@ WORDS = st.sampled_from(["crashed", "hung", "failed", "out_of_memory", "lost", "
 def test_whatever_fails_every_shard_ends_once_and_every_attempt_is_in_the_ledger(
     script: dict[int, list[str]],
 ) -> None:
-    policy = Policy(initial_deadline_s=10, grace_s=1, max_quarantined_share=1.0, max_lost_rounds=100)
-    summary, books, executor, heard = run_script(script, 12, policy)
-    tally = summary.tally
-    assert tally.committed + tally.superseded + tally.quarantined == 12 and summary.remaining == 0
-    assert sorted(e.attempt for e in books.entries) == sorted(o.attempt for o in executor.orders)
+    policy = RetryPolicy(initial_deadline_s=10, grace_s=1, max_quarantined_share=1.0, max_lost_rounds=100)
+    summary, recorder, executor, heard = run_script(script, 12, policy)
+    totals = summary.totals
+    assert totals.committed + totals.superseded + totals.quarantined == 12 and summary.remaining == 0
+    assert sorted(e.attempt for e in recorder.entries) == sorted(o.attempt for o in executor.orders)
     final = [shard for shard, _, action in heard.actions if action in ("done", "quarantine")]
     assert sorted(final) == list(range(12))
-    wall_s = sum(e.cost.wall_s for e in books.entries if e.cost)
-    assert tally.useful_wall_s + tally.wasted_wall_s == pytest.approx(wall_s)
+    wall_s = sum(e.cost.wall_s for e in recorder.entries if e.cost)
+    assert totals.useful_wall_s + totals.wasted_wall_s == pytest.approx(wall_s)
 
 
 def test_twenty_thousand_shards_on_a_bad_cluster() -> None:
     """Failures, lost and slow nodes, zombies and doubled reports lead to the right sums, in flat memory."""
     traced: dict[int, int] = {}
 
-    def on_tick(tally: Tally) -> None:
-        if (thousands := tally.finished // 1000) not in traced:
+    def on_tick(totals: JobTotals) -> None:
+        if (thousands := totals.finished // 1000) not in traced:
             traced[thousands] = tracemalloc.get_traced_memory()[0]
 
     tracemalloc.start()

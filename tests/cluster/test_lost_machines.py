@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.task import AttemptReport
-from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor, report_of
+from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor, report_of
 
 
 @pytest.fixture(autouse=True)
@@ -35,40 +35,40 @@ class OneMachine(SimulatedExecutor):
 
 
 def on_one_machine(
-    shards: int, fate: Callable[[Order, int], Fate]
-) -> tuple[JobSummary, PaperBooks, OneMachine]:
-    clock, books = FakeClock(), PaperBooks()
+    shards: int, fate: Callable[[AttemptOrder, int], Fate]
+) -> tuple[JobSummary, PaperRecorder, OneMachine]:
+    clock, recorder = FakeClock(), PaperRecorder()
     executor = OneMachine(clock, fate, keep_orders=True)
-    summary = drive(range(shards), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
-    assert len(books.entries) == len(executor.orders) == summary.tally.outcomes.total()
-    return summary, books, executor
+    summary = drive(range(shards), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
+    assert len(recorder.entries) == len(executor.orders) == summary.totals.outcomes.total()
+    return summary, recorder, executor
 
 
 @pytest.mark.parametrize("shards", [2, 7, 300])
 def test_an_executor_that_loses_everything_ends_the_job_and_is_no_shards_fault(shards: int) -> None:
     made = 0
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         nonlocal made
         made += shards > 2
         return ("committed", 5.0) if 0 < made <= 3 else ("lost", 0.01)
 
-    summary, books, executor = on_one_machine(shards, fate)
-    assert summary.end == "aborted" and summary.exit_code == 2 and not books.given_up
+    summary, recorder, executor = on_one_machine(shards, fate)
+    assert summary.end == "aborted" and summary.exit_code == 2 and not recorder.given_up
     assert summary.cause == "whatever begins is lost, at last by: scripted lost"
-    assert summary.remaining == shards - summary.tally.committed and len(executor.orders) < 60
+    assert summary.remaining == shards - summary.totals.committed and len(executor.orders) < 60
 
 
 def test_an_executor_that_works_again_completes_the_job() -> None:
     began = 0
 
-    def fate(order: Order, n: int) -> Fate:
+    def fate(order: AttemptOrder, n: int) -> Fate:
         nonlocal began
         began += 1
         return ("lost", 0.1) if began % 40 < 4 else ("committed", 5.0)
 
-    summary, books, _ = on_one_machine(300, fate)
-    assert summary.end == "complete" and summary.tally.committed == 300 and not books.given_up
+    summary, recorder, _ = on_one_machine(300, fate)
+    assert summary.end == "complete" and summary.totals.committed == 300 and not recorder.given_up
 
 
 @pytest.mark.parametrize(("shards", "wall_s"), [(1, 1.0), (30, 0.01), (30, 20.0)])
@@ -76,10 +76,10 @@ def test_a_shard_that_takes_its_machine_along_is_given_up_alone(shards: int, wal
     # Wherever among the others it is begun: the driver begins at a random shard.
     for bad in range(shards):
 
-        def fate(order: Order, n: int, bad: int = bad) -> Fate:
+        def fate(order: AttemptOrder, n: int, bad: int = bad) -> Fate:
             return ("lost", wall_s) if order.shard == bad else ("committed", 5.0)
 
-        summary, books, executor = on_one_machine(shards, fate)
-        assert set(books.given_up) == {bad} and summary.tally.committed == shards - 1
+        summary, recorder, executor = on_one_machine(shards, fate)
+        assert set(recorder.given_up) == {bad} and summary.totals.committed == shards - 1
         assert len(executor.orders) <= shards + 11 * 8
-        assert max(Counter(e.shard for e in books.entries if e.shard != bad).values(), default=0) <= 5
+        assert max(Counter(e.shard for e in recorder.entries if e.shard != bad).values(), default=0) <= 5

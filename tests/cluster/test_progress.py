@@ -7,8 +7,8 @@ import json
 
 from rich.console import Console
 
+from datagen.cluster.job_totals import JobTotals
 from datagen.cluster.progress import JobProgress
-from datagen.cluster.tally import Tally
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Progress
 from tests.cluster.simulated import FakeClock
@@ -19,15 +19,15 @@ CRASH = AttemptReport("a", 5, "crashed", cause="Fatal Python error: Segmentation
 def thirty_seconds(as_json: bool) -> list[str]:
     clock, out = FakeClock(), io.StringIO()
     shown = Progress(as_json, clock, Console(file=out))
-    events, tally = JobProgress(shown, 60, done_before=50), Tally(100)
+    events, totals = JobProgress(shown, 60, done_before=50), JobTotals(100)
     for second in range(1, 31):
         clock.now_s = second
-        tally.committed, tally.labels = second, 60 * second
-        events.tick(tally)
+        totals.committed, totals.labels = second, 60 * second
+        events.tick(totals)
     events.ended(CRASH, "retry")
     events.ended(AttemptReport("b", 6, "committed"), "done")
     events.stopping("asked to stop")
-    events.tick(tally)
+    events.tick(totals)
     shown.close()
     return out.getvalue().splitlines()
 
@@ -55,9 +55,9 @@ def test_the_bar_shows_rate_time_left_retries_and_cost() -> None:
         clock=clock, console=Console(file=out, force_terminal=True, width=160, color_system=None)
     )
     bar = JobProgress(shown, 60)
-    tally = Tally(100, committed=40, labels=2400, retries=3, quarantined=1, useful_cpu_s=7200)
+    totals = JobTotals(100, committed=40, labels=2400, retries=3, quarantined=1, useful_cpu_s=7200)
     clock.now_s = 40.0
-    bar.tick(tally)
+    bar.tick(totals)
     bar.ended(CRASH, "retry")
     bar.stopping("asked to stop")
     shown.close()
@@ -74,7 +74,7 @@ def test_a_usual_terminal_shows_all_figures() -> None:
     shown = Progress(clock=clock, console=Console(file=out, force_terminal=True, width=80, color_system=None))
     bar = JobProgress(shown, 60)
     clock.now_s = 40.0
-    bar.tick(Tally(3000, committed=1400, labels=84_000, retries=3, useful_cpu_s=7200))
+    bar.tick(JobTotals(3000, committed=1400, labels=84_000, retries=3, useful_cpu_s=7200))
     shown.close()
     last = [line for line in out.getvalue().splitlines() if "1400/3000" in line][-1]
     assert "2,100 labels/s  0:00:46 left  3 retries  2.00 core-h" in last

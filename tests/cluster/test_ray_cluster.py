@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from datagen.cluster import ray_cluster as ray_cluster_module
-from datagen.cluster.private_folder import private_folder
+from datagen.cluster.cluster_folders import private_folder
 from datagen.cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
 from datagen.schemas.errors import InputError

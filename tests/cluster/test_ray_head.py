@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.cluster import ray_head
-from datagen.cluster.private_folder import new_folder
+from datagen.cluster.cluster_folders import new_folder
 from datagen.cluster.ray_head import ensure_head, running_head, stop_head
 from datagen.schemas.errors import InputError
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.cluster.driver import Order, drive
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.stop_request import StopRequest
 from datagen.schemas.shard_ranges import ShardRanges
 from tests.cluster.several_drivers import drive_together, waste
-from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperBooks, SimulatedExecutor
+from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor
 
 
 class Other:
@@ -36,7 +36,7 @@ class Other:
                     self.done.add(self.at)
                     self.at += 1
 
-    def fate(self, order: Order, n: int) -> Fate:
+    def fate(self, order: AttemptOrder, n: int) -> Fate:
         self.advance()
         if order.shard in self.done:
             return ("superseded", 0.01)
@@ -51,24 +51,24 @@ def test_a_driver_makes_way_for_another(shards: int) -> None:
     clock = FakeClock()
     other = Other(clock, shards, slots=4)
 
-    class SharedBooks(PaperBooks):
+    class SharedBooks(PaperRecorder):
         def missing(self) -> ShardRanges:
             other.advance()
             return ShardRanges.of(range(shards)).without(ShardRanges.of(other.done | other.ours))
 
-    books = SharedBooks()
+    recorder = SharedBooks()
     executor = SimulatedExecutor(clock, other.fate, slots=4)
-    summary = drive(range(shards), lambda o: o, executor, books, LENIENT, Heard(), StopRequest(), clock)
-    tally = summary.tally
+    summary = drive(range(shards), lambda o: o, executor, recorder, LENIENT, Heard(), StopRequest(), clock)
+    totals = summary.totals
     assert summary.end == "complete" and summary.remaining == 0
     clock.now_s += 5.0 * shards  # what the other is at work at counts as done here
     other.advance()
-    assert tally.committed == len(other.ours) and other.done | other.ours == set(range(shards))
-    assert tally.committed + tally.superseded + tally.elsewhere == shards
+    assert totals.committed == len(other.ours) and other.done | other.ours == set(range(shards))
+    assert totals.committed + totals.superseded + totals.elsewhere == shards
     # Places are drawn at random. Over few shards the two may meet until the end; over many they share them.
-    assert shards == 40 or tally.committed > shards // 3
+    assert shards == 40 or totals.committed > shards // 3
     # Twice the first window, and some more wherever the two met: no longer everything.
-    assert shards == 40 or tally.wasted_wall_s <= 5.0 * (64 + shards // 50)
+    assert shards == 40 or totals.wasted_wall_s <= 5.0 * (64 + shards // 50)
 
 
 @given(st.sets(st.integers(0, 80)), st.integers(0, 2**32), st.lists(st.integers(0, 3), max_size=80))
@@ -106,7 +106,7 @@ def test_drivers_that_begin_together_waste_little(
     wasted = []
     for _ in range(12):
         summaries = drive_together(drivers, shards)
-        assert sum(summary.tally.committed for summary in summaries) == shards
+        assert sum(summary.totals.committed for summary in summaries) == shards
         assert all(summary.end == "complete" and not summary.remaining for summary in summaries)
         wasted.append(waste(summaries))
     assert np.all(np.mean(wasted, axis=0) <= (attempts, share))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
-from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, json_of, make_small_run
 

@@ -13,7 +13,7 @@ from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.specification import CandidateParams, HeuristicParams, Specification
 from datagen.train.reader import SampleReader
-from datagen.workers.labels.heuristic import heuristic
+from datagen.workers.labels.distance_visibility_score import heuristic
 from tests.made_runs import make_run, small_spec
 from tests.refusals import refused
 from tests.small_runs import arrays_of, json_of, submit_arguments

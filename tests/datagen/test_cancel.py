@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from datagen.schemas.jobs import Job, Jobs
+from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import open_storage
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, json_of, submit_arguments
@@ -32,11 +32,11 @@ class Work:
             cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    def job(self) -> Job:
+    def job(self) -> StoredJob:
         (job,) = Jobs(self.place).all()
         return job
 
-    def wait_until_it_makes_shards(self) -> Job:
+    def wait_until_it_makes_shards(self) -> StoredJob:
         while True:
             jobs = Jobs(self.place).all()
             if jobs and jobs[0].state is not None and jobs[0].state.phase == "making":
@@ -93,7 +93,7 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     # A minute passes.
     assert job.state is not None
     before = (datetime.now(UTC) - timedelta(minutes=2)).isoformat()
-    Jobs(work.place).tell(job.state.model_copy(update={"updated": before}))
+    Jobs(work.place).put_state(job.state.model_copy(update={"updated": before}))
     (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
     assert shown["health"] == "dead"
     assert cli.run(["status", str(run)]) == 0
@@ -114,7 +114,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
     try:
         before = (datetime.now(UTC) - timedelta(minutes=5)).isoformat()
         assert job.state is not None
-        Jobs(work.place).tell(job.state.model_copy(update={"updated": before}))
+        Jobs(work.place).put_state(job.state.model_copy(update={"updated": before}))
         monkeypatch.setattr("datagen.commands.cancel._GIVE_UP_S", 1.0)
         assert work.job().health() == "live"
         assert cli.run(["cancel", str(run)]) == 1

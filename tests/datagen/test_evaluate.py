@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from datagen import cli
-from datagen.evaluating.contestants import open_models
+from datagen.evaluation_report.methods import open_models
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import Checkpoint, CheckpointHead, write_checkpoint
 from tests.made_runs import make_run

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.commands.extend import shares
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from tests.refusals import refused
 from tests.small_runs import (
     HERE,

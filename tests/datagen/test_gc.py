@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
-from datagen.reports.accounts import account_for
+from datagen.reports.spending import account_for
 from datagen.schemas.errors import InputError
-from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.jobs import JobRecord, Jobs, new_job_id
 from datagen.schemas.keys import REMOVING, commit_copy_key, commit_key, shard_folder
-from datagen.schemas.merged import open_runs
-from datagen.schemas.record_files import now
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage, StoredFile, open_storage
@@ -109,7 +109,7 @@ def test_what_began_under_a_job_that_is_at_work_stays(tmp_path: Path) -> None:
     run, _ = littered(tmp_path)
     age_all(run, 60)
     jobs = Jobs(run.storage)
-    jobs.begin(JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=now(), address="local"))
+    jobs.begin(JobRecord(id=new_job_id(), command=(), host="h", pid=1, started=utc_now(), address="local"))
     write(run, 4, "at-work")
     found = {piece.key for piece in find_garbage(run.storage, 0, time.time())}
     assert shard_folder(4, "at-work") not in found and shard_folder(1, "late") in found
@@ -214,9 +214,9 @@ def test_a_run_in_a_bucket_is_swept_as_on_a_disk(bucket: str, capsys: pytest.Cap
     }  # fmt: skip
     kept = {f.key for f in run.storage.list("")}
     assert {key for key in before if REMOVING not in key and ".probe-" not in key} == kept
-    books = account_for([run])
+    spending = account_for([run])
     run.storage.delete(index_files(run))
-    assert account_for([run]) == books and books.useful.attempts == 3
+    assert account_for([run]) == spending and spending.useful.attempts == 3
     for shard in range(3):
         check_digests(run, run.commit_of(shard))
 

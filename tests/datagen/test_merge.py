@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from datagen import cli
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.train.reader import SampleReader
 from tests.made_runs import make_run
@@ -51,10 +51,10 @@ def test_runs_of_one_specification_give_the_store_of_one_run(
     assert {source["address"] for source in part["lineage"]} == {str(apart / "first"), str(apart / "whole")}
     assert_equal_runs(arrays_of(out), arrays_of(apart / "whole"))
     assert files_of(apart / "first") == before
-    books = [json_of(capsys, ["audit", str(apart / name)])["sources"][0] for name in ("first", "whole")]
+    spending = [json_of(capsys, ["audit", str(apart / name)])["sources"][0] for name in ("first", "whole")]
     (united,) = json_of(capsys, ["audit", str(out)])["sources"]
     spent = united["useful"]["wall_s"] + sum(waste["wall_s"] for waste in united["waste"].values())
-    assert spent == pytest.approx(sum(book["useful"]["wall_s"] for book in books), abs=1e-6)
+    assert spent == pytest.approx(sum(book["useful"]["wall_s"] for book in spending), abs=1e-6)
     files = files_of(out)
     assert json_of(capsys, arguments)["runs"][0]["shards"]["linked"] == 0
     assert files_of(out) == files

@@ -10,11 +10,11 @@ import pytest
 
 from datagen import cli
 from datagen.schemas.keys import commit_key, shard_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
-from datagen.train.opening import open_parts
+from datagen.train.run_parts import open_parts
 from tests.datagen.forged import forge
 from tests.made_runs import check_digests
 from tests.refusals import refused

@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from datagen import cli
-from datagen.schemas.checking.mending import mend_place
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.record_files import encode_record, signed_json
@@ -19,7 +19,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
-from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, remake
+from tests.faults.damage_campaign import Damage, apply, copy_run, fewer_arrays, make_place, regenerate
 from tests.made_runs import files_of, make_run, small_spec
 
 
@@ -107,13 +107,13 @@ def test_a_mending_that_is_broken_off_is_finished_by_the_next(tmp_path: Path) ->
     def break_off(run: Run, shard: int) -> Any:
         if shard == 2:
             raise KeyboardInterrupt
-        return remake(run, shard)
+        return regenerate(run, shard)
 
     place = open_storage(tmp_path / "run", probe=False)
     with pytest.raises(KeyboardInterrupt):
-        mend_place(place, break_off)
-    mended = mend_place(place, remake)
-    assert mended.remade_files == keys[2:] and mended.left == []
+        repair_runs(place, break_off)
+    repaired = repair_runs(place, regenerate)
+    assert repaired.regenerated_files == keys[2:] and repaired.left == []
     assert files_of(tmp_path / "run") == files_of(tmp_path / "clean")
 
 
@@ -124,12 +124,12 @@ def test_a_failing_simulator_leaves_its_shard_and_mends_the_others(tmp_path: Pat
     def fail(run: Run, shard: int) -> Any:
         if shard == 1:
             raise RuntimeError("the physics left sense")
-        return remake(run, shard)
+        return regenerate(run, shard)
 
-    mended = mend_place(open_storage(tmp_path / "run", probe=False), fail, workers=2)
-    assert sorted(mended.remade_files) == [keys[0], keys[2]]
-    assert {f.key for f in mended.left if f.kind == "file"} == {keys[1]}
-    assert any("left sense" in f.mend for f in mended.left)
+    repaired = repair_runs(open_storage(tmp_path / "run", probe=False), fail, workers=2)
+    assert sorted(repaired.regenerated_files) == [keys[0], keys[2]]
+    assert {f.key for f in repaired.left if f.kind == "file"} == {keys[1]}
+    assert any("left sense" in f.mend for f in repaired.left)
 
 
 def test_a_deleted_chunk_comes_back_from_the_sealed_store(tmp_path: Path) -> None:
@@ -141,8 +141,8 @@ def test_a_deleted_chunk_comes_back_from_the_sealed_store(tmp_path: Path) -> Non
     def never(run: Run, shard: int) -> Any:
         raise AssertionError("there was a second source")
 
-    mended = mend_place(open_storage(tmp_path / "run", probe=False), never)
-    assert mended.copied_files == [key] and mended.left == []
+    repaired = repair_runs(open_storage(tmp_path / "run", probe=False), never)
+    assert repaired.copied_files == [key] and repaired.left == []
     assert files_of(tmp_path / "run") == files_of(tmp_path / "clean")
     assert (tmp_path / "run" / key).samefile(tmp_path / "run/data.zarr/points_m/c.1.0.0")
 
@@ -152,8 +152,8 @@ def test_what_cannot_be_mended_is_left_and_said(tmp_path: Path) -> None:
     (tmp_path / "run/ledger/b-0.json").write_bytes(b"")
     for key in ("commits/000001.json", "shards/000001/a-1/commit.json", "ledger/a-1.json"):
         (tmp_path / "run" / key).unlink()
-    mended = mend_place(run.storage, remake)
-    assert {(f.kind, f.key) for f in mended.left if f.is_damage} == {
+    repaired = repair_runs(run.storage, regenerate)
+    assert {(f.kind, f.key) for f in repaired.left if f.is_damage} == {
         ("account", "ledger/b-0.json"),
         ("lost", "commits/000001.json"),
         ("sealed", "data.zarr"),
@@ -176,9 +176,9 @@ def test_the_parts_of_a_merged_place_are_mended(tmp_path: Path) -> None:
     chunk = damage(tmp_path / "run", f"{part}/shards/000001/*/label/c.0")
     records = [damage(tmp_path / "run", key) for key in (f"{part}/commits/000000.json", MERGED)]
     sealed = damage(tmp_path / "run", "data.zarr/zarr.json")
-    mended = mend_place(open_storage(tmp_path / "run", probe=False), remake)
-    assert sorted(mended.records) == sorted(records) and mended.remade_files == [chunk]
-    assert mended.resealed and mended.left == [] and mended.changed == []
+    repaired = repair_runs(open_storage(tmp_path / "run", probe=False), regenerate)
+    assert sorted(repaired.records) == sorted(records) and repaired.regenerated_files == [chunk]
+    assert repaired.resealed and repaired.left == [] and repaired.changed == []
     assert files_of(tmp_path / "run") == files_of(tmp_path / "clean"), sealed
 
 
@@ -214,11 +214,13 @@ def test_a_run_on_s3_is_checked_and_mended(bucket: str) -> None:
         storage.put(key, data[:-1] + b"\0")
     storage.delete(["data.zarr/label/zarr.json", "shards/000000/a-0/label/c.0", "commits/000000.json"])
     storage.put("data.zarr/label/c.7", b"")
-    mended = mend_place(storage, remake)
-    assert mended.left == [] and mended.remade_files == []  # the sealed store holds copies of its own
+    repaired = repair_runs(storage, regenerate)
+    assert (
+        repaired.left == [] and repaired.regenerated_files == []
+    )  # the sealed store holds copies of its own
     assert {f.key: storage.get(f.key, 2**30) for f in storage.list("")} == whole
     storage.delete(["data.zarr/zarr.json"])
     storage.put("shards/000001/a-1/points_m/c.0.0.0", b"0")
     storage.put("data.zarr/points_m/c.1.0.0", b"0")
-    mended = mend_place(storage, remake)
-    assert mended.left == [] and mended.remade_shards == [1] and mended.resealed
+    repaired = repair_runs(storage, regenerate)
+    assert repaired.left == [] and repaired.regenerated_shards == [1] and repaired.resealed

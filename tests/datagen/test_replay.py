@@ -15,13 +15,13 @@ from PIL import Image
 
 from datagen import cli
 from datagen.commands.replay import find_sample
-from datagen.remaking.alone import ShardFailed
-from datagen.remaking.stages import STAGES
+from datagen.regeneration.single_shard import ShardFailed
+from datagen.regeneration.stage_comparison import STAGES
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
-from datagen.workers.labels import distance_visibility
+from datagen.workers.labels import heuristic_source
 from tests.datagen.forged import forge
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, arrays_of, files_of, json_of, make_small_run
@@ -239,9 +239,7 @@ def test_a_defect_reaches_the_debugger_as_it_was_raised(
     def broken(*_: Any) -> Any:
         raise ZeroDivisionError("a defect of the label source")
 
-    monkeypatch.setattr(
-        distance_visibility, "HEURISTIC", replace(distance_visibility.HEURISTIC, label=broken)
-    )
+    monkeypatch.setattr(heuristic_source, "HEURISTIC", replace(heuristic_source.HEURISTIC, label=broken))
     with pytest.raises(ZeroDivisionError, match="a defect of the label source") as caught:
         cli.run(["replay", str(given_up), "--shard", "1"])
     assert caught.traceback[-1].name == "broken"
@@ -251,12 +249,12 @@ def test_a_defect_reaches_the_debugger_as_it_was_raised(
 def test_a_batch_that_breaks_its_schema_keeps_its_traceback_too(
     given_up: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = distance_visibility.HEURISTIC
+    source = heuristic_source.HEURISTIC
 
     def broken(*given: Any) -> Any:
         return {**source.label(*given), "visibility": np.full(PER_SCENE, np.nan, np.float32)}
 
-    monkeypatch.setattr(distance_visibility, "HEURISTIC", replace(source, label=broken))
+    monkeypatch.setattr(heuristic_source, "HEURISTIC", replace(source, label=broken))
     with pytest.raises(ShardFailed, match="visibility: NaN") as caught:
         cli.run(["replay", str(given_up), "--shard", "1"])
     assert isinstance(caught.value.__cause__, InputError)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import datagen.commands.submit
-import datagen.jobs.going_on
+import datagen.jobs.start_job
 from datagen import cli
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
@@ -150,14 +150,14 @@ def test_an_early_ctrl_c_says_how_to_go_on(
 ) -> None:
     run = tmp_path / "run"
     with monkeypatch.context() as patched:  # while the first scene is drawn
-        patched.setattr(datagen.commands.submit, "draw_scene", interrupting)
+        patched.setattr(datagen.commands.submit, "generate_scene", interrupting)
         again = the_command(capsys, lambda: cli.run(submit_arguments(run, N)))
     assert again[:2] == ["submit", "heuristic"] and not run.exists()
     with monkeypatch.context() as patched:  # while workers start: the run is there
         patched.setattr("datagen.jobs.job.InProcessExecutor", interrupting)
         assert the_command(capsys, lambda: cli.run(again))[:2] == ["resume", str(run)]
     with monkeypatch.context() as patched:  # while sources are opened
-        patched.setattr(datagen.jobs.going_on, "open_origin", interrupting)
+        patched.setattr(datagen.jobs.start_job, "open_sources", interrupting)
         again = the_command(capsys, lambda: cli.run(["resume", str(run), *HERE]))
     jobs = json_of(capsys, ["status", str(run)])["jobs"]
     assert [job["state"]["end"] for job in jobs] == ["interrupted"]

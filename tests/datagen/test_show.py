@@ -14,7 +14,7 @@ from datagen.drawing.outcome_colours import LOOKS
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
-from datagen.workers.scenes.recall import recall_candidates, recall_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
@@ -85,9 +85,9 @@ def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str,
 
     run = Run.open(str(runs[name]))
     spec, rows = run.manifest.spec, read_scene(run, 0)
-    scene = recall_scene(open_world(spec, "builtin", "builtin"), rows.record)
+    scene = reconstruct_scene(open_world(spec, "builtin", "builtin"), rows.record)
     for row in range(0, PER_SCENE, 2):
-        again = try_again(scene, recall_candidates(rows.samples, scene), row, spec)
+        again = try_again(scene, reconstruct_candidates(rows.samples, scene), row, spec)
         assert again.trial.outcome == NAMES[rows.samples["outcome"][row]]
         assert again.moves == (rows.samples["path_length_rad"][row] > 0)
         if name != "plan":

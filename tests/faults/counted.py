@@ -16,14 +16,14 @@ from math import fsum, isclose
 from pathlib import Path
 from typing import Any
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, this_host
+from datagen.cluster.attempt_guard import Meter, this_host
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.open_shards import OpenShards
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.task import Product
-from datagen.reports.accounts import account_for
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.task import AttemptResult
+from datagen.reports.spending import account_for
 from datagen.schemas.cost import StageClock
 from datagen.schemas.keys import commit_key
 from datagen.schemas.run import Run
@@ -35,7 +35,7 @@ from tests.made_runs import check_digests, commit_of, make_run, rows_of
 from tests.small_runs import arrays_of, assert_equal_runs
 
 # Whoever is killed again and again must not give a shard up.
-PATIENT = Policy(
+PATIENT = RetryPolicy(
     max_failures=1000, max_lost=1000, backoff_s=0.02, max_backoff_s=0.1, initial_deadline_s=120, look_s=0.5
 )
 SAMPLES_PER_SHARD = 10
@@ -76,14 +76,14 @@ def count(counted: str, word: str, attempt: str) -> None:
         os.close(fd)
 
 
-def make_counted(task: CountedRows, meter: Meter) -> Product:
+def make_counted(task: CountedRows, meter: Meter) -> AttemptResult:
     """Draw, write and commit the shard, as `datagen.cluster.attempt` does with real ones."""
     run, clock = Run.open(task.run), StageClock()
     count(task.counted, "begins", task.attempt)
     run.ledger.start(task.attempt, task.shard)
     count(task.counted, "begun", task.attempt)
     if not task.stubborn and run.storage.exists(commit_key(task.shard)):
-        return Product(False, 0, 0, meter.cost())
+        return AttemptResult(False, 0, 0, meter.cost())
     with clock.stage("draw"):
         time.sleep(task.seconds * random.uniform(0.5, 1.5))
         scenes, samples = rows_of(run, task.shard)
@@ -93,7 +93,7 @@ def make_counted(task: CountedRows, meter: Meter) -> Product:
     cost = meter.cost(clock, written_bytes=sum(entry.size for entry in entries))
     commit = commit_of(run, task.shard, task.attempt, entries, int(samples["label"].sum()))
     won = run.commit(commit.model_copy(update={"cost": cost, "host": this_host()}))
-    return Product(won, commit.samples, commit.positives, cost)
+    return AttemptResult(won, commit.samples, commit.positives, cost)
 
 
 def drive_counted(
@@ -109,7 +109,7 @@ def drive_counted(
         OpenShards.keep = lambda self, missing: 0
     notes = f"{counted}-notes-{os.getpid()}"  # a killed driver leaves them behind
 
-    def make_task(order: Order) -> CountedRows:
+    def make_task(order: AttemptOrder) -> CountedRows:
         return CountedRows(
             place, counted, seconds, stubborn, order.shard, order.attempt, order.deadline_s, notes
         )
@@ -117,7 +117,7 @@ def drive_counted(
     executor = ProcessExecutor(make_counted, workers)
     if together is not None:
         together.wait(300)
-    drive(run.missing(), make_task, executor, RunBooks(run), PATIENT, Heard(), StopRequest())
+    drive(run.missing(), make_task, executor, RunRecorder(run), PATIENT, Heard(), StopRequest())
     executor.close()
     close_lost_attempts(run)
 
@@ -211,12 +211,12 @@ def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
     assert winners == {name for name, end in ends.items() if end["outcome"] == "committed"}
     lost_s = [end["cost"]["wall_s"] for name, end in ends.items() if name not in winners and end["cost"]]
 
-    books = account_for([run])
-    waste = sum(account.attempts for account in books.waste.values())
-    assert books.useful.attempts == shards and books.running == 0
-    assert books.useful.attempts + waste == len(ends) == len(set(ends) | starts)
-    assert isclose(books.total_wall_s, fsum(wall_s + lost_s), rel_tol=1e-9)
-    useful = books.useful
+    recorder = account_for([run])
+    waste = sum(account.attempts for account in recorder.waste.values())
+    assert recorder.useful.attempts == shards and recorder.running == 0
+    assert recorder.useful.attempts + waste == len(ends) == len(set(ends) | starts)
+    assert isclose(recorder.total_wall_s, fsum(wall_s + lost_s), rel_tol=1e-9)
+    useful = recorder.useful
     assert isclose(useful.wall_s, fsum(useful.stage_wall_s.values()) + useful.unnamed_wall_s, rel_tol=1e-9)
     return {
         "shards": shards,
@@ -224,6 +224,6 @@ def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
         "cut at their beginning": len(seen.begins - seen.begun),
         "killed before it": len(unseen),
         "attempts wasted": waste,
-        "of these without account": sum(account.unaccounted for account in books.waste.values()),
-        "waste share of time": 1 - useful.wall_s / books.total_wall_s,
-    } | {f"ended {outcome}": books.waste[outcome].attempts for outcome in sorted(books.waste)}
+        "of these without account": sum(account.unaccounted for account in recorder.waste.values()),
+        "waste share of time": 1 - useful.wall_s / recorder.total_wall_s,
+    } | {f"ended {outcome}": recorder.waste[outcome].attempts for outcome in sorted(recorder.waste)}

@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
-from datagen.cluster.books import close_lost_attempts, refresh_index
+from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
 from datagen.commands.gc import remove
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from datagen.schemas.checking.mending import mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS, RecordSchema
-from datagen.schemas.garbage import find_garbage
+from datagen.schemas.garbage_collection import find_garbage
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.root_records import publish
 from datagen.schemas.run import Run
@@ -129,7 +129,7 @@ def damage(folder: Path, places: Iterable[str] = ("",)) -> list[str]:
         f"{place}: {finding.key}: {finding.problem}"
         for place in places
         if (folder / place).exists()
-        for finding in check_place(open_storage(folder / place, probe=False), Checked())
+        for finding in check_runs(open_storage(folder / place, probe=False), Checked())
         if finding.is_damage
     ]
 
@@ -218,7 +218,7 @@ def _apart(folder: Path, seeds: tuple[int, int]) -> None:
 
 
 def _merge(folder: Path) -> None:
-    carry_out(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
+    merge_runs(plan_merge([str(folder / "a"), str(folder / "b")], str(folder / "out")))
 
 
 def _damaged_records(folder: Path) -> None:
@@ -250,11 +250,11 @@ def _flip(path: Path) -> None:
 
 
 def _repair(folder: Path) -> None:
-    def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+    def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
         return encode_shard(run.schema, run.layout, run.manifest.spec_hash, *rows_of(run, shard))
 
-    mended = mend_place(open_storage(folder, probe=False), remake)
-    for finding in mended.left:
+    repaired = repair_runs(open_storage(folder, probe=False), regenerate)
+    for finding in repaired.left:
         raise InputError(finding.key, "", finding.problem, finding.mend)  # the command ends with 1
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.mending import Mended, mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.repair import Repaired, repair_runs
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import LedgerEntry
@@ -22,7 +22,7 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.storage import open_storage
 from tests.faults.crash_points_operations import small_schema
-from tests.made_runs import make_run, now, rows_of
+from tests.made_runs import make_run, rows_of, utc_now
 
 # What has no second source: its loss is found, and cannot be undone bit for bit.
 _ALONE = ("ledger/", "quarantine/")
@@ -42,7 +42,7 @@ class Campaign:
     """How many damages of each kind there were, and those that went wrong."""
 
     tried: Counter[str] = field(default_factory=Counter[str])
-    mended: Counter[str] = field(default_factory=Counter[str])
+    repaired: Counter[str] = field(default_factory=Counter[str])
     missed: list[str] = field(default_factory=list[str])
     not_restored: list[str] = field(default_factory=list[str])
     not_clean: list[str] = field(default_factory=list[str])
@@ -54,7 +54,7 @@ class Campaign:
                 sum(one.startswith(f"{kind} ") for one in bad)
                 for bad in (self.missed, self.not_restored, self.not_clean)
             ]
-            yield kind, self.tried[kind], counts[0], self.mended[kind], counts[1], counts[2]
+            yield kind, self.tried[kind], counts[0], self.repaired[kind], counts[1], counts[2]
 
 
 @contextmanager
@@ -76,12 +76,12 @@ def make_place(
     """A sealed run of few files, whose ledger has waste too."""
     run = make_run(folder, n, scenes_per_shard, candidates_per_scene)
     run.ledger.start("b-0", 0)
-    run.ledger.end(LedgerEntry(attempt="b-0", shard=0, outcome="failed", cause="ValueError", ended=now()))
+    run.ledger.end(LedgerEntry(attempt="b-0", shard=0, outcome="failed", cause="ValueError", ended=utc_now()))
     seal(run.storage)
     return run
 
 
-def remake(run: Run, shard: int) -> Mapping[str, bytes]:
+def regenerate(run: Run, shard: int) -> Mapping[str, bytes]:
     """The files of a shard of random rows, computed again."""
     scenes, samples = rows_of(run, shard)
     return encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
@@ -142,17 +142,17 @@ def try_all(
         if number % mend_every:
             undo()
             continue
-        campaign.mended[damage.kind] += 1
-        mended = mend_at(scratch)
-        if mended.changed:
-            campaign.not_restored.append(f"{name}: also touched {mended.changed[:3]}")
+        campaign.repaired[damage.kind] += 1
+        repaired = mend_at(scratch)
+        if repaired.changed:
+            campaign.not_restored.append(f"{name}: also touched {repaired.changed[:3]}")
         there = {key: (scratch / key).read_bytes() for key in keys_of(scratch)}
         # What has no second source may be left as it is, or be written anew from what is known.
         apart = {key for key in whole.keys() | there.keys() if whole.get(key) != there.get(key)}
         alone = damage.key.startswith(_ALONE)
         if apart - ({damage.key} if alone else set()):
             campaign.not_restored.append(f"{name}: {sorted(apart)[:3]}")
-        if not alone and ((left := findings_at(scratch)) or mended.left):
+        if not alone and ((left := findings_at(scratch)) or repaired.left):
             campaign.not_clean.append(f"{name}: {left[:2]}")
         if apart:
             shutil.rmtree(scratch)
@@ -199,12 +199,12 @@ def _overwrite(path: Path, data: bytes) -> None:
 
 def findings_at(folder: Path) -> list[Finding]:
     """What checks find at a place."""
-    return list(check_place(open_storage(folder, probe=False, create=False), Checked()))
+    return list(check_runs(open_storage(folder, probe=False, create=False), Checked()))
 
 
-def mend_at(folder: Path) -> Mended:
+def mend_at(folder: Path) -> Repaired:
     """Mend a place of random rows."""
-    return mend_place(open_storage(folder, probe=False, create=False), remake)
+    return repair_runs(open_storage(folder, probe=False, create=False), regenerate)
 
 
 def _flipped(data: bytes, bit: int) -> bytes:

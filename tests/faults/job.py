@@ -10,15 +10,16 @@ import sys
 import time
 from dataclasses import dataclass
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter, notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.stop import StopRequest, stop_on_signals
-from datagen.cluster.task import Product
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest, stop_on_signals
+from datagen.cluster.task import AttemptResult
 from datagen.schemas.progress import Progress
 from datagen.schemas.run import Run
 from tests.made_runs import write
@@ -36,13 +37,13 @@ class RandomRows:
     notes: str
 
 
-def make_rows(task: RandomRows, meter: Meter) -> Product:
+def make_rows(task: RandomRows, meter: Meter) -> AttemptResult:
     """Write and commit the shard."""
     run = Run.open(task.run)
     run.ledger.start(task.attempt, task.shard)
     time.sleep(task.seconds)
     commit = write(run, task.shard, task.attempt).model_copy(update={"cost": meter.cost()})
-    return Product(run.commit(commit), commit.samples, commit.positives, commit.cost)
+    return AttemptResult(run.commit(commit), commit.samples, commit.positives, commit.cost)
 
 
 def main() -> int:
@@ -57,16 +58,16 @@ def main() -> int:
         Progress(as_json=True) as shown,
     ):
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             return RandomRows(place, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
         events = JobProgress(shown, run.layout.samples_per_shard)
-        summary = drive(missing, make_task, executor, RunBooks(run), Policy(), events, stop)
+        summary = drive(missing, make_task, executor, RunRecorder(run), RetryPolicy(), events, stop)
     said = {
         "end": summary.end,
         "cause": summary.cause,
         "closed": close_lost_attempts(run),
-        "outcomes": summary.tally.outcomes,
+        "outcomes": summary.totals.outcomes,
     }
     print(json.dumps(said))
     return summary.exit_code

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
-from datagen.cluster.guard import Meter, guarded, obituary, read_note
-from datagen.cluster.task import AttemptReport, Product, Task
+from datagen.cluster.attempt_guard import Meter, guarded
+from datagen.cluster.post_mortem import failure_report, read_note
+from datagen.cluster.task import AttemptReport, AttemptResult, Task
 
 T = TypeVar("T", bound=Task)
 # Forked from a driver that has one thread and has loaded everything: a new worker takes milliseconds. (A
@@ -31,7 +32,7 @@ class _Worker:
 class ProcessExecutor(Generic[T]):
     """`workers` processes that take tasks in turn; one that dies is replaced, and its attempt has crashed."""
 
-    def __init__(self, function: Callable[[T, Meter], Product], workers: int) -> None:
+    def __init__(self, function: Callable[[T, Meter], AttemptResult], workers: int) -> None:
         self._function, self.slots = function, workers
         self._queue: deque[T] = deque()
         self._ended: list[AttemptReport] = []
@@ -82,8 +83,8 @@ class ProcessExecutor(Generic[T]):
             worker.pipe.close()
             self._workers[self._workers.index(worker)] = self._new_worker()
             if task.attempt in self._killed:
-                return obituary(task, "cancelled", "ended by force")
-            return obituary(task, "crashed", "the worker process died")
+                return failure_report(task, "cancelled", "ended by force")
+            return failure_report(task, "crashed", "the worker process died")
 
     def has_begun(self, attempt: str) -> bool:
         return any(
@@ -93,7 +94,7 @@ class ProcessExecutor(Generic[T]):
     def kill(self, attempt: str) -> None:
         for task in [task for task in self._queue if task.attempt == attempt]:
             self._queue.remove(task)
-            self._ended.append(obituary(task, "cancelled", "ended by force"))
+            self._ended.append(failure_report(task, "cancelled", "ended by force"))
         for worker in self._workers:
             if worker.task is not None and worker.task.attempt == attempt:
                 self._killed.add(attempt)
@@ -107,7 +108,9 @@ class ProcessExecutor(Generic[T]):
             worker.process.join()
 
 
-def _work(function: Callable[[Any, Meter], Product], pipe: Connection, inherited: list[Connection]) -> None:
+def _work(
+    function: Callable[[Any, Meter], AttemptResult], pipe: Connection, inherited: list[Connection]
+) -> None:
     """A worker's life: until its driver closes the pipe, or is gone."""
     for other in inherited:
         other.close()

@@ -11,13 +11,13 @@ import zarr
 from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import Meter
-from datagen.cluster.inprocess import InProcessExecutor
-from datagen.cluster.policy import Policy
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.task import Product
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
+from datagen.cluster.task import AttemptResult
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_copy_key, shard_folder
 from datagen.schemas.run import Run
@@ -44,14 +44,14 @@ class Rows:
     notes: str = ""
 
 
-def make_rows(task: Rows, meter: Meter) -> Product:
+def make_rows(task: Rows, meter: Meter) -> AttemptResult:
     """Write and commit the shard; a line in the file for each execution that the ledger knows of."""
     run = Run.open(task.run)
     run.ledger.start(task.attempt, task.shard)
     with Path(task.executions).open("a") as f:
         f.write(f"{task.attempt}\n")
     commit = write(run, task.shard, task.attempt).model_copy(update={"cost": meter.cost()})
-    return Product(run.commit(commit), commit.samples, commit.positives, commit.cost)
+    return AttemptResult(run.commit(commit), commit.samples, commit.positives, commit.cost)
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,11 @@ def _job(address: str, shards: int, executions: str) -> Run:
     manifest = manifest_of(small_spec(), LAYOUT)
     run = Run.create_or_open(open_storage(address), manifest, shards * LAYOUT.samples_per_shard)
 
-    def make_task(order: Order) -> Rows:
+    def make_task(order: AttemptOrder) -> Rows:
         return Rows(address, executions, order.shard, order.attempt, order.deadline_s)
 
-    policy, executor = Policy(), InProcessExecutor(make_rows)
-    drive(run.missing(), make_task, executor, RunBooks(run), policy, Heard(), StopRequest())
+    policy, executor = RetryPolicy(), InProcessExecutor(make_rows)
+    drive(run.missing(), make_task, executor, RunRecorder(run), policy, Heard(), StopRequest())
     close_lost_attempts(run)
     return run
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.cluster.guard import Meter
-from datagen.cluster.task import JobCannotGoOn, Product
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.task import AttemptResult, JobCannotContinue
 from datagen.schemas.fields import sized_schema
 from datagen.schemas.run_records import Layout
 from tests.made_runs import small_spec, tables_of
@@ -32,7 +32,7 @@ class ScriptedTask:
     tries: str = ""  # folder that counts attempts, one file each; "" is beside the notes
 
 
-def perform(task: ScriptedTask, meter: Meter) -> Product:
+def perform(task: ScriptedTask, meter: Meter) -> AttemptResult:
     """The task function. Attempts are counted by files."""
     tries = Path(task.tries) if task.tries else Path(task.notes).parent / "tries"
     tries.mkdir(exist_ok=True)
@@ -40,7 +40,7 @@ def perform(task: ScriptedTask, meter: Meter) -> Product:
     (tries / f"{task.shard}-{n}-{os.getpid()}").touch()
     word = task.words[n] if n < len(task.words) else "commit"
     misbehave(word)
-    return Product(word != "superseded", labels=10, positives=4, cost=meter.cost())
+    return AttemptResult(word != "superseded", labels=10, positives=4, cost=meter.cost())
 
 
 def misbehave(word: str) -> None:
@@ -76,7 +76,7 @@ def misbehave(word: str) -> None:
     elif word in ("not_finite", "one_row_less"):
         hand_over_bad_rows(word)
     elif word == "disk":
-        raise JobCannotGoOn(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
+        raise JobCannotContinue(f"RUN: {os.strerror(errno.ENOSPC)}. Free disk space")
     elif word == "grow":
         GROWN.append(bytearray(os.urandom(1) * (300 << 20)))
 

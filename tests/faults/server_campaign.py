@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import psutil
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary, JobTotals
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
-from datagen.reports.accounts import account_for
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
+from datagen.reports.spending import account_for
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from tests.cluster.simulated import Heard
@@ -26,7 +26,7 @@ from tests.made_runs import check_digests, make_run
 from tests.small_runs import arrays_of, assert_equal_runs
 
 SAMPLES_PER_SHARD = 10
-POLICY = Policy(backoff_s=0.05)
+POLICY = RetryPolicy(backoff_s=0.05)
 
 
 def kill_server(ray: Any, kind: str) -> bool:
@@ -38,16 +38,16 @@ def kill_server(ray: Any, kind: str) -> bool:
     return True
 
 
-def one_job(run: Run, seconds: float, on_tick: Callable[[Any, Tally], None]) -> JobSummary:
-    """Make the missing shards on a local cluster of two slots; `on_tick` is given Ray and the tally."""
+def one_job(run: Run, seconds: float, on_tick: Callable[[Any, JobTotals], None]) -> JobSummary:
+    """Make the missing shards on a local cluster of two slots; `on_tick` is given Ray and the totals."""
     with notes_of_a_job() as notes, ray_executor(make_rows, RaySettings(workers=2)) as executor:
         import ray
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             return RandomRows(run.storage.url, seconds, order.shard, order.attempt, order.deadline_s, notes)
 
-        heard = Heard(on_tick=lambda tally: on_tick(ray, tally))
-        summary = drive(run.missing(), make_task, executor, RunBooks(run), POLICY, heard, StopRequest())
+        heard = Heard(on_tick=lambda totals: on_tick(ray, totals))
+        summary = drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, heard, StopRequest())
     close_lost_attempts(run)
     return summary
 
@@ -63,9 +63,9 @@ def kill_servers(
     killed = aborted = 0
     due = rng.integers(shards // 2)  # the next kill comes when more shards are committed
 
-    def on_tick(ray: Any, tally: Tally) -> None:
+    def on_tick(ray: Any, totals: JobTotals) -> None:
         nonlocal killed, due
-        if killed < kills and tally.in_flight and len(run.committed()) > due and kill_server(ray, kind):
+        if killed < kills and totals.in_flight and len(run.committed()) > due and kill_server(ray, kind):
             killed, due = killed + 1, len(run.committed()) + rng.integers(shards // 2)
 
     while run.missing() or killed < kills:
@@ -97,7 +97,7 @@ def check_bytes_and_ledger(run: Run) -> int:
     winners = {end.attempt for end in ends if end.outcome == "committed"}
     assert winners == {commit.attempt for commit in commits}
     assert {end.outcome for end in ends} <= {"committed", "lost", "superseded"}
-    books = account_for([run])
-    waste = sum(account.attempts for account in books.waste.values())
-    assert books.useful.attempts == len(commits) and len(commits) + waste == len(ends)
+    recorder = account_for([run])
+    waste = sum(account.attempts for account in recorder.waste.values())
+    assert recorder.useful.attempts == len(commits) and len(commits) + waste == len(ends)
     return waste

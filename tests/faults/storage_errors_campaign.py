@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen import cli
-from datagen.cluster.books import close_lost_attempts
+from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.run import Run

@@ -18,7 +18,7 @@ from datagen.schemas.run_records import LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal
 from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import copy_run, findings_at, mend_at
-from tests.made_runs import attempt, files_of, make_run, now, small_spec
+from tests.made_runs import attempt, files_of, make_run, small_spec, utc_now
 
 PLACES = ("run", "open", "merged")
 
@@ -67,7 +67,9 @@ def _run(folder: Path, n: int, seed: int, name: str) -> None:
         assert attempt(run, shard, f"{name}-{shard}")
     for k in range(2):
         run.ledger.start(f"{name}-failed-{k}", k)
-        ended = LedgerEntry(attempt=f"{name}-failed-{k}", shard=k, outcome="failed", cause=name, ended=now())
+        ended = LedgerEntry(
+            attempt=f"{name}-failed-{k}", shard=k, outcome="failed", cause=name, ended=utc_now()
+        )
         run.ledger.end(ended)
     given_up = QuarantineRecord(
         shard=900,
@@ -77,7 +79,7 @@ def _run(folder: Path, n: int, seed: int, name: str) -> None:
         attempts=(),
         causes=(name,),
         stacks=(),
-        created=now(),
+        created=utc_now(),
     )
     run.quarantine(given_up)
 

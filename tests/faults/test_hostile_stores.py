@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from datagen import cli
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.storage import open_storage
@@ -139,5 +139,5 @@ def test_looking_outside_would_have_been_noticed(name: str, run: Path) -> None:
 
 def test_findings_name_what_is_hostile(run: Path) -> None:
     odd_names(run)
-    keys = {f.key for f in check_place(open_storage(run, probe=False), Checked())}
+    keys = {f.key for f in check_runs(open_storage(run, probe=False), Checked())}
     assert any("owned" in key for key in keys)

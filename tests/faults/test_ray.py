@@ -11,17 +11,17 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary, JobTotals
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary, Tally
-from tests.cluster.simulated import Heard, PaperBooks
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.stop_request import StopRequest
+from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import ScriptedTask, perform
 
 SETTINGS = RaySettings(workers=2, attempts_per_worker=50, resident_limit_bytes=250 << 20)
-POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
+POLICY = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +39,14 @@ def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 @dataclass
 class Played:
     summary: JobSummary
-    books: PaperBooks
+    recorder: PaperRecorder
     folder: Path
 
     def ends(self, shard: int) -> list[str]:
-        return [e.outcome for e in self.books.entries if e.shard == shard]
+        return [e.outcome for e in self.recorder.entries if e.shard == shard]
 
     def entry(self, outcome: str) -> Any:
-        return next(e for e in self.books.entries if e.outcome == outcome)
+        return next(e for e in self.recorder.entries if e.outcome == outcome)
 
 
 def play(
@@ -54,14 +54,14 @@ def play(
     folder: Path,
     words: Mapping[int, tuple[str, ...]],
     shards: int = 6,
-    policy: Policy = POLICY,
+    policy: RetryPolicy = POLICY,
     deadline_s: float = 30.0,
-    on_tick: Callable[[Tally, StopRequest], None] = lambda tally, stop: None,
+    on_tick: Callable[[JobTotals, StopRequest], None] = lambda totals, stop: None,
 ) -> Played:
     notes = folder / "notes"
     notes.mkdir()
 
-    def make_task(order: Order) -> ScriptedTask:
+    def make_task(order: AttemptOrder) -> ScriptedTask:
         return ScriptedTask(
             order.shard,
             order.attempt,
@@ -70,12 +70,12 @@ def play(
             words.get(order.shard, ()),
         )
 
-    stop, books = StopRequest(), PaperBooks()
-    heard = Heard(on_tick=lambda tally: on_tick(tally, stop))
+    stop, recorder = StopRequest(), PaperRecorder()
+    heard = Heard(on_tick=lambda totals: on_tick(totals, stop))
     executor = RayExecutor(perform, SETTINGS, ray)
-    summary = drive(range(shards), make_task, executor, books, policy, heard, stop)
+    summary = drive(range(shards), make_task, executor, recorder, policy, heard, stop)
     assert list(notes.iterdir()) == []  # neither notes nor stacks are left behind
-    return Played(summary, books, folder)
+    return Played(summary, recorder, folder)
 
 
 @dataclass(frozen=True)
@@ -120,59 +120,59 @@ def test_every_way_to_die_has_its_outcome_its_cause_its_stack_and_its_budget(
 ) -> None:
     words = {shard: fate.words for shard, fate in enumerate(FATES.values())}
     played = play(ray, tmp_path, words, shards=len(FATES) + 4)
-    assert played.summary.tally.committed == 4 + sum(not fate.given_up for fate in FATES.values())
+    assert played.summary.totals.committed == 4 + sum(not fate.given_up for fate in FATES.values())
     for shard, (name, fate) in enumerate(FATES.items()):
-        first = next(e for e in played.books.entries if e.shard == shard)
+        first = next(e for e in played.recorder.entries if e.shard == shard)
         assert played.ends(shard) == fate.outcomes, name
         assert re.match(fate.cause, first.cause), f"{name}: {first.cause}"
         assert fate.stack in first.stack and bool(first.stack) >= bool(fate.stack), name
         assert first.host is not None and first.host.pid > 0 and first.cost.wall_s >= 0, name
-        assert (shard in played.books.given_up) == fate.given_up, name
+        assert (shard in played.recorder.given_up) == fate.given_up, name
     committed = played.entry("committed")
     assert committed.cost.peak_rss_bytes > 10 << 20 and committed.started <= committed.ended
 
 
 def test_hangs_end_at_their_deadline_with_the_stack(ray: Any, tmp_path: Path) -> None:
     played = play(ray, tmp_path, {0: ("hang",), 1: ("hang_with_lock",)}, shards=4, deadline_s=5.0)
-    assert played.summary.tally.committed == 4
+    assert played.summary.totals.committed == 4
     for shard in (0, 1):
         assert played.ends(shard) == ["hung", "committed"]
-        entry = next(e for e in played.books.entries if e.shard == shard)
+        entry = next(e for e in played.recorder.entries if e.shard == shard)
         assert "deadline of 5 s" in entry.cause and "misbehave" in entry.stack
         assert entry.cost is not None and entry.cost.wall_s >= 5.0
 
 
 def test_a_process_that_cannot_end_itself_is_ended_by_the_driver(ray: Any, tmp_path: Path) -> None:
-    policy = Policy(max_quarantined_share=1.0, initial_deadline_s=5.0, grace_s=0.5, backoff_s=0.05)
+    policy = RetryPolicy(max_quarantined_share=1.0, initial_deadline_s=5.0, grace_s=0.5, backoff_s=0.05)
     played = play(ray, tmp_path, {1: ("stop",)}, shards=3, policy=policy)
-    assert played.summary.tally.committed == 3 and played.ends(1) == ["hung", "committed"]
+    assert played.summary.totals.committed == 3 and played.ends(1) == ["hung", "committed"]
     assert "ended by the driver" in played.entry("hung").cause
 
 
 def test_a_shard_that_always_crashes_is_given_up_with_its_stacks(ray: Any, tmp_path: Path) -> None:
     played = play(ray, tmp_path, {1: ("segfault",) * 3}, shards=3)
-    trouble = played.books.given_up[1]
-    assert played.summary.tally.committed == 2 and len(trouble.stacks) == 3
+    trouble = played.recorder.given_up[1]
+    assert played.summary.totals.committed == 2 and len(trouble.stacks) == 3
     assert all("Segmentation fault" in stack for stack in trouble.stacks)
 
 
 def test_a_full_disk_ends_the_job(ray: Any, tmp_path: Path) -> None:
     played = play(ray, tmp_path, dict.fromkeys(range(0, 400, 5), ("disk",)), shards=400)
-    assert played.summary.end == "aborted" and played.summary.tally.committed < 50
+    assert played.summary.end == "aborted" and played.summary.totals.committed < 50
     assert played.summary.cause == "RUN: No space left on device. Free disk space"
 
 
 def test_a_forced_stop_ends_hung_workers_and_frees_their_slots(ray: Any, tmp_path: Path) -> None:
-    def stop_when_running(tally: Tally, stop: StopRequest) -> None:
+    def stop_when_running(totals: JobTotals, stop: StopRequest) -> None:
         if len(list((tmp_path / "notes").glob("*.stack"))) == 2:
             stop.ask()
             stop.ask()
 
     words = dict.fromkeys(range(6), ("hang_with_lock",))
     played = play(ray, tmp_path, words, shards=6, on_tick=stop_when_running)
-    assert played.summary.end == "interrupted" and played.summary.tally.outcomes == {"cancelled": 4}
+    assert played.summary.end == "interrupted" and played.summary.totals.outcomes == {"cancelled": 4}
     (tmp_path / "after").mkdir()
-    assert play(ray, tmp_path / "after", {}, shards=6).summary.tally.committed == 6
+    assert play(ray, tmp_path / "after", {}, shards=6).summary.totals.committed == 6
 
 
 def test_a_worker_that_grew_too_large_makes_way_for_a_fresh_one(ray: Any, tmp_path: Path) -> None:
@@ -180,13 +180,13 @@ def test_a_worker_that_grew_too_large_makes_way_for_a_fresh_one(ray: Any, tmp_pa
     # so that two slots need a fresh process for each attempt.
     attempts = 6
     played = play(ray, tmp_path, dict.fromkeys(range(attempts), ("grow",)), shards=attempts)
-    assert played.summary.tally.outcomes == {"committed": attempts}
+    assert played.summary.totals.outcomes == {"committed": attempts}
     pids = [path.name.split("-")[2] for path in (tmp_path / "tries").iterdir()]
     assert len(pids) == len(set(pids)) == attempts
 
 
 def test_a_worker_that_stays_small_is_used_again(ray: Any, tmp_path: Path) -> None:
     attempts = 20
-    assert play(ray, tmp_path, {}, shards=attempts).summary.tally.committed == attempts
+    assert play(ray, tmp_path, {}, shards=attempts).summary.totals.committed == attempts
     pids = [path.name.split("-")[2] for path in (tmp_path / "tries").iterdir()]
     assert len(set(pids)) < len(pids) == attempts

@@ -8,13 +8,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
-from tests.cluster.simulated import Heard, PaperBooks
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.stop_request import StopRequest
+from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 
 
@@ -33,19 +33,19 @@ def test_who_fills_the_memory_is_ended_and_tried_once_more(
     monkeypatch.setenv("RAY_memory_usage_threshold", f"{threshold:.4f}")
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
     (tmp_path / "tries").mkdir()
-    settings, books = RaySettings(workers=1), PaperBooks()
+    settings, recorder = RaySettings(workers=1), PaperRecorder()
     with notes_of_a_job() as notes, ray_cluster(settings) as ray:
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             tries = str(tmp_path / "tries")
             return ScriptedTask(0, order.attempt, 200, notes, ("fill_memory",), tries)
 
-        policy = Policy(max_quarantined_share=1.0, backoff_s=0.05)
+        policy = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05)
         summary = drive(
-            [0], make_task, RayExecutor(perform, settings, ray), books, policy, Heard(), StopRequest()
+            [0], make_task, RayExecutor(perform, settings, ray), recorder, policy, Heard(), StopRequest()
         )
-    assert summary.tally.committed == 1 and summary.tally.retries == 1
-    ended, committed = books.entries
+    assert summary.totals.committed == 1 and summary.totals.retries == 1
+    ended, committed = recorder.entries
     assert (ended.outcome, committed.outcome) == ("out_of_memory", "committed")
     assert "memory" in ended.cause and ended.host is not None and ended.host.pid != os.getpid()
     assert ended.cost is not None and ended.cost.wall_s > 0

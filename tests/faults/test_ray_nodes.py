@@ -9,26 +9,26 @@ from typing import Any
 
 import pytest
 
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.fitness import refuse_unfit_machines
-from datagen.cluster.guard import notes_of_a_job
-from datagen.cluster.policy import Policy
+from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.post_mortem import notes_of_a_job
+from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.ray_cluster import RaySettings, forget_former_token, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, head_environment, new_token
-from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import Tally
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from tests.cluster.simulated import Heard, PaperBooks
+from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.job import RandomRows, make_rows
 from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import check_digests, make_run
 from tests.small_runs import make_small_run
 
-POLICY = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
+POLICY = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 
 
 @dataclass
@@ -78,22 +78,22 @@ def test_deaths_on_another_machine_leave_their_stacks_in_the_ledger(
 ) -> None:
     words = {0: ("segfault",), 1: ("hang_with_lock",), 2: ("stop",), 3: ("silent_exit",), 4: ("raise",)}
     (tmp_path / "tries").mkdir()
-    executor, books = RayExecutor(perform, machines.settings, machines.ray), PaperBooks()
+    executor, recorder = RayExecutor(perform, machines.settings, machines.ray), PaperRecorder()
     with notes_of_a_job() as notes:
 
-        def make_task(order: Order) -> ScriptedTask:
+        def make_task(order: AttemptOrder) -> ScriptedTask:
             script = words.get(order.shard, ())
             # A stopped process has no clock; the driver's own deadline comes for it.
             return ScriptedTask(order.shard, order.attempt, 5.0, notes, script, str(tmp_path / "tries"))
 
-        policy = Policy(
+        policy = RetryPolicy(
             max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=15, grace_s=0.5, kill_s=60
         )
-        summary = drive(range(8), make_task, executor, books, policy, Heard(), StopRequest())
+        summary = drive(range(8), make_task, executor, recorder, policy, Heard(), StopRequest())
         left = [str(p) for p in machines.folder.rglob("*.stack")]
         executor.close()
-    assert summary.tally.committed == 8
-    ends = {s: [e for e in books.entries if e.shard == s] for s in words}
+    assert summary.totals.committed == 8
+    ends = {s: [e for e in recorder.entries if e.shard == s] for s in words}
     assert {s: [e.outcome for e in of] for s, of in ends.items()} == {
         0: ["crashed", "committed"],
         1: ["hung", "committed"],
@@ -136,17 +136,17 @@ def test_a_machine_that_goes_takes_nothing_with_it(machines: Machines, tmp_path:
         def second_is_at_work() -> bool:
             return any((machines.folder / "second" / "tmp" / notes).glob("*.stack"))
 
-        def kill_the_second(tally: Tally) -> None:
-            if not gone and tally.committed >= 2 and second_is_at_work():
+        def kill_the_second(totals: JobTotals) -> None:
+            if not gone and totals.committed >= 2 and second_is_at_work():
                 gone.append("second")
                 slots.remove_node(machines.second, allow_graceful=False)
 
-        def make_task(order: Order) -> RandomRows:
+        def make_task(order: AttemptOrder) -> RandomRows:
             # Long enough that the machine is gone before what it is at is done.
             return RandomRows(run.storage.url, 4.0, order.shard, order.attempt, order.deadline_s, notes)
 
         heard = Heard(on_tick=kill_the_second)
-        summary = drive(run.missing(), make_task, executor, RunBooks(run), POLICY, heard, StopRequest())
+        summary = drive(run.missing(), make_task, executor, RunRecorder(run), POLICY, heard, StopRequest())
         executor.close()
     assert gone and summary.end == "complete" and run.committed() == set(range(8))
     assert close_lost_attempts(run) == 0

@@ -11,7 +11,7 @@ import pytest
 from datagen import cli
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_copy_key, commit_key
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Plan

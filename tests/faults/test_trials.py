@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.cluster.books import RunBooks, close_lost_attempts
-from datagen.cluster.driver import Order, drive
-from datagen.cluster.policy import Policy
+from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
-from datagen.cluster.stop import StopRequest
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
+from datagen.cluster.stop_request import StopRequest
 from datagen.schemas.run import Run
 from tests.cluster.simulated import Heard
 from tests.faults.trials import FaultyTrials, attempt_with_faults
@@ -79,7 +79,7 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
     sources = run.manifest.sources
     ordered: set[int] = set()
 
-    def make_task(order: Order) -> FaultyTrials:
+    def make_task(order: AttemptOrder) -> FaultyTrials:
         is_first, words = order.shard not in ordered, WORDS.get(order.shard, ())
         ordered.add(order.shard)
         return FaultyTrials(
@@ -97,10 +97,10 @@ def test_a_trial_that_kills_its_worker_costs_one_attempt_and_a_resumed_run_is_th
         )
 
     settings = RaySettings(workers=2)
-    policy = Policy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=PATIENCE_S)
+    policy = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=PATIENCE_S)
     with ray_cluster(settings) as ray:
         executor = RayExecutor(attempt_with_faults, settings, ray)
-        summary = drive(run.missing(), make_task, executor, RunBooks(run), policy, Heard(), StopRequest())
+        summary = drive(run.missing(), make_task, executor, RunRecorder(run), policy, Heard(), StopRequest())
     assert summary.end == "complete" and not close_lost_attempts(run)
 
     ends = {shard: [e.outcome for e in run.ledger.ends() if e.shard == shard] for shard in range(SHARDS)}

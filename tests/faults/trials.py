@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import datagen.workers.labels.trials as label_trials
+import datagen.workers.labels.arm_labelling as label_trials
 from datagen.cluster.attempt import run_attempt
-from datagen.cluster.guard import Meter
-from datagen.cluster.task import Product, ShardTask
+from datagen.cluster.attempt_guard import Meter
+from datagen.cluster.task import AttemptResult, ShardTask
 from tests.faults.scripted import misbehave
 
 
@@ -20,7 +20,7 @@ class FaultyTrials(ShardTask):
     words: tuple[str, ...] = ()
 
 
-def attempt_with_faults(task: FaultyTrials, meter: Meter) -> Product:
+def attempt_with_faults(task: FaultyTrials, meter: Meter) -> AttemptResult:
     """The task function. Attempts are counted by files beside the notes."""
     tries = Path(task.notes).parent / "tries"
     tries.mkdir(exist_ok=True)

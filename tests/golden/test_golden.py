@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.remaking.deep import deep_findings
-from datagen.remaking.scenes import what_differs_here
-from datagen.remaking.shards import open_origin
+from datagen.regeneration.deep_check import deep_findings
+from datagen.regeneration.scenes import what_differs_here
+from datagen.regeneration.shards import open_sources
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION
 from datagen.schemas.scene_rows import read_scene
@@ -127,7 +127,7 @@ def test_its_rows_still_follow_from_its_specification(golden: Golden) -> None:
     if not golden.has_its_world:
         pytest.skip("the built-in world is another one since: docs/relabel-and-replay.md")
     for run in open_runs(golden.merged):
-        origin = open_origin(run, needs_scenes=False)
+        origin = open_sources(run, needs_scenes=False)
         assert list(deep_findings(run, 6, origin, np.random.default_rng(0))) == []
 
 

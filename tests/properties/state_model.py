@@ -19,7 +19,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.shard_files import encode_shard
 from datagen.schemas.specification import HeuristicParams, Specification
-from datagen.workers.labels import heuristic, load_label_source
+from datagen.workers.labels import distance_visibility_score, load_label_source
 from tests.made_runs import small_spec, tables_of
 
 LAYOUT = Layout(scenes_per_shard=1, candidates_per_scene=2)
@@ -106,7 +106,7 @@ def expected_rows(sealed: dict[tuple[int, str], Part]) -> tuple[Any, Any]:
                 d, mount, reach, rho = (
                     rows[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility")
                 )
-                _, label = heuristic.heuristic(d, mount, reach, rho, RULES[key[1]])
+                _, label = distance_visibility_score.heuristic(d, mount, reach, rho, RULES[key[1]])
             # Only the end of the store is cut: that of the last run with rows.
             kept = min(part.n - shard * PER_SHARD, PER_SHARD) if key == with_rows[-1] else PER_SHARD
             ids.append(sample_ids(hash_of(*key), shard, np.arange(PER_SHARD))[:kept])
@@ -126,6 +126,8 @@ def files_of_shard(run: Run, shard: int) -> dict[str, bytes]:
     scenes, samples = tables_of(run.schema, LAYOUT, spec.seed, shard, run.manifest.spec_hash)
     if spec.scenes_from is not None:
         distances = (samples[k] for k in ("distance_m", "mount_distance_m", "arm_reach_m", "visibility"))
-        samples["heuristic_score"], samples["label"] = heuristic.heuristic(*distances, spec.heuristic)
-        samples["label_version"][:] = heuristic.VERSION
+        samples["heuristic_score"], samples["label"] = distance_visibility_score.heuristic(
+            *distances, spec.heuristic
+        )
+        samples["label_version"][:] = distance_visibility_score.VERSION
     return encode_shard(run.schema, LAYOUT, run.manifest.spec_hash, scenes, samples)

@@ -17,13 +17,13 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from datagen.reports.accounts import Books, account_for
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.reports.spending import Spending, account_for
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import shard_folder
-from datagen.schemas.merged import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry, QuarantineRecord
 from datagen.schemas.scene_rows import read_shard
@@ -160,7 +160,7 @@ def workplace() -> Iterator[Path]:
 
 
 def merge(folder: Path, names: Sequence[str], out: str) -> Path:
-    carry_out(plan_merge([str(folder / name) for name in names], str(folder / out)))
+    merge_runs(plan_merge([str(folder / name) for name in names], str(folder / out)))
     return folder / out
 
 
@@ -192,9 +192,9 @@ def is_text(value: Any) -> bool:
     return isinstance(value, str) or value.dtype.kind == "O"
 
 
-def sums(books: Sequence[Books]) -> Counter[str]:
+def sums(spending: Sequence[Spending]) -> Counter[str]:
     total: Counter[str] = Counter()
-    for each in books:
+    for each in spending:
         for account in (each.useful, *each.waste.values()):
             total.update({"wall_s": account.wall_s, "cpu_s": account.cpu_s, "bytes": account.written_bytes})
             total.update({f"stage {name}": s for name, s in account.stage_wall_s.items()})
@@ -247,7 +247,7 @@ def assert_laws(folder: Path, made: Sequence[Source], order: Sequence[str]) -> N
     assert spent["bytes"] == paid["bytes"]
     for name in paid.keys() | spent.keys():
         assert spent[name] == pytest.approx(paid[name], abs=1e-6), name
-    assert list(check_place(open_storage(whole), Checked())) == []
+    assert list(check_runs(open_storage(whole), Checked())) == []
 
 
 def assert_linked(folder: Path, part: Run, shard: int) -> None:

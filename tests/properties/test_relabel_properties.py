@@ -13,11 +13,11 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from datagen import cli
+from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
 from datagen.relabelling.runs import relabel_all, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams
 from datagen.schemas.storage import open_storage
-from datagen.specifying.stored_scenes import open_stored_scenes, specify_again
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, make_small_run
 
 N = 2 * PER_SCENE

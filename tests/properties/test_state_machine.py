@@ -20,18 +20,18 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from datagen.cluster.books import close_lost_attempts
+from datagen.cluster.run_recorder import close_lost_attempts
 from datagen.relabelling.runs import relabel_all, relabelled_specification
-from datagen.schemas.checking.mending import mend_place
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.garbage import find_garbage, sweep
+from datagen.schemas.garbage_collection import find_garbage, sweep
 from datagen.schemas.keys import commit_key, shard_folder
-from datagen.schemas.merged import open_runs
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.record_files import now
+from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal
@@ -61,7 +61,7 @@ EXAMPLES, STEPS = 200, 50
 def findings(place: Place) -> list[Any]:
     """What `verify` calls damage."""
     storage = open_storage(place.folder, probe=False)
-    return [finding for finding in check_place(storage, Checked()) if finding.is_damage]
+    return [finding for finding in check_runs(storage, Checked()) if finding.is_damage]
 
 
 def close_all(place: Place) -> None:
@@ -172,7 +172,7 @@ class AnyHistory(RuleBasedStateMachine):
         assert run.quarantine(
             QuarantineRecord(
                 shard=shard, seed=key[0], first_scene=shard, scenes=1,
-                attempts=(), causes=("failed: a test",), stacks=("",), created=now(),
+                attempts=(), causes=("failed: a test",), stacks=("",), created=utc_now(),
             )
         )  # fmt: skip
         place.parts[key] = replace(part, quarantined=part.quarantined | {shard})
@@ -221,10 +221,10 @@ class AnyHistory(RuleBasedStateMachine):
         named = [str(place.folder) for place in places]
         if len({place.rule for place in places}) > 1:
             with pytest.raises(InputError):
-                carry_out(plan_merge(named, str(folder)))
+                merge_runs(plan_merge(named, str(folder)))
             assert not folder.exists() or not any(folder.iterdir())
             return
-        carry_out(plan_merge(named, str(folder)))
+        merge_runs(plan_merge(named, str(folder)))
         parts: dict[tuple[int, str], Part] = {}
         for place in places:
             for key, part in place.parts.items():
@@ -276,7 +276,7 @@ class AnyHistory(RuleBasedStateMachine):
         broken[bit // 8] ^= 1 << bit % 8
         run.storage.put(file, bytes(broken))  # a new file: what is linked elsewhere stays whole
         assert any(finding.key.endswith(entry.path) for finding in findings(place))
-        mended = mend_place(open_storage(place.folder, probe=False), files_of_shard)
+        mended = repair_runs(open_storage(place.folder, probe=False), files_of_shard)
         assert not [f for f in mended.left if f.is_damage]
         if mended.resealed:  # anew, over what is committed now
             place.sealed = dict(place.parts)

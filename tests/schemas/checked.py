@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
-from datagen.schemas.checking.place import Checked, check_place
 from datagen.schemas.record_files import signed_json
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost, LedgerEntry
@@ -18,7 +18,7 @@ from tests.made_runs import make_run
 
 def check(folder: Path) -> tuple[list[Finding], Checked]:
     checked = Checked()
-    return list(check_place(open_storage(folder, probe=False, create=False), checked)), checked
+    return list(check_runs(open_storage(folder, probe=False, create=False), checked)), checked
 
 
 def found(folder: Path) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.merging import carry_out, plan_merge
+from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal, unseal
 from datagen.schemas.storage import open_storage
@@ -133,6 +133,6 @@ def test_merged_shards_are_committed_when_they_last(size: int, disk: Disk, tmp_p
     make_run(tmp_path / "b", 10, size, shards=[])
     planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
     with disk.watched(tmp_path / "out", "000000.json") as lost:
-        carry_out(planned)
+        merge_runs(planned)
     assert lost == [{"commits"}] and disk.lost(tmp_path / "out") == set()
     assert list(Run.open(tmp_path / "out").missing()) == []

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from datagen import cli
-from datagen.remaking.deep import deep_findings
-from datagen.remaking.shards import open_origin
+from datagen.regeneration.deep_check import deep_findings
+from datagen.regeneration.shards import open_sources
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION, SCHEMAS, Field, sized_schema
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
 from datagen.train.reader import SampleReader
 from datagen.workers import run_shard
-from datagen.workers.labels import distance_visibility
+from datagen.workers.labels import heuristic_source
 from tests.made_runs import small_spec
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, arrays_of, assert_equal_runs, json_of, make_small_run
@@ -43,7 +43,7 @@ def learn_fields(patch: pytest.MonkeyPatch) -> None:
     patch.setitem(
         SCHEMAS, "heuristic", replace(before, version=NEWER, scene_fields=scene, sample_fields=sample)
     )
-    record, source = run_shard.scene_row, distance_visibility.HEURISTIC
+    record, source = run_shard.scene_row, heuristic_source.HEURISTIC
 
     def scene_row(scene: Any) -> dict[str, Any]:
         return {**record(scene), "n_bodies": len(scene.house.house.bodies)}
@@ -54,8 +54,8 @@ def learn_fields(patch: pytest.MonkeyPatch) -> None:
         return {**source.label(scene, candidates, spec, clock), "bearing_rad": bearing}
 
     patch.setattr(run_shard, "scene_row", scene_row)
-    patch.setattr("datagen.remaking.scenes.scene_row", scene_row)
-    patch.setattr(distance_visibility, "HEURISTIC", replace(source, label=label))
+    patch.setattr("datagen.regeneration.scenes.scene_row", scene_row)
+    patch.setattr(heuristic_source, "HEURISTIC", replace(source, label=label))
 
 
 def test_a_newer_program_writes_its_fields_and_an_older_one_refuses_that_run(
@@ -68,7 +68,7 @@ def test_a_newer_program_writes_its_fields_and_an_older_one_refuses_that_run(
         assert set(arrays) >= NEW and np.ptp(arrays["bearing_rad"]) > 0 and arrays["n_bodies"].min() > 0
         assert Run.open(run).manifest.schema_version == NEWER
         opened = Run.open(run)
-        assert list(deep_findings(opened, 3, open_origin(opened), np.random.default_rng(0))) == []
+        assert list(deep_findings(opened, 3, open_sources(opened), np.random.default_rng(0))) == []
     words = ("schema_version", f"{NEWER}, and this program knows", f"to {SCHEMA_VERSION}. Use the version")
     refused(["show", str(run), "--out", str(tmp_path / "scene.png")], capsys, *words)
     again = ["submit", "heuristic", "--n", str(2 * N), "--out", str(run), "--workers", "0"]
@@ -88,7 +88,7 @@ def test_an_older_run_goes_on_without_the_new_fields(
         assert_equal_runs(arrays_of(begun), arrays_of(whole))
         run = Run.open(begun)
         assert run.manifest.schema_version == SCHEMA_VERSION == run.schema.version
-        assert list(deep_findings(run, 4, open_origin(run), np.random.default_rng(0))) == []
+        assert list(deep_findings(run, 4, open_sources(run), np.random.default_rng(0))) == []
         assert json_of(capsys, ["status", str(begun)])["labels"] == 2 * N
         assert json_of(capsys, ["audit", str(begun)])
         assert cli.run(["show", str(begun), "--out", str(tmp_path / "scene.png")]) == 0

@@ -50,10 +50,10 @@ def test_a_job_is_dead_when_it_is_silent_and_its_process_is_gone(
     record = record_of(at, os.getpid() if isinstance(pid, str) else pid, host)
     jobs.begin(record)
     heard = at - timedelta(minutes=minutes)
-    jobs.tell(JobState(id=record.id, updated=heard.isoformat(), phase="making"))
+    jobs.put_state(JobState(id=record.id, updated=heard.isoformat(), phase="making"))
     (job,) = jobs.all()
     assert job.health(at) == health
-    jobs.tell(JobState(id=record.id, updated=heard.isoformat(), phase="ended", end="complete"))
+    jobs.put_state(JobState(id=record.id, updated=heard.isoformat(), phase="ended", end="complete"))
     (job,) = jobs.all()
     assert job.health(at) == "ended"
 

@@ -12,8 +12,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage, lineage_summary
-from datagen.schemas.merged import find_scene, open_runs, wanted
-from datagen.schemas.merging import Result, carry_out, plan_merge
+from datagen.schemas.merged_runs import find_scene, label_counts, open_runs
+from datagen.schemas.merging import MergeResult, merge_runs, plan_merge
 from datagen.schemas.merging.ledgers import GUESS_CAUSE, SPARE_CAUSE
 from datagen.schemas.record_files import read_record
 from datagen.schemas.run import Run
@@ -32,8 +32,8 @@ def few_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCHEMAS, "heuristic", small_schema())
 
 
-def merge(folder: Path | str, names: Sequence[str], out: str = "out") -> Result:
-    return carry_out(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
+def merge(folder: Path | str, names: Sequence[str], out: str = "out") -> MergeResult:
+    return merge_runs(plan_merge([f"{folder}/{name}" for name in names], f"{folder}/{out}"))
 
 
 def fill(folder: Path, shards: Sequence[int], who: str, n: int = 60, size: int = 2, seed: int = 0) -> Run:
@@ -72,7 +72,7 @@ def test_runs_of_several_specifications_become_a_place_of_parts(tmp_path: Path):
     runs = open_runs(tmp_path / "out")
     assert [run.manifest.spec_hash for run in runs] == sorted(small_spec(k).hash() for k in (0, 1))
     assert not (tmp_path / "out" / "manifest.json").exists()
-    found = wanted(runs)
+    found = label_counts(runs)
     assert (found.n, found.labels, found.missing) == (50, 40, 1)
     first = runs[0]
     assert find_scene(runs, 1) == (first, 1)
@@ -150,7 +150,7 @@ def test_a_merge_that_was_cut_short_is_finished_by_the_same_command(tmp_path: Pa
                 raise Killed
 
         with pytest.raises(Killed):
-            carry_out(plan_merge([f"{tmp_path}/{name}" for name in "abc"], f"{tmp_path}/{out}"), step)
+            merge_runs(plan_merge([f"{tmp_path}/{name}" for name in "abc"], f"{tmp_path}/{out}"), step)
         merge(tmp_path, "abc", out)
         assert files_of(tmp_path / out) == wanted_files, after
 
@@ -160,7 +160,7 @@ def test_a_merge_that_was_killed_while_it_named_its_parts_is_finished_by_the_sam
     fill(tmp_path, [0, 1], "b", seed=1)
     merge(tmp_path, "ab", "done")
     planned = plan_merge([f"{tmp_path}/a", f"{tmp_path}/b"], f"{tmp_path}/out")
-    carry_out(planned)
+    merge_runs(planned)
     # Its copy was there, and its draft half written.
     named = (tmp_path / "out" / MERGED).read_bytes()
     (tmp_path / "out" / MERGED).unlink()
@@ -313,7 +313,7 @@ def test_a_file_that_goes_while_it_is_linked_leaves_nothing_half_done(
     planned = plan_merge([source.storage.url], out)
     monkeypatch.setattr(Run, "check_files", and_then_it_goes)
     with pytest.raises(InputError, match=r"000001-a/label/c\.0: no such file"):
-        carry_out(planned)
+        merge_runs(planned)
     run = Run.open(out)
     assert run.committed() == {0} and list(run.storage.list("shards/000001")) == []
 
@@ -328,7 +328,7 @@ def test_merging_on_s3_gives_the_same_files(tmp_path: Path, bucket: str):
     for _ in range(2):
         merge(bucket, "abc")
     merge(bucket, "ab", "ab")
-    carry_out(plan_merge([f"{bucket}/{name}" for name in ("ab", "c")], str(tmp_path / "here")))
+    merge_runs(plan_merge([f"{bucket}/{name}" for name in ("ab", "c")], str(tmp_path / "here")))
     place = open_storage(f"{bucket}/out")
     there = {f.key: place.get(f.key, 2**30) for f in place.list("")}
     assert there.keys() >= {"merged.json", f"{part_folder(manifest.spec_hash)}/lineage.json"}
@@ -336,5 +336,5 @@ def test_merging_on_s3_gives_the_same_files(tmp_path: Path, bucket: str):
     assert {k: v for k, v in there.items() if not k.startswith("data.zarr")} == {
         k: v for k, v in here.items() if not k.startswith("data.zarr")
     }
-    assert wanted(open_runs(place)) == wanted(open_runs(tmp_path / "here"))
+    assert label_counts(open_runs(place)) == label_counts(open_runs(tmp_path / "here"))
     assert sealed_root(place) == sealed_root(open_storage(tmp_path / "here"))

@@ -16,7 +16,7 @@ import xarray
 import zarr
 
 from datagen.schemas import shard_files
-from datagen.schemas.checking.place import Checked, check_place
+from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import SEALED, seal
@@ -118,7 +118,7 @@ def test_runs_of_more_shards_than_a_store_can_name_are_refused(tmp_path: Path):
     told["attributes"] |= {"n": 10**12, "missing_shards": []}
     root.chmod(0o644)
     root.write_text(json.dumps(told))
-    findings = list(check_place(run.storage, Checked()))
+    findings = list(check_runs(run.storage, Checked()))
     assert [(f.key, f.kind) for f in findings] == [(f"{SEALED}/zarr.json", "sealed")]
     assert "holds 100000000000 shards" in findings[0].problem
 

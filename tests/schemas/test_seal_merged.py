@@ -10,7 +10,7 @@ import zarr
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.merged import open_runs
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged

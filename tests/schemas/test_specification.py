@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from datagen.configuration.specify import layout_of
 from datagen.schemas.fields import SCHEMAS, Field
 from datagen.schemas.specification import Source, Specification
-from datagen.specifying.specify import layout_of
 
 SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}
 SPEC = Specification.model_validate(SOURCES)

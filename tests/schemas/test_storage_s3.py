@@ -15,7 +15,7 @@ from obstore.exceptions import GenericError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.storage import Storage, open_storage
-from datagen.schemas.storage.errors import StoreFailure, store_trouble
+from datagen.schemas.storage.errors import StoreUnavailable, store_trouble
 from tests.s3_servers import Faults, environment, faulty_proxy
 
 Behind = Callable[[Faults], AbstractContextManager[Storage]]
@@ -190,7 +190,9 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
             lambda: s.put_many({"a": b"", "b": b""}),
         ):
             before = faults.seen["requests"]
-            with pytest.raises(StoreFailure, match=r"the store answers 50[03] .*Wait until the store") as e:
+            with pytest.raises(
+                StoreUnavailable, match=r"the store answers 50[03] .*Wait until the store"
+            ) as e:
                 verb()
             assert faults.seen["requests"] - before >= 2
             assert "\n" not in str(e.value) and "made up" not in str(e.value)
@@ -259,7 +261,7 @@ def told_of(port: int, problem: str, monkeypatch: pytest.MonkeyPatch, timeout_s:
     monkeypatch.setenv("DATAGEN_STORE_TIMEOUT_S", timeout_s)
     s = open_storage("s3://bucket/runs/a", probe=False)
     for verb in (lambda: s.put_new("commits/7", b"x"), lambda: list(s.list("commits"))):
-        with pytest.raises(StoreFailure) as e:
+        with pytest.raises(StoreUnavailable) as e:
             verb()
         told = str(e.value)
         assert problem in told and told.startswith("s3://bucket/runs/a/commits")

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import datagen.schemas.summaries
-from datagen.reports.accounts import Books, account_for
+from datagen.reports.spending import Spending, account_for
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import commit_key
 from datagen.schemas.record_files import encode_record, signed_json
@@ -66,25 +66,25 @@ def end(rng: random.Random, attempt: str, shard: int) -> LedgerEntry:
     )  # fmt: skip
 
 
-def from_records(run: Run) -> tuple[list[CommitSummary], list[EndSummary], Books]:
+def from_records(run: Run) -> tuple[list[CommitSummary], list[EndSummary], Spending]:
     """What the records alone say, each read by itself."""
     records = [Run.open(run.storage).commit_of(shard) for shard in sorted(run.committed())]
     commits = [CommitSummary(**{f: getattr(r, f) for f in CommitSummary.model_fields}) for r in records]
     ends = [EndSummary(**{f: getattr(r, f) for f in EndSummary.model_fields}) for r in run.ledger.ends()]
     files = {key: run.storage.get(key, 2**30) for key in index_files(run)}
     run.storage.delete(files)
-    books = account_for([run])
+    spending = account_for([run])
     for key, data in files.items():
         run.storage.put(key, data or b"")
-    return commits, ends, books
+    return commits, ends, spending
 
 
 def assert_equal(run: Run) -> None:
-    commits, ends, books = from_records(run)
+    commits, ends, spending = from_records(run)
     assert list(Summaries(run).commits()) == commits
     assert list(Summaries(run).ends()) == ends
     said = account_for([run])
-    assert said == books and said.useful.unnamed_wall_s == books.useful.unnamed_wall_s
+    assert said == spending and said.useful.unnamed_wall_s == spending.useful.unnamed_wall_s
 
 
 class History:

@@ -40,15 +40,15 @@ def test_a_sound_run_has_no_findings_and_its_numbers_are_told(sealed: Run):
     assert findings == []
     assert (checked.shards, checked.samples, checked.is_sealed) == (2, 20, True)
     assert checked.files == sum(len(c.files) for c in sealed.commits())
-    books = checked.books
-    assert (books.attempts, books.committed_wall_s, books.wasted_wall_s) == (3, 2.0, 2.0)
+    totals = checked.totals
+    assert (totals.attempts, totals.committed_wall_s, totals.wasted_wall_s) == (3, 2.0, 2.0)
 
 
 def test_unfinished_unsealed_and_empty_runs_are_sound(tmp_path: Path):
     run = make_run(tmp_path / "a", 50, shards=[0, 3])
     run.ledger.start("runs-now", 1)
     assert found(tmp_path / "a") == []
-    assert check(tmp_path / "a")[1].books.unfinished == 1
+    assert check(tmp_path / "a")[1].totals.unfinished == 1
     make_run(tmp_path / "b", 50, shards=[])
     assert found(tmp_path / "b") == []
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from datagen.schemas.whole_files import whole_file
-from datagen.workers.content_cache import Arrays, Shelf, alone_in, drop_unused, read_arrays, refresh
+from datagen.workers.content_cache import Arrays, CacheFolder, alone_in, drop_unused, read_arrays, refresh
 from tests.other_user import as_another_user, needs_root
 
-SHELF = Shelf(
+SHELF = CacheFolder(
     "things",
     {"points": (np.float32, ("n", 3)), "weights": (np.float64, ("n",)), "name": (np.str_, ())},
     most_files=3,

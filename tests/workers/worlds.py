@@ -8,9 +8,9 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh
 from datagen.workers.geometry.transforms import look_at, translation
-from datagen.workers.houses.house import Body, BodyKind, House, Room, Surface
+from datagen.workers.houses.house import BodyKind, House, Room, StaticBody, Surface
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.frame import Camera, Stage
+from datagen.workers.rendering.frame import Camera, SceneGeometry
 
 Vec3 = tuple[float, float, float]
 Colour = tuple[int, int, int]
@@ -51,11 +51,11 @@ def box_body(
     size_m: Vec3,
     centre_m: Vec3,
     rgb: Colour = (200, 200, 190),
-) -> Body:
+) -> StaticBody:
     """A static box, world frame."""
     room = "" if kind == "wall" else "room|1"
     mesh = box_mesh(size_m, centre_m, rgb)
-    return Body(body_id, kind, object_type, "", room, mesh, (box_vertices(size_m, centre_m),))
+    return StaticBody(body_id, kind, object_type, "", room, mesh, (box_vertices(size_m, centre_m),))
 
 
 def model_of(name: str, mesh: Mesh, parts_m: Sequence[F32], mass_kg: float) -> ObjectModel:
@@ -113,7 +113,7 @@ def ball_model(name: str, radius_m: float, mass_kg: float = 0.1, rgb: Colour = (
     return model_of(name, coloured(vertices, faces, rgb), [np.unique(vertices, axis=0)], mass_kg)
 
 
-def table_house(furniture: Sequence[Body] = ()) -> House:
+def table_house(furniture: Sequence[StaticBody] = ()) -> House:
     """One walled room without ceiling; a table with four legs stands in its middle.
 
     The floor's top is z = 0; `furniture` is added to what stands in the room.
@@ -129,7 +129,7 @@ def table_house(furniture: Sequence[Body] = ()) -> House:
     slab = box_vertices((tw, td, top), (x, y, TABLE_TOP_M - top / 2))
     parts = (slab, *legs)
     faces = np.concatenate([_BOX_FACES + 8 * k for k in range(len(parts))]).astype(np.int32)
-    table = Body(
+    table = StaticBody(
         "table|1", "furniture", "DiningTable", "Table_1", "room|1",
         coloured(np.concatenate(parts), faces, (150, 100, 60)), parts,
     )  # fmt: skip
@@ -160,11 +160,11 @@ def on_table(model: ObjectModel, dx_m: float = 0.0, dy_m: float = 0.0, lift_m: f
 
 def stage_with(
     objects: Sequence[ObjectModel], offsets_m: Sequence[tuple[float, float]], house: House | None = None
-) -> Stage:
+) -> SceneGeometry:
     """Objects upright on the table of `table_house`, each off its middle by its (dx, dy)."""
     poses = [on_table(model, dx, dy) for model, (dx, dy) in zip(objects, offsets_m, strict=True)]
     T = np.stack(poses) if poses else np.zeros((0, 4, 4))
-    return Stage(table_house() if house is None else house, tuple(objects), T)
+    return SceneGeometry(table_house() if house is None else house, tuple(objects), T)
 
 
 def camera_at(

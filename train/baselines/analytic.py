@@ -10,14 +10,14 @@ import numpy as np
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines.baseline import F64, Unfitted, mount_m, observed_rho, planar_distance_m, reach_m
 from datagen.train.inputs import Array, Batch, is_clear
-from datagen.workers.labels.heuristic import heuristic
+from datagen.workers.labels.distance_visibility_score import heuristic
 
 _PAPER = HeuristicParams()
 
 
 @dataclass(frozen=True)
 class Analytic(Unfitted):
-    """Score H (workers/labels/heuristic.py), good from tau on.
+    """Score H (workers/labels/distance_visibility_score.py), good from tau on.
 
     `params` are those of a specification, by default the paper's with ours where it states none;
     `datagen calibrate` fits better ones. Where the base does not fit the score is H - 10.

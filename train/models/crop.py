@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datagen.train.inputs import Clouds, Robots
+from datagen.train.inputs import Clouds, RobotInputs
 from datagen.train.models.grouping import first_true
 
 # The colour that marks the target (GBPP, arXiv 2509.11594), of 255.
@@ -41,7 +41,7 @@ class Crop:
         )
 
 
-def crop_clouds(clouds: Clouds[Tensor], robots: Robots[Tensor], n_points: int) -> Crop:
+def crop_clouds(clouds: Clouds[Tensor], robots: RobotInputs[Tensor], n_points: int) -> Crop:
     """The first `n_points` stored points of each robot's cloud within `arm_reach_m` of the target, in 3D.
 
     Stored order: the head of a cloud is in farthest-point order, so that what is taken covers it.

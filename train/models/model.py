@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor, nn
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 
 ConfigT = TypeVar("ConfigT", bound="ModelConfig")
 
@@ -37,13 +37,15 @@ class Model(nn.Module, ABC):
         super().__init__()
         self.config: dict[str, Any] = config.model_dump(mode="json")
 
-    def score(self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]) -> Tensor:
+    def score(
+        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
+    ) -> Tensor:
         """Logits (N, 2), float32; column 1 is "good". All tensors on the model's device."""
         return self(clouds, candidates, robots)
 
     @abstractmethod
     def forward(
-        self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) go through it."""
 
@@ -65,7 +67,9 @@ def fast(model: Model) -> Model:
         setattr(model, method, torch.compile(getattr(model, method), dynamic=True))
     plain = model.forward
 
-    def mixed(clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]) -> Tensor:
+    def mixed(
+        clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
+    ) -> Tensor:
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return plain(clouds, candidates, robots).float()
 

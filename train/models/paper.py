@@ -27,7 +27,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import Crop, crop_clouds
 from datagen.train.models.grouping import ball_query, farthest_points, gather_rows
 from datagen.train.models.layers import PointMlp, empty_logits
@@ -97,7 +97,7 @@ class PaperModel(Model):
         self.head = nn.Sequential(*layers, nn.Linear(width, 2))
 
     def forward(
-        self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2)."""
         if not len(candidates):

@@ -27,7 +27,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import Crop, crop_clouds
 from datagen.train.models.frames import (
     N_PAIR_FEATURES,
@@ -129,21 +129,25 @@ class SharedModel(Model):
         )
 
     def forward(
-        self, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+        self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
         """Logits (N, 2)."""
         if not len(candidates):
             return empty_logits(candidates.base_xy_m)
         return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
-    def encode(self, clouds: Clouds[Tensor], robots: Robots[Tensor]) -> Tokens:
+    def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
         """What of the clouds is the same for all candidates; it has no parameters, so it can be kept."""
         with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
             return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
 
     def score_tokens(
-        self, tokens: Tokens, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+        self,
+        tokens: Tokens,
+        clouds: Clouds[Tensor],
+        candidates: CandidateInputs[Tensor],
+        robots: RobotInputs[Tensor],
     ) -> Tensor:
         """Logits (N, 2) from what `encode` gave for the same clouds and robots."""
         with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
@@ -175,7 +179,11 @@ class SharedModel(Model):
         return self.head(torch.cat([seen, self.scalars(scalars)], dim=1)).float()
 
     def _frames(
-        self, tokens: Tokens, clouds: Clouds[Tensor], candidates: Candidates[Tensor], robots: Robots[Tensor]
+        self,
+        tokens: Tokens,
+        clouds: Clouds[Tensor],
+        candidates: CandidateInputs[Tensor],
+        robots: RobotInputs[Tensor],
     ) -> Frames:
         rise_m = tokens.target_rise_m
         if self.sizes.camera == "given":
@@ -244,7 +252,7 @@ def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:
     return torch.bmm(steering, of_tokens.flatten(2)).unflatten(2, of_tokens.shape[2:])
 
 
-def _visibility(frames: Frames, crop: Crop, candidates: Candidates[Tensor]) -> Tensor:
+def _visibility(frames: Frames, crop: Crop, candidates: CandidateInputs[Tensor]) -> Tensor:
     """(N, 3): estimated rho, and it stretched near 0 and near 1, where the paper's score is steep."""
     eyes_m = torch.cat([candidates.base_xy_m, frames.camera_rise_m[:, None]], dim=1).cpu().numpy()
     radius_m = frames.target_radius_m.cpu().numpy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datagen.train.prediction.candidates import RobotSize
+from datagen.train.prediction.base_cells import RobotSize
 from datagen.train.prediction.frames import read_frame, read_place
 from datagen.train.prediction.predict import Prediction, load_scorer, predict
 

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.geometry.transforms import is_pose
-from datagen.workers.houses.reading import Node, parse_json
+from datagen.workers.json_document import JsonNode, parse_json
 
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096
@@ -102,12 +102,12 @@ def checked_pose(T: F64, place: str) -> F64:
     return exact
 
 
-def _of(node: Node | None) -> Node:
+def _of(node: JsonNode | None) -> JsonNode:
     assert node is not None
     return node
 
 
-def _document(path: Path) -> Node:
+def _document(path: Path) -> JsonNode:
     return parse_json(read_regular(path, _MAX_JSON_BYTES, FILE_MEND), str(path))
 
 

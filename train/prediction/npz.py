@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.train.prediction.files import FILE_MEND, MAX_FILE_BYTES, MAX_PIXELS
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")

@@ -9,10 +9,10 @@ import plotly.graph_objects as go
 
 from datagen.schemas.errors import printable
 from datagen.schemas.specification import CandidateParams
-from datagen.train.prediction.answer import told
-from datagen.train.prediction.candidates import STATES
+from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.pictures import GOLD, shown_rows
 from datagen.train.prediction.predict import Prediction
+from datagen.train.prediction.prediction_report import told
 
 _MOST_POINTS = 20_000
 _SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open"}

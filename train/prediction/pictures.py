@@ -15,9 +15,9 @@ from matplotlib.patches import Circle, Rectangle
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from datagen.schemas.specification import CandidateParams
-from datagen.train.prediction.answer import told
-from datagen.train.prediction.candidates import BLOCKED, CLEAR, STATES, UNSEEN
+from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNSEEN
 from datagen.train.prediction.predict import Prediction
+from datagen.train.prediction.prediction_report import told
 from datagen.workers.geometry.mesh import F64
 
 COLOURS, GOLD = "RdYlGn", "#ffc400"

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.train.prediction.files import FILE_MEND, MAX_FILE_BYTES, Bools
 from datagen.workers.geometry.mesh import F32, U8
 

@@ -11,22 +11,22 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
-from datagen.train.prediction.candidates import (
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.prediction.base_cells import (
     BLOCKED,
     CLEAR,
     STATES,
     UNSEEN,
-    Places,
+    BaseCells,
     RobotSize,
     facing_yaw,
-    look_at_places,
+    observe_cells,
     seen_share,
 )
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
-from datagen.train.prediction.growing import grow_mask
+from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.geometry.mesh import F64
@@ -50,7 +50,7 @@ class Prediction:
     target: TargetBox
     filled: Filled | None  # None where no mask was given or clicked
     cloud: Cloud
-    places: Places
+    places: BaseCells
     score: F64  # (N,)
     best: int | None  # the best of those that may be chosen; None where there is none
     notes: tuple[str, ...]
@@ -183,7 +183,7 @@ def predict(
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
-    places = look_at_places(seen, centre, robot, _grid(grid, half_width_m))
+    places = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
     score = scored(scorer, _batch(cloud, target, robot, places))
     best = _best(score, places, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
     notes = _notes(grounds, filled, cloud)
@@ -264,7 +264,7 @@ def _grid(cells: int, half_width_m: float) -> CandidateParams:
     return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
 
 
-def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) -> Batch[Array]:
+def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: BaseCells) -> Batch[Array]:
     """The places as a scorer takes them; `base_is_clear` says what was seen to stand in the way."""
     n = len(places.offset_m)
 
@@ -280,20 +280,20 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: Places) ->
             one(target.center_m[2]),
             one(target.radius_m),
         ),
-        Robots(
+        RobotInputs(
             np.zeros(1, np.int64),
             one(robot.camera_height_m),
             one(robot.base_height_m),
             one(robot.arm_reach_m),
         ),
-        Candidates(np.zeros(n, np.int64), places.offset_m),
+        CandidateInputs(np.zeros(n, np.int64), places.offset_m),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
         {"base_is_clear": places.state != STATES.index(BLOCKED)},
     )
 
 
-def _best(score: F64, places: Places, allowed: Sequence[str]) -> int | None:
+def _best(score: F64, places: BaseCells, allowed: Sequence[str]) -> int | None:
     rows = np.flatnonzero(np.isin(places.state, [STATES.index(name) for name in allowed]))
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
 

@@ -23,18 +23,18 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.schemas.whole_files import whole_file
-from datagen.train.dataset import Origin
+from datagen.train.dataset import DataOrigin
 from datagen.train.models import Model, build_model
-from datagen.train.training.inert import MAX_BYTES, refuse_foreign, refuse_odd_values
-from datagen.train.training.validation import Measured
+from datagen.train.training.torch_file_check import MAX_BYTES, refuse_foreign, refuse_odd_values
+from datagen.train.training.validation import ValidationMetrics
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
 _MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
 
 
-class EpochRecord(Measured):
+class EpochRecord(ValidationMetrics):
     """What an epoch came to."""
 
     epoch: int  # counted from 1
@@ -53,8 +53,8 @@ class CheckpointHead:
     model_config: dict[str, Any]
     stage: str  # stage1, stage2 or sim-only
     options: dict[str, Any]  # of training, resolved
-    data: tuple[Origin, ...]
-    val_data: tuple[Origin, ...]
+    data: tuple[DataOrigin, ...]
+    val_data: tuple[DataOrigin, ...]
     house_ids: tuple[str, ...]  # trained on, by the checkpoint that this one began from too
     object_digests: tuple[str, ...]  # the same of objects
     val_house_ids: tuple[str, ...]  # decided which epoch is the best, also of the one that it began from

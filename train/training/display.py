@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.schemas.progress import Pace, Progress, clock_text, whole
-from datagen.train.training.watching import Step
+from datagen.train.training.callbacks import TrainingStep
 
 
 class TrainingProgress:
@@ -19,7 +19,7 @@ class TrainingProgress:
         self._spent_s = self._samples = self._waited_s = self._steps = 0.0
         self._pace = Pace(lambda: self._spent_s)
 
-    def step(self, step: Step) -> None:
+    def step(self, step: TrainingStep) -> None:
         self._spent_s, self._steps = self._spent_s + step.step_s, self._steps + 1
         self._samples, self._waited_s = self._samples + step.samples, self._waited_s + step.wait_s
         self._pace.see(self._samples, self._waited_s, self._steps)
@@ -41,7 +41,7 @@ class TrainingProgress:
         samples_per_s = round(self._pace.per_s(0), rate_digits)
         return {"samples_per_s": samples_per_s, "loader_share": round(self._pace.per_s(1), 4)}
 
-    def _figures(self, step: Step) -> tuple[str, dict[str, object]]:
+    def _figures(self, step: TrainingStep) -> tuple[str, dict[str, object]]:
         speed, left_s = self._speed(1), self._pace.left_s(step.steps - step.step, 2)
         text = (
             f"loss {step.loss:.4f}  {speed['samples_per_s']:,.0f} samples/s  "

@@ -17,12 +17,12 @@ import torch
 import torch.distributed as dist
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.private_folders import locked_folder
+from datagen.schemas.locked_folders import locked_folder
 from datagen.train.training.ranks import Ranks
 
 Stopping = Callable[[], bool]
 # What each process does, importable by name; True when it came to its end.
-Work = Callable[[Any, Ranks, Stopping], bool]
+ProcessWork = Callable[[Any, Ranks, Stopping], bool]
 _PREFIX = "datagen-ranks-"
 
 
@@ -44,7 +44,7 @@ def interruptible() -> Generator[Stopping]:
             signal.signal(number, handler)
 
 
-def train_in_processes(work: Work, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
+def train_in_processes(work: ProcessWork, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
     """Run `work(job, ranks, stopping)` in so many new processes that can reach each other.
 
     What one of them raises as InputError is raised here, and ends the others; so does the end of this
@@ -100,7 +100,7 @@ def _answer(here: Connection) -> bool | InputError | None:
         return None
 
 
-def _child(work: Work, job: Any, ranks: Ranks, device: str, folder: str, there: Connection) -> None:
+def _child(work: ProcessWork, job: Any, ranks: Ranks, device: str, folder: str, there: Connection) -> None:
     # Ctrl-C reaches the whole group of processes; only the first of them decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

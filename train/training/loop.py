@@ -21,12 +21,12 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
 from datagen.train.tensors import to_torch
+from datagen.train.training.callbacks import TrainingCallback, TrainingStep
 from datagen.train.training.checkpoints import EpochRecord
-from datagen.train.training.optimising import rate_at, set_rate
+from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
 from datagen.train.training.validation import validate
-from datagen.train.training.watching import Step, Watcher
 
 _STEP_STREAM = 0x57E9  # keeps the draws of steps apart from those of batches
 _IDS_NAMED = 4
@@ -70,16 +70,16 @@ class Training:
     ranks: Ranks
 
 
-def run(
+def run_training(
     training: Training,
-    keep: Callable[[], None],
-    watcher: Watcher,
+    save: Callable[[], None],
+    callback: TrainingCallback,
     stopping: Callable[[], bool] = lambda: False,
-    keep_every_s: float = 300.0,
+    save_every_s: float = 300.0,
 ) -> bool:
     """Train from the position on. Whether it came to its end; else it was stopped, and all is kept.
 
-    `keep` is called after each epoch, every `keep_every_s` and when it stops. InputError at a loss or
+    `save` is called after each epoch, every `save_every_s` and when it stops. InputError at a loss or
     gradient that is no number, before it can reach the weights.
     """
     at, clock = training.position, _Clock()
@@ -91,21 +91,21 @@ def run(
         for batch in training.train.epoch(at.epoch, at.batch):
             clock.wait_ends()
             seen, stop = _step(training, logits_of, batch, clock, stopping())
-            watcher.step(seen)
-            if stop or time.monotonic() - kept_s >= keep_every_s:
-                keep()
+            callback.step(seen)
+            if stop or time.monotonic() - kept_s >= save_every_s:
+                save()
                 kept_s = time.monotonic()
             if stop:
                 return False
             clock.wait_begins()
-        _end_epoch(training, clock, watcher)
-        keep()
+        _end_epoch(training, clock, callback)
+        save()
     return True
 
 
 def _step(
     training: Training, logits_of: Callable[..., Tensor], batch: Batch[Array], clock: _Clock, stopping: bool
-) -> tuple[Step, bool]:
+) -> tuple[TrainingStep, bool]:
     """A step on the batches of all ranks as if they were one; what it was, and whether any rank stops."""
     options, at, ranks, device = training.options, training.position, training.ranks, training.model.device
     torch.manual_seed(_seed(options.seed, at.epoch, at.batch, ranks.rank))
@@ -137,10 +137,10 @@ def _step(
     _pay(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
     loss_now = sums[1] / sums[0]
     times = (wait_s / ranks.world, wall_s / ranks.world)
-    return Step(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
+    return TrainingStep(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
 
 
-def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
+def _end_epoch(training: Training, clock: _Clock, callback: TrainingCallback) -> None:
     """Validate, keep the best weights in mind, and decide whether to go on."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
@@ -166,7 +166,7 @@ def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
     )
     wall_s, cpu_s = training.ranks.total(spent).tolist()
     _pay(at, wall_s, cpu_s, 0.0)
-    watcher.epoch({**record, "best": best})
+    callback.epoch({**record, "best": best})
 
 
 def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:

@@ -10,7 +10,7 @@ from datagen.schemas.errors import InputError
 
 
 @dataclass(frozen=True)
-class Stage:
+class TrainingStage:
     """One row of the paper's schedule (GBPP, Sec. III-D): which labels, which loss, from which weights."""
 
     name: str
@@ -23,10 +23,10 @@ class Stage:
 
 
 # The paper gives the losses and the order; rates, decay and epochs are ours.
-STAGES: dict[str, Stage] = {
-    "stage1": Stage("stage1", ("heuristic",), True, False, 2e-3, 0.0, 12),
-    "stage2": Stage("stage2", ("plan", "sim"), False, True, 1e-3, 1e-2, 20),
-    "sim-only": Stage("sim-only", ("plan", "sim"), False, False, 2e-3, 1e-2, 20),
+STAGES: dict[str, TrainingStage] = {
+    "stage1": TrainingStage("stage1", ("heuristic",), True, False, 2e-3, 0.0, 12),
+    "stage2": TrainingStage("stage2", ("plan", "sim"), False, True, 1e-3, 1e-2, 20),
+    "sim-only": TrainingStage("sim-only", ("plan", "sim"), False, False, 2e-3, 1e-2, 20),
 }
 
 

@@ -17,7 +17,7 @@ from datagen.train.tensors import to_torch
 from datagen.train.training.ranks import Ranks
 
 
-class Measured(TypedDict):
+class ValidationMetrics(TypedDict):
     """What a model came to on samples; what is not defined with one class alone is None."""
 
     val_loss: float
@@ -26,7 +26,9 @@ class Measured(TypedDict):
     val_auc: float | None
 
 
-def validate(model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks) -> Measured:
+def validate(
+    model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks
+) -> ValidationMetrics:
     """Loss (the stage's own), accuracy, balanced accuracy and AUC over all ranks' batches.
 
     Numbers that are not defined, with one class alone, are None. InputError where the loss is not a number.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 
 Bools = npt.NDArray[np.bool_]
 
@@ -19,7 +19,7 @@ _ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class SceneCandidates:
     """N base poses of one scene. Numbers are float32, as stored, so that labels can be recomputed."""
 
     base_xy_m: F32  # (N, 2), world
@@ -34,7 +34,7 @@ class Candidates:
 
 
 @dataclass(frozen=True, eq=False)
-class _Robots:
+class _SceneRobots:
     """The R robots of one scene."""
 
     camera_height_m: F32  # (R,)
@@ -57,12 +57,12 @@ def grid_offsets(params: CandidateParams) -> F64:
 
 def draw_candidates(
     target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
-) -> Candidates:
+) -> SceneCandidates:
     """All cells of the grid, or `per_scene` positions jittered within their cells, with robots on them.
 
     Cells are drawn from all without repetition, or from those that `within` asks for. Robots:
     `robots_per_scene` of them with the candidates dealt out in turn, so that a model can encode a
-    scene once a robot; or one a candidate, as the paper has it. Raises Redraw("no_base") where
+    scene once a robot; or one a candidate, as the paper has it. Raises SceneRejected("no_base") where
     around this target there are too few places of the asked kind for these robots.
     """
     n = params.count
@@ -77,7 +77,7 @@ def draw_candidates(
     return _stand(base_xy_m, robot_index, robots, obstacles, params)
 
 
-def distances(candidates: Candidates, target_center_m: F64) -> tuple[F32, F32]:
+def distances(candidates: SceneCandidates, target_center_m: F64) -> tuple[F32, F32]:
     """Horizontal distance base to target centre, and distance arm mount to target centre; each (N,)."""
     planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64) - target_center_m[:2], axis=1)
     rise_m = target_center_m[2] - candidates.base_height_m.astype(np.float64)
@@ -99,32 +99,32 @@ def _jittered(offsets_m: F64, params: CandidateParams, rng: np.random.Generator)
     return offsets_m + rng.uniform(-cell / 2, cell / 2, size=offsets_m.shape)
 
 
-def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _Robots:
+def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _SceneRobots:
     def draw(r: Range) -> F32:
         return rng.uniform(r.low, r.high, size=n).astype(np.float32)
 
-    return _Robots(draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m))
+    return _SceneRobots(draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m))
 
 
 def _stand(
     base_xy_m: F32,
     robot_index: npt.NDArray[np.int16],
-    robots: _Robots,
+    robots: _SceneRobots,
     obstacles: Obstacles,
     params: CandidateParams,
-) -> Candidates:
+) -> SceneCandidates:
     """Robots put on their places (N, 2), world, with what is free around them."""
     camera_m, base_m = robots.camera_height_m[robot_index], robots.base_height_m[robot_index]
     clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, obstacles, params)
     reach_m = robots.arm_reach_m[robot_index]
-    return Candidates(base_xy_m, robot_index, camera_m, base_m, reach_m, clearance_m)
+    return SceneCandidates(base_xy_m, robot_index, camera_m, base_m, reach_m, clearance_m)
 
 
 def _places_within(
     target_center_m: F64,
     obstacles: Obstacles,
     params: CandidateParams,
-    robots: _Robots,
+    robots: _SceneRobots,
     robot_index: npt.NDArray[np.int16],
     rng: np.random.Generator,
 ) -> F32:
@@ -151,10 +151,10 @@ def _places_within(
             free[found] = False
         if not open_.any():
             return base_xy_m
-    raise Redraw("no_base")
+    raise SceneRejected("no_base")
 
 
-def _is_within(candidates: Candidates, target_center_m: F64, params: CandidateParams) -> Bools:
+def _is_within(candidates: SceneCandidates, target_center_m: F64, params: CandidateParams) -> Bools:
     """Which candidates (N,) are of the kind that `params.within` asks for."""
     clear = candidates.clearance_m >= 0
     if params.within == "clear":

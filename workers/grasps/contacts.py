@@ -27,7 +27,7 @@ _LINES_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class HalfSpaces:
     """The half-spaces of P convex parts: n . x + c <= 0 for all M rows of a part inside it."""
 
     planes: F64  # (M, 4), unit normals outwards
@@ -54,7 +54,7 @@ class Contacts:
         return np.linalg.norm(self.second_m - self.first_m, axis=1)
 
 
-def solid_of(parts_m: Sequence[F32]) -> Solid:
+def solid_of(parts_m: Sequence[F32]) -> HalfSpaces:
     """The union of convex parts, each given by its corners (V, 3)."""
     planes: list[F64] = []
     triangles: list[F64] = []
@@ -68,7 +68,7 @@ def solid_of(parts_m: Sequence[F32]) -> Solid:
         triangles.append(points[hull.simplices])
         normals.append(hull.equations[:, :3])
     counts = [len(p) for p in planes]
-    return Solid(
+    return HalfSpaces(
         np.concatenate(planes),
         np.cumsum([0, *counts[:-1]]),
         np.repeat(np.arange(len(planes)), counts),
@@ -77,7 +77,7 @@ def solid_of(parts_m: Sequence[F32]) -> Solid:
     )
 
 
-def surface_points(solid: Solid, n: int, rng: np.random.Generator) -> tuple[F64, F64]:
+def surface_points(solid: HalfSpaces, n: int, rng: np.random.Generator) -> tuple[F64, F64]:
     """Points (N, 3), N <= n, uniform over the surface of the union, and outward normals (N, 3).
 
     Draws n points over the hulls of all parts and drops those that lie inside another part.
@@ -95,7 +95,7 @@ def surface_points(solid: Solid, n: int, rng: np.random.Generator) -> tuple[F64,
     return points[keep], solid.normals[chosen[keep]]
 
 
-def _outside(solid: Solid, points_m: F64) -> npt.NDArray[np.bool_]:
+def _outside(solid: HalfSpaces, points_m: F64) -> npt.NDArray[np.bool_]:
     """Which points (N, 3) lie in no part's interior."""
     height = points_m @ solid.planes[:, :3].T + solid.planes[:, 3]
     depth = -np.maximum.reduceat(height, solid.first, axis=1)  # (N, P) below each part's surface
@@ -121,7 +121,7 @@ def perpendicular(axes: F64) -> tuple[F64, F64]:
     return u, v
 
 
-def contact_pairs(solid: Solid, points_m: F64, directions: F64, max_width_m: float) -> Contacts:
+def contact_pairs(solid: HalfSpaces, points_m: F64, directions: F64, max_width_m: float) -> Contacts:
     """The pairs on the lines that enter the union at the points (N, 3) along unit directions (N, 3).
 
     A line may leave and enter it again: the first end gives a grasp of the wall alone, as of a rim, the
@@ -141,7 +141,7 @@ def contact_pairs(solid: Solid, points_m: F64, directions: F64, max_width_m: flo
     return Contacts(np.concatenate(first), np.concatenate(second), np.concatenate(closing))
 
 
-def _ends(solid: Solid, p: F64, d: F64, max_width_m: float) -> tuple[Ints, F64, F64]:
+def _ends(solid: HalfSpaces, p: F64, d: F64, max_width_m: float) -> tuple[Ints, F64, F64]:
     """Rows (K,) of the lines, how far (K,) along they leave the union, and the normals (K, 3) there."""
     into = d @ solid.planes[:, :3].T  # (N, M)
     height = p @ solid.planes[:, :3].T + solid.planes[:, 3]

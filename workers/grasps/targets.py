@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datagen.schemas.specification import GraspParams
-from datagen.workers.grasps.keep import scored_grasps
+from datagen.workers.grasps.grasp_cache import scored_grasps
 from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Gripper

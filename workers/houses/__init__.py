@@ -8,7 +8,7 @@ from datagen.workers.registry import open_source
 
 # Each opens the source which the text after a reference's colon describes.
 HOUSE_SOURCES: dict[str, str] = {
-    "builtin": "datagen.workers.houses.builtin:open_builtin",
+    "builtin": "datagen.workers.procedural_houses.builtin:open_builtin",
     "procthor": "datagen.workers.houses.procthor:open_procthor",
     "ai2thor": "datagen.workers.houses.ai2thor:open_ai2thor",
 }

@@ -22,13 +22,13 @@ from typing import Any, cast
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular, read_regular
 from datagen.schemas.identity import digest_of
+from datagen.schemas.untrusted_files import open_regular, read_regular
+from datagen.workers.furniture.support_tops import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon
 from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
-from datagen.workers.houses.house import Body, House, Room, Surface
-from datagen.workers.houses.layout import CARRYING_TYPES
+from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.loader import room_ids_at
 from datagen.workers.houses.mesh_geometry import (
     convex_parts,
@@ -37,7 +37,7 @@ from datagen.workers.houses.mesh_geometry import (
     outlines,
     slab_parts,
 )
-from datagen.workers.houses.reading import EXTENT_M, Node, parse_json
+from datagen.workers.json_document import EXTENT_M, JsonNode, parse_json
 
 _SUFFIX = ".scene_instance.json"
 _SCENES = Path("ai2thor-hab/configs/scenes")
@@ -101,7 +101,7 @@ class Ai2thorHouses:
         if not len(mesh.faces):
             raise scene.get("stage_instance").error("a stage without walls or floor", _MEND)
         skipped: Counter[str] = Counter()
-        placed: list[tuple[Body, F64, F64, Mesh]] = []
+        placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
             name = _template_name(entry)
             file = self.root / _OBJECTS / f"{name}.glb"
@@ -124,7 +124,7 @@ class Ai2thorHouses:
             house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), dict(skipped)
         )
 
-    def _stage(self, scene: Node, house_id: str) -> tuple[_Template, bool]:
+    def _stage(self, scene: JsonNode, house_id: str) -> tuple[_Template, bool]:
         name = _template_name(scene.get("stage_instance"))
         file = self.root / "ai2thor-hab/assets" / f"{name}.glb"
         return self._template(file), house_id.startswith("ProcTHOR/")
@@ -144,7 +144,9 @@ class Ai2thorHouses:
             self._templates.popitem(last=False)
         return template
 
-    def _placed(self, number: int, name: str, template: _Template, T: F64) -> tuple[Body, F64, F64, Mesh]:
+    def _placed(
+        self, number: int, name: str, template: _Template, T: F64
+    ) -> tuple[StaticBody, F64, F64, Mesh]:
         """The body, the point that decides its room, its pose and its mesh in its own frame."""
         mesh = template.mesh.transformed(T)
         parts = tuple((p @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for p in template.parts_m)
@@ -153,7 +155,7 @@ class Ai2thorHouses:
         is_small = bool(size_m.max() < _SMALL_M or (mesh.vertices_m[:, 2].min() > 0.2 and size_m.max() < 0.6))
         asset_id = PurePosixPath(name).name
         kind = "small" if is_small else "furniture"
-        body = Body(f"{number}|{asset_id}", kind, object_type, asset_id, "", mesh, parts)
+        body = StaticBody(f"{number}|{asset_id}", kind, object_type, asset_id, "", mesh, parts)
         middle = (mesh.vertices_m.min(0) + mesh.vertices_m.max(0))[:2] / 2
         return body, middle.astype(np.float64), T, template.mesh
 
@@ -219,11 +221,12 @@ def _types(root: Path) -> dict[int, str]:
     members = cast(dict[str, Any], node.value) if isinstance(node.value, dict) else {}
     place = str(path)
     return {
-        int(Node(place, f"$.{k}", v).number(-1, 1e9)): Node(place, "$", k).text() for k, v in members.items()
+        int(JsonNode(place, f"$.{k}", v).number(-1, 1e9)): JsonNode(place, "$", k).text()
+        for k, v in members.items()
     }
 
 
-def _template_name(entry: Node) -> str:
+def _template_name(entry: JsonNode) -> str:
     """A template's path below the assets folder; it may not lead out of it."""
     node = entry.get("template_name")
     name = node.text()
@@ -233,7 +236,7 @@ def _template_name(entry: Node) -> str:
     return name
 
 
-def _pose(entry: Node) -> F64:
+def _pose(entry: JsonNode) -> F64:
     """`T_world_object` of an instance; object meshes are already z up, so both sides are turned."""
     x, y, z = _numbers(entry.get("translation"), 3, EXTENT_M)
     found = entry.find("rotation")
@@ -259,7 +262,7 @@ def _pose(entry: Node) -> F64:
     return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
 
 
-def _numbers(node: Node, count: int, limit: float) -> list[float]:
+def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
     values = [n.number(-limit, limit) for n in node.items(count)]
     if len(values) != count:
         raise node.error(f"{len(values)} numbers where {count} belong")
@@ -272,7 +275,9 @@ def _stage_pose(is_turned: bool) -> F64:
     return _Y_UP_TO_WORLD @ turn @ np.linalg.inv(_Y_UP_TO_WORLD)
 
 
-def _walls_and_rooms(stage: Mesh, things: list[tuple[Body, F64]]) -> tuple[list[Body], list[Room]]:
+def _walls_and_rooms(
+    stage: Mesh, things: list[tuple[StaticBody, F64]]
+) -> tuple[list[StaticBody], list[Room]]:
     """The stage as a body, and a room for every patch of floor."""
     normals, _ = normals_and_areas(stage)
     corner_z = stage.vertices_m[stage.faces][:, :, 2]
@@ -297,7 +302,7 @@ def _walls_and_rooms(stage: Mesh, things: list[tuple[Body, F64]]) -> tuple[list[
         kind = next((name for t, name in _ROOM_BY_TYPE if t in within[room.room_id]), "Room")
         rooms.append(Room(room.room_id, kind, room.polygon_m, room.ceiling_m))
     parts = slab_parts(stage, 0.02, _WALL_TOP_M)
-    return [Body("stage", "wall", "Wall", "", "", stage, parts)], rooms
+    return [StaticBody("stage", "wall", "Wall", "", "", stage, parts)], rooms
 
 
 def _without_ceiling(stage: Mesh) -> Mesh:
@@ -309,13 +314,13 @@ def _without_ceiling(stage: Mesh) -> Mesh:
     return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
 
 
-def _with_room(body: Body, room_id: str) -> Body:
-    return Body(
+def _with_room(body: StaticBody, room_id: str) -> StaticBody:
+    return StaticBody(
         body.body_id, body.kind, body.object_type, body.asset_id, room_id, body.visual, body.convex_parts_m
     )
 
 
-def _surfaces(body: Body, room_id: str, T: F64, local: Mesh) -> list[Surface]:
+def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:
     """Flat tops of an upright, unstretched body."""
     if T[2, 2] < 0.999 or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
         return []

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, prism
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.solids import Rgb, Solid, prism
 
 MAX_CORNERS = 64
 FLOOR_THICKNESS_M = 0.05
@@ -46,9 +46,9 @@ def triangles(polygon_m: F64) -> list[tuple[int, int, int]]:
     return out
 
 
-def floor_solids(polygon_m: F64, rgb: Rgb) -> list[Solid]:
+def floor_solids(polygon_m: F64, rgb: Rgb) -> list[ColouredSolid]:
     """Triangular slabs below z = 0 that fill the polygon."""
-    slabs: list[Solid] = []
+    slabs: list[ColouredSolid] = []
     for a, b, c in triangles(polygon_m):
         corners = polygon_m[[a, b, c]]
         if abs(float(_cross(corners[1] - corners[0], corners[2] - corners[0]))) < 1e-6:

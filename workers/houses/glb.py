@@ -12,9 +12,9 @@ import trimesh
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F64, U8, Mesh
-from datagen.workers.houses.reading import parse_json
+from datagen.workers.json_document import parse_json
 
 MAX_FILE_BYTES = 256 << 20
 MAX_FACES = 500_000

@@ -22,7 +22,7 @@ class Room:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class StaticBody:
     """One rigid static thing: a wall, a piece of furniture or a small thing standing on one.
 
     `visual` is what cameras see and `convex_parts_m` what other things bump into, both in the
@@ -64,7 +64,7 @@ class House:
     house_id: str
     digest: str  # sha256 of the house's own bytes in its source
     rooms: tuple[Room, ...]
-    bodies: tuple[Body, ...]
+    bodies: tuple[StaticBody, ...]
     surfaces: tuple[Surface, ...]
     skipped: Mapping[str, int] = field(default_factory=dict)
 

@@ -25,11 +25,11 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular, read_regular
 from datagen.schemas.identity import canonical_json
+from datagen.schemas.untrusted_files import open_regular, read_regular
 from datagen.schemas.whole_files import whole_file
 from datagen.workers.content_cache import cache_folder, drop_unused, read_arrays, refresh, write_arrays
-from datagen.workers.houses.reading import parse_json
+from datagen.workers.json_document import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
 MAX_LINES = 500_000  # fifty times the known sets; each takes half a kilobyte of memory

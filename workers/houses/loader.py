@@ -13,16 +13,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.furniture.colours import material_rgb
+from datagen.workers.furniture.solids import join
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.houses.asset_table import Asset
-from datagen.workers.houses.colours import material_rgb
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon, floor_solids
-from datagen.workers.houses.furnishing import object_bodies
-from datagen.workers.houses.house import Body, House, Room, Surface
-from datagen.workers.houses.reading import EXTENT_M, Node
-from datagen.workers.houses.solids import join
+from datagen.workers.houses.furniture_bodies import object_bodies
+from datagen.workers.houses.house import House, Room, StaticBody, Surface
 from datagen.workers.houses.walls import WINDOW_SILL_M, Hole, WallSegment, wall_bodies
+from datagen.workers.json_document import EXTENT_M, JsonNode
 
 MAX_ROOMS = 200
 MAX_WALLS = 2000
@@ -31,7 +31,7 @@ _MAX_HEIGHT_M = 30.0
 _DEFAULT_CEILING_M = 2.5
 
 
-def build_house(root: Node, house_id: str, digest: str, assets: Mapping[str, Asset]) -> House:
+def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str, Asset]) -> House:
     """The house of one document. Raises InputError that names the house and the JSON path."""
     skipped: Counter[str] = Counter()
     walls, room_heights = _walls(root.get("walls"), skipped)
@@ -41,7 +41,9 @@ def build_house(root: Node, house_id: str, digest: str, assets: Mapping[str, Ass
     owners = room_ids_at(np.array([xy for _, xy in furniture]).reshape(-1, 2), rooms)
     owner_of = {body.body_id: owner for (body, _), owner in zip(furniture, owners, strict=True)}
     bodies = [
-        Body(b.body_id, b.kind, b.object_type, b.asset_id, owner_of[b.body_id], b.visual, b.convex_parts_m)
+        StaticBody(
+            b.body_id, b.kind, b.object_type, b.asset_id, owner_of[b.body_id], b.visual, b.convex_parts_m
+        )
         for b, _ in furniture
     ]
     usable: list[Surface] = []
@@ -65,9 +67,9 @@ def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:
     return owners
 
 
-def _rooms(node: Node, heights: Mapping[str, float]) -> tuple[list[Room], list[Body]]:
+def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], list[StaticBody]]:
     rooms: list[Room] = []
-    floors: list[Body] = []
+    floors: list[StaticBody] = []
     seen: set[str] = set()
     for entry in node.items(MAX_ROOMS):
         room_id = entry.get("id").text()
@@ -82,13 +84,13 @@ def _rooms(node: Node, heights: Mapping[str, float]) -> tuple[list[Room], list[B
         ceiling_m = heights.get(room_id, max(heights.values(), default=_DEFAULT_CEILING_M))
         rooms.append(Room(room_id, entry.get("roomType").text(), polygon_m, ceiling_m))
         mesh, parts_m = join(floor_solids(polygon_m, material_rgb(entry.find("floorMaterial"), True)))
-        floors.append(Body(f"floor-{room_id}", "wall", "Floor", "", room_id, mesh, parts_m))
+        floors.append(StaticBody(f"floor-{room_id}", "wall", "Floor", "", room_id, mesh, parts_m))
     if not rooms:
         raise node.error("a house without rooms", "Remove the house.")
     return rooms, floors
 
 
-def _walls(node: Node, skipped: Counter[str]) -> tuple[dict[str, WallSegment], dict[str, float]]:
+def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment], dict[str, float]]:
     """Walls by id and the height of the walls of each room."""
     walls: dict[str, WallSegment] = {}
     heights: dict[str, float] = {}
@@ -119,7 +121,7 @@ def _walls(node: Node, skipped: Counter[str]) -> tuple[dict[str, WallSegment], d
     return walls, heights
 
 
-def _holes(node: Node | None, walls: Mapping[str, WallSegment], is_door: bool) -> list[Hole]:
+def _holes(node: JsonNode | None, walls: Mapping[str, WallSegment], is_door: bool) -> list[Hole]:
     """Openings, measured along `wall0`, or along `wall1` from its other end where only it exists."""
     holes: list[Hole] = []
     if node is None:
@@ -154,9 +156,9 @@ def _holes(node: Node | None, walls: Mapping[str, WallSegment], is_door: bool) -
     return holes
 
 
-def _text_or_empty(node: Node | None) -> str:
+def _text_or_empty(node: JsonNode | None) -> str:
     return "" if node is None else node.text()
 
 
-def _ground(node: Node) -> tuple[float, float]:
+def _ground(node: JsonNode) -> tuple[float, float]:
     return (node.get("x").number(-EXTENT_M, EXTENT_M), node.get("z").number(-EXTENT_M, EXTENT_M))

@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from datagen.workers.furniture.support_tops import Rectangle
 from datagen.workers.geometry.mesh import F32, F64, Mesh
-from datagen.workers.houses.layout import Rectangle
 
 MAX_PARTS = 32
 _MAX_CORNERS = 64

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, join, prism
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.houses.house import Body
-from datagen.workers.houses.solids import Rgb, Solid, join, prism
+from datagen.workers.houses.house import StaticBody
 
 WALL_THICKNESS_M = 0.02
 # A pane that reaches the floor still stops a robot's base.
@@ -61,7 +61,7 @@ class _Line:
         return float((np.array(point_m) - self.origin) @ self.direction)
 
 
-def wall_bodies(walls: Sequence[WallSegment], holes: Sequence[Hole]) -> list[Body]:
+def wall_bodies(walls: Sequence[WallSegment], holes: Sequence[Hole]) -> list[StaticBody]:
     """Bodies of all walls, one a straight stretch; holes name the wall they are measured along."""
     by_wall: dict[str, list[Hole]] = defaultdict(list)
     for hole in holes:
@@ -70,7 +70,7 @@ def wall_bodies(walls: Sequence[WallSegment], holes: Sequence[Hole]) -> list[Bod
     buckets: dict[tuple[int, int], list[int]] = defaultdict(list)
     for wall in walls:
         _sort_into(wall, lines, buckets)
-    bodies: list[Body] = []
+    bodies: list[StaticBody] = []
     for line, members in lines:
         bodies.extend(_bodies_on_line(line, members, by_wall, len(bodies)))
     return bodies
@@ -96,11 +96,11 @@ def _sort_into(
 
 def _bodies_on_line(
     line: _Line, walls: list[WallSegment], by_wall: dict[str, list[Hole]], first: int
-) -> list[Body]:
+) -> list[StaticBody]:
     spans = [tuple(sorted((line.along(w.start_m), line.along(w.end_m)))) for w in walls]
     forward = [line.along(w.end_m) > line.along(w.start_m) for w in walls]
     holes: list[tuple[float, float, float, float]] = []
-    leaves: list[Solid] = []
+    leaves: list[ColouredSolid] = []
     for wall, ahead in zip(walls, forward, strict=True):
         for hole in by_wall.get(wall.wall_id, ()):
             sign = 1.0 if ahead else -1.0
@@ -109,8 +109,8 @@ def _bodies_on_line(
             if hole.is_closed:
                 leaves.append(_slab(line, s0, s1, hole.height_m, _DOOR_RGB, _DOOR_RGB))
     cuts = _distinct([s for span in spans for s in span] + [s for h in holes for s in h[:2]])
-    bodies: list[Body] = []
-    solids: list[Solid] = []
+    bodies: list[StaticBody] = []
+    solids: list[ColouredSolid] = []
     start, last = 0.0, None
     for a, b in zip(cuts, [*cuts[1:], np.inf], strict=True):
         key = _structure(a, b, walls, spans, forward, holes) if np.isfinite(b) else None
@@ -160,7 +160,7 @@ def _solid_ranges(height_m: float, gaps: tuple[tuple[float, float], ...]) -> lis
     return ranges
 
 
-def _slab(line: _Line, s0: float, s1: float, z: tuple[float, float], left: Rgb, right: Rgb) -> Solid:
+def _slab(line: _Line, s0: float, s1: float, z: tuple[float, float], left: Rgb, right: Rgb) -> ColouredSolid:
     half = WALL_THICKNESS_M / 2
     across = np.array([-line.direction[1], line.direction[0]])  # to the left of the line
     a, b = line.origin + s0 * line.direction, line.origin + s1 * line.direction
@@ -172,13 +172,13 @@ def _slab(line: _Line, s0: float, s1: float, z: tuple[float, float], left: Rgb, 
 
 
 @dataclass(frozen=True, eq=False)
-class TwoSided(Solid):
+class TwoSided(ColouredSolid):
     """A slab whose left side (its third wall) has another colour than the rest."""
 
     left_rgb: Rgb = _PLAIN
 
 
-def _body(body_id: str, object_type: str, solids: list[Solid]) -> Body:
+def _body(body_id: str, object_type: str, solids: list[ColouredSolid]) -> StaticBody:
     mesh, parts_m = join(solids)
     row = 0
     for solid in solids:
@@ -186,7 +186,7 @@ def _body(body_id: str, object_type: str, solids: list[Solid]) -> Body:
             # A prism of four sides lists its wall triangles first: side k has rows k and k + 4.
             mesh.face_rgb[[row + 2, row + 6]] = solid.left_rgb
         row += len(solid.faces)
-    return Body(body_id, "wall", object_type, "", "", mesh, parts_m)
+    return StaticBody(body_id, "wall", object_type, "", "", mesh, parts_m)
 
 
 def _distinct(values: list[float]) -> list[float]:

@@ -6,9 +6,9 @@ from datagen.workers.labels.source import LabelSource
 from datagen.workers.registry import entry
 
 LABEL_SOURCES: dict[str, str] = {
-    "heuristic": "datagen.workers.labels.distance_visibility:HEURISTIC",
-    "plan": "datagen.workers.labels.plan:PLAN",
-    "sim": "datagen.workers.labels.sim:SIM",
+    "heuristic": "datagen.workers.labels.heuristic_source:HEURISTIC",
+    "plan": "datagen.workers.labels.plan_source:PLAN",
+    "sim": "datagen.workers.labels.sim_source:SIM",
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.scenes.scene import SettledScene
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -29,13 +29,13 @@ class LabelSource:
     name: str
     version: int
     schema: str
-    label: Callable[[SettledScene, Candidates, Specification, StageClock], Columns]
+    label: Callable[[SettledScene, SceneCandidates, Specification, StageClock], Columns]
     label_rows: (
-        Callable[[SettledScene, Candidates, Specification, StageClock, Sequence[int]], Columns] | None
+        Callable[[SettledScene, SceneCandidates, Specification, StageClock, Sequence[int]], Columns] | None
     ) = None
 
     def columns(
-        self, scene: SettledScene, candidates: Candidates, spec: Specification, rows: Sequence[int]
+        self, scene: SettledScene, candidates: SceneCandidates, spec: Specification, rows: Sequence[int]
     ) -> Columns:
         """The columns of the candidates `rows`, as `label` gives them among all."""
         if self.label_rows is not None:

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.collision import Ints
-from datagen.workers.motion.forward import ForwardKinematics
+from datagen.workers.motion.forward_kinematics import ForwardKinematics
 from datagen.workers.robots.robot import Robot
 
 _SAMPLES = 16384

@@ -45,7 +45,7 @@ def is_line_free(q_from: F64, q_to: F64, first_blocked: FirstBlocked, step_rad: 
     return first_blocked(q) == len(q)
 
 
-class _Tree:
+class _SearchTree:
     def __init__(self, root: F64, capacity: int) -> None:
         self.q = np.empty((capacity, len(root)))
         self.q[0] = root
@@ -85,7 +85,7 @@ def connect(
     straight for the new end as far as it is free. The trees take turns. The same `rng` gives the same path.
     """
     capacity = 2 * iterations + 1
-    trees = (_Tree(q_start, capacity), _Tree(q_goal, capacity))
+    trees = (_SearchTree(q_start, capacity), _SearchTree(q_goal, capacity))
     for k in range(iterations):
         grown, other = trees[k % 2], trees[1 - k % 2]
         end = _advance(grown, rng.uniform(lower_rad, upper_rad), _LONGEST_EDGE_RAD, first_blocked, step_rad)
@@ -100,7 +100,7 @@ def connect(
 
 
 def _advance(
-    tree: _Tree, q_to: F64, longest_rad: float, first_blocked: FirstBlocked, step_rad: float
+    tree: _SearchTree, q_to: F64, longest_rad: float, first_blocked: FirstBlocked, step_rad: float
 ) -> int | None:
     """Grow from the nearest node towards `q_to` as far as the line is free; the new node, if any."""
     nearest = tree.nearest(q_to)

@@ -14,13 +14,13 @@ from datagen.workers.objects import shapes
 from datagen.workers.objects.builtin_table import RECIPES
 from datagen.workers.objects.convex import ConvexParts, convex_parts, fits_gripper
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.objects.shapes import Paint, Solid
+from datagen.workers.objects.shapes import Paint, ParametricSolid
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 # Part of every digest: raise it when `shapes` or the assembly here changes what comes out.
 GENERATOR_VERSION = 1
 
-_SHAPES: dict[str, Callable[..., Solid]] = {
+_SHAPES: dict[str, Callable[..., ParametricSolid]] = {
     "block": shapes.block,
     "lathe": shapes.lathe,
     "vessel": shapes.vessel,
@@ -92,7 +92,7 @@ def _model(name: str, digest: str) -> ObjectModel:
     )
 
 
-def _piece(piece: dict[str, Any]) -> Solid:
+def _piece(piece: dict[str, Any]) -> ParametricSolid:
     arguments = {key: value for key, value in piece.items() if key not in ("shape", "with", "put")}
     for key in ("centres_m", "radii_m"):
         if key in arguments:

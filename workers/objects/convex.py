@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import open_regular
 from datagen.schemas.identity import digest_of
-from datagen.workers.content_cache import Arrays, Shelf
+from datagen.schemas.untrusted_files import open_regular
+from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.geometry.mesh import F32, Mesh, Texture
 from datagen.workers.objects.convex import ConvexParts, read_convex_parts
 from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
@@ -21,7 +21,7 @@ from datagen.workers.objects.texture import face_colours, read_texture
 READER_VERSION = 1
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
-_SHELF = Shelf(
+_CACHE = CacheFolder(
     "objects",
     {
         "vertices": (np.float32, ("vertices", 3)),
@@ -74,11 +74,11 @@ def load_scan(files: ScanFiles) -> Scan:
     Raises InputError as `read_scan` does; a cache that cannot be used costs time, never a result.
     """
     key = f"{files.digest}-{READER_VERSION}"
-    stored = _SHELF.load(key)
+    stored = _CACHE.load(key)
     if stored is not None:
         return _restored(stored)
     scan = read_scan(files.visual, files.texture, files.collision)
-    _SHELF.store(key, _stored(scan))
+    _CACHE.store(key, _stored(scan))
     return scan
 
 

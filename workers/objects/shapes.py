@@ -25,7 +25,7 @@ Profile = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class ParametricSolid:
     """A closed surface and convex parts, in one frame."""
 
     mesh: Mesh
@@ -82,7 +82,7 @@ def faces_of_box(colours: Sequence[Rgb]) -> Paint:
     return paint
 
 
-def block(size_m: tuple[float, float, float], paint: Paint, cells: int = 6) -> Solid:
+def block(size_m: tuple[float, float, float], paint: Paint, cells: int = 6) -> ParametricSolid:
     """A box about the origin, its sides cut into cells x cells squares to carry a print."""
     half = np.array(size_m) / 2
     ticks = np.linspace(-1, 1, cells + 1)
@@ -108,7 +108,7 @@ def block(size_m: tuple[float, float, float], paint: Paint, cells: int = 6) -> S
     return _painted(np.concatenate(points) * half, all_faces, squares, [signs * half], paint)
 
 
-def lathe(profile_m: Profile, paint: Paint, segments: int = 32) -> Solid:
+def lathe(profile_m: Profile, paint: Paint, segments: int = 32) -> ParametricSolid:
     """A solid of revolution about z from its outline (radius, height), bottom to top.
 
     The caps are flat; a radius of 0 makes a tip. Heights must not fall. Convex parts are the
@@ -121,7 +121,7 @@ def lathe(profile_m: Profile, paint: Paint, segments: int = 32) -> Solid:
     return _painted(vertices, faces, cells, parts, paint)
 
 
-def vessel(outer_m: Profile, inner_m: Profile, paint: Paint, segments: int = 20) -> Solid:
+def vessel(outer_m: Profile, inner_m: Profile, paint: Paint, segments: int = 20) -> ParametricSolid:
     """An open vessel: outer outline foot to rim, inner outline floor to rim, both (radius, height).
 
     The outer outline has one point more, its foot; the others face the inner ones one by one, the
@@ -141,7 +141,9 @@ def vessel(outer_m: Profile, inner_m: Profile, paint: Paint, segments: int = 20)
     return _painted(vertices, faces, cells, parts, paint)
 
 
-def tube(centres_m: F64, radii_m: F64, paint: Paint, segments: int = 12, flat: float = 1.0) -> Solid:
+def tube(
+    centres_m: F64, radii_m: F64, paint: Paint, segments: int = 12, flat: float = 1.0
+) -> ParametricSolid:
     """A bent bar: circles of `radii_m` (N,) around `centres_m` (N, 3), across the path.
 
     The path lies in a plane; `flat` is the section's size across that plane over its size in it.
@@ -163,22 +165,24 @@ def tube(centres_m: F64, radii_m: F64, paint: Paint, segments: int = 12, flat: f
 
 
 def moved(
-    solid: Solid,
+    solid: ParametricSolid,
     offset_m: Sequence[float] = (0, 0, 0),
     turn: Sequence[float] = (0, 0, 0),
     scale: Sequence[float] = (1, 1, 1),
-) -> Solid:
+) -> ParametricSolid:
     """The solid scaled, then turned (rotation vector, radians), then shifted."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ np.diag(scale)
     T[:3, 3] = offset_m
     parts = tuple((part @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for part in solid.parts_m)
-    return Solid(solid.mesh.transformed(T), parts)
+    return ParametricSolid(solid.mesh.transformed(T), parts)
 
 
-def joined(*solids: Solid) -> Solid:
+def joined(*solids: ParametricSolid) -> ParametricSolid:
     """Several solids as one object; they may overlap."""
-    return Solid(concatenate([s.mesh for s in solids]), tuple(part for s in solids for part in s.parts_m))
+    return ParametricSolid(
+        concatenate([s.mesh for s in solids]), tuple(part for s in solids for part in s.parts_m)
+    )
 
 
 def _plane_normal(points_m: F64) -> F64:
@@ -240,7 +244,9 @@ def _bulging_runs(outline: F64) -> list[tuple[int, int]]:
     return [*runs, (start, len(outline) - 1)]
 
 
-def _painted(vertices: F64, faces: Indices, cells: Indices, parts: Sequence[F64], paint: Paint) -> Solid:
+def _painted(
+    vertices: F64, faces: Indices, cells: Indices, parts: Sequence[F64], paint: Paint
+) -> ParametricSolid:
     """Faces of one cell (the two triangles of a quadrilateral) are painted alike."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -252,4 +258,6 @@ def _painted(vertices: F64, faces: Indices, cells: Indices, parts: Sequence[F64]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     colours = np.asarray(paint(centre / weight, normal)).astype(np.uint8)[of_face]
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32), colours)
-    return Solid(mesh, tuple(part.astype(np.float32)[np.sort(ConvexHull(part).vertices)] for part in parts))
+    return ParametricSolid(
+        mesh, tuple(part.astype(np.float32)[np.sort(ConvexHull(part).vertices)] for part in parts)
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.workers.objects.convex import fits_gripper
-from datagen.workers.objects.credibility import reason_to_exclude
+from datagen.workers.objects.exclusions import reason_to_exclude
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.objects.scan import READER_VERSION, Scan, load_scan
 from datagen.workers.objects.ycb_layouts import Entry, read_layout

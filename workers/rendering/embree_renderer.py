@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64, U8
-from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
 from datagen.workers.rendering.rays import (
     MISS,
     Hits,
     RayMesh,
-    RayStage,
+    RayScene,
     first_hits,
     house_rays,
     into_frame,
@@ -38,25 +38,25 @@ class Pixels:
     body: I16  # (N,)
 
 
-def ray_stage(stage: Stage) -> RayStage:
-    """Hierarchies of a stage, built from scratch; runs keep them in `datagen.workers.world` instead."""
-    return RayStage(
-        house_rays(stage.house),
-        [object_rays(model) for model in stage.objects],
-        np.array([model.radius_m for model in stage.objects]),
-        stage.T_world_object,
+def ray_scene(scene: SceneGeometry) -> RayScene:
+    """Hierarchies of a scene, built from scratch; runs keep them in `datagen.workers.world` instead."""
+    return RayScene(
+        house_rays(scene.house),
+        [object_rays(model) for model in scene.objects],
+        np.array([model.radius_m for model in scene.objects]),
+        scene.T_world_object,
     )
 
 
-def render_embree(stage: Stage, camera: Camera) -> Frame:
-    """The whole frame of a stage."""
-    return render_rays(ray_stage(stage), camera)
+def render_embree(scene: SceneGeometry, camera: Camera) -> Frame:
+    """The whole frame of a scene."""
+    return render_rays(ray_scene(scene), camera)
 
 
-def render_rays(stage: RayStage, camera: Camera) -> Frame:
-    """The whole frame of a stage whose hierarchies exist."""
+def render_rays(scene: RayScene, camera: Camera) -> Frame:
+    """The whole frame of a scene whose hierarchies exist."""
     h, w = camera.height_px, camera.width_px
-    pixels = cast_pixels(stage, camera, np.arange(h * w))
+    pixels = cast_pixels(scene, camera, np.arange(h * w))
     return Frame(camera, pixels.rgb.reshape(h, w, 3), pixels.depth_m.reshape(h, w), pixels.body.reshape(h, w))
 
 
@@ -68,7 +68,7 @@ def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
     return np.stack([x, y, np.ones(len(pixels))], axis=1).astype(np.float32)
 
 
-def cast_pixels(stage: RayStage, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:
+def cast_pixels(scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:
     """Colour, depth and body of chosen pixels, given as flat indices (N,) into the frame."""
     n = len(pixels)
     rotation = camera.T_world_camera[:3, :3].astype(np.float32)
@@ -76,18 +76,18 @@ def cast_pixels(stage: RayStage, camera: Camera, pixels: npt.NDArray[np.int64]) 
     origins = np.tile(camera.T_world_camera[:3, 3].astype(np.float32), (n, 1))
 
     # Directions have depth 1, so the ray parameter is the depth along the camera's z axis.
-    hits = first_hits(stage.house, origins, directions)
+    hits = first_hits(scene.house, origins, directions)
     depth_m = hits.parameter.copy()
     body = np.where(hits.face >= 0, 0, -1).astype(np.int16)
     rgb = np.empty((n, 3), np.uint8)
     rgb[:] = _BACKGROUND_RGB
     shown = hits.face >= 0
-    rgb[shown] = _shade(stage.house, _take(hits, shown), directions[shown])
+    rgb[shown] = _shade(scene.house, _take(hits, shown), directions[shown])
 
     eye_m = camera.T_world_camera[:3, 3]
-    for k, rays in enumerate(stage.objects):
-        T = stage.T_world_object[k]
-        near = _towards_sphere(eye_m, directions, T[:3, 3], float(stage.radii_m[k]))
+    for k, rays in enumerate(scene.objects):
+        T = scene.T_world_object[k]
+        near = _towards_sphere(eye_m, directions, T[:3, 3], float(scene.radii_m[k]))
         local_origins, local_directions = into_frame(T, origins[near], directions[near])
         found = first_hits(rays, local_origins, local_directions)
         closer = found.parameter < depth_m[near]

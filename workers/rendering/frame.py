@@ -33,7 +33,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class SceneGeometry:
     """What stands in front of the camera: a house and the objects placed in it."""
 
     house: House
@@ -55,6 +55,6 @@ class Frame:
 
 
 class Renderer(Protocol):
-    """Renders one frame of a stage."""
+    """Renders one frame of a scene."""
 
-    def __call__(self, stage: Stage, camera: Camera) -> Frame: ...
+    def __call__(self, scene: SceneGeometry, camera: Camera) -> Frame: ...

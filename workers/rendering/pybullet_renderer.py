@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
 from datagen.workers.geometry.transforms import inverse, look_at, quaternion_wxyz
 from datagen.workers.rendering.face_texture import face_normals, face_texture
-from datagen.workers.rendering.frame import I16, Camera, Frame, Stage
+from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
 
 # What is nearer or farther is not drawn. A near plane far off keeps depth sharp; one close to the
 # eye shows the wall that an eye stands in.
@@ -27,29 +27,29 @@ _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
 _AMBIENT, _DIFFUSE = 0.7, 0.3
 
 
-def render_pybullet(stage: Stage, camera: Camera) -> Frame:
-    """The whole frame of a stage, built from scratch. Raises InputError where Bullet cannot."""
-    with PybulletStage(stage) as loaded:
+def render_pybullet(scene: SceneGeometry, camera: Camera) -> Frame:
+    """The whole frame of a scene, built from scratch. Raises InputError where Bullet cannot."""
+    with PybulletScene(scene) as loaded:
         return loaded.render(camera)
 
 
-class PybulletStage:
-    """A stage loaded once, for many images; a context manager that frees it at the end."""
+class PybulletScene:
+    """A scene loaded once, for many images; a context manager that frees it at the end."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, scene: SceneGeometry) -> None:
+        self._scene = scene
         self._closing = ExitStack()
         self._alone: dict[int, _Drawing] = {}
-        with ExitStack() as undo:  # a stage that fails to load leaves nothing behind
+        with ExitStack() as undo:  # a scene that fails to load leaves nothing behind
             self._full = undo.enter_context(_Drawing())
             # An eye within a wall or a cupboard sees it from inside.
-            house = concatenate([body.visual for body in stage.house.bodies])
+            house = concatenate([body.visual for body in scene.house.bodies])
             self._full.add(house, np.eye(4), 0, both_sides=True)
-            for k, model in enumerate(stage.objects):
-                self._full.add(model.visual, stage.T_world_object[k], 1 + k)
+            for k, model in enumerate(scene.objects):
+                self._full.add(model.visual, scene.T_world_object[k], 1 + k)
             self._closing = undo.pop_all()
 
-    def __enter__(self) -> PybulletStage:
+    def __enter__(self) -> PybulletScene:
         return self
 
     def __exit__(
@@ -69,11 +69,11 @@ class PybulletStage:
         """
         if target not in self._alone:
             drawing = self._closing.enter_context(_Drawing())
-            drawing.add(self._stage.objects[target].visual, self._stage.T_world_object[target], 1 + target)
+            drawing.add(self._scene.objects[target].visual, self._scene.T_world_object[target], 1 + target)
             self._alone[target] = drawing
         alone_px, visible_px = np.zeros(len(eyes_m), np.int32), np.zeros(len(eyes_m), np.int32)
-        centre_m = self._stage.T_world_object[target, :3, 3]
-        radius_m = self._stage.objects[target].radius_m
+        centre_m = self._scene.T_world_object[target, :3, 3]
+        radius_m = self._scene.objects[target].radius_m
         for row, eye_m in enumerate(eyes_m):
             distance_m = float(np.linalg.norm(eye_m - centre_m))
             if distance_m <= radius_m * 1.05:
@@ -94,7 +94,7 @@ class _Drawing:
     def __init__(self) -> None:
         self._world: int = pybullet.connect(pybullet.DIRECT)
         if self._world < 0:
-            mend = "Draw fewer stages at once in one process, or take another renderer"
+            mend = "Draw fewer scenes at once in one process, or take another renderer"
             raise InputError("--renderer", "pybullet", "Bullet cannot open another world", mend)
         self._label_of_body: list[int] = []
 

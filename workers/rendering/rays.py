@@ -33,7 +33,7 @@ class RayMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class RayStage:
+class RayScene:
     """A house and placed objects, ready for rays."""
 
     house: RayMesh

@@ -12,7 +12,7 @@ from datagen.schemas.errors import InputError
 from datagen.workers.geometry.mesh import F64, Mesh, concatenate
 from datagen.workers.geometry.transforms import quaternion_wxyz
 from datagen.workers.rendering.face_texture import face_normals, face_texture
-from datagen.workers.rendering.frame import Camera, Frame, Stage
+from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; whether one works is found out below.
@@ -40,11 +40,11 @@ class _Studio:
 _studio: _Studio | None = None
 
 
-def render_sapien(stage: Stage, camera: Camera) -> Frame:
-    """The whole frame of a stage. Raises InputError where this machine has no render device."""
+def render_sapien(geometry: SceneGeometry, camera: Camera) -> Frame:
+    """The whole frame of a scene. Raises InputError where this machine has no render device."""
     studio = _the_studio()
-    meshes = [(concatenate([body.visual for body in stage.house.bodies]), np.eye(4))]
-    meshes += [(model.visual, T) for model, T in zip(stage.objects, stage.T_world_object, strict=True)]
+    meshes = [(concatenate([body.visual for body in geometry.house.bodies]), np.eye(4))]
+    meshes += [(model.visual, T) for model, T in zip(geometry.objects, geometry.T_world_object, strict=True)]
     entities: list[sapien.Entity] = []
     try:
         for mesh, T in meshes:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import look_at
-from datagen.workers.rendering.rays import MISS, RayMesh, RayStage, nearest, occluded
+from datagen.workers.rendering.rays import MISS, RayMesh, RayScene, nearest, occluded
 
 # A hit on the target counts as seen up to this depth before it, so that what the target stands on
 # does not hide it by rounding.
@@ -18,7 +18,7 @@ _MAX_RAYS = 1 << 16
 I32 = npt.NDArray[np.int32]
 
 
-def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
+def visible_pixels(scene: RayScene, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
     """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
 
     Each eye (N, 3), world, looks at the centre of object `target` through a window of
@@ -27,30 +27,30 @@ def visible_pixels(stage: RayStage, target: int, eyes_m: F64, window: int) -> tu
     """
     n = len(eyes_m)
     target_px, visible_px = np.zeros(n, np.int32), np.zeros(n, np.int32)
-    centre_m = stage.T_world_object[target, :3, 3]
+    centre_m = scene.T_world_object[target, :3, 3]
     distance_m = np.linalg.norm(eyes_m - centre_m, axis=1)
-    usable = np.flatnonzero(distance_m > stage.radii_m[target] * 1.05)
+    usable = np.flatnonzero(distance_m > scene.radii_m[target] * 1.05)
     block = max(1, _MAX_RAYS // window**2)
     for start in range(0, len(usable), block):
         rows = usable[start : start + block]
-        alone, seen = _count(stage, target, eyes_m[rows], distance_m[rows], window)
+        alone, seen = _count(scene, target, eyes_m[rows], distance_m[rows], window)
         target_px[rows], visible_px[rows] = alone, seen
     return target_px, visible_px
 
 
-def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
+def _count(scene: RayScene, target: int, eyes_m: F64, distance_m: F64, window: int) -> tuple[I32, I32]:
     n = len(eyes_m)
-    T_world_target = stage.T_world_object[target]
+    T_world_target = scene.T_world_object[target]
     axes = np.stack([look_at(eye, T_world_target[:3, 3])[:3, :3] for eye in eyes_m])  # (n, 3, 3)
-    sine = stage.radii_m[target] / distance_m
+    sine = scene.radii_m[target] / distance_m
     half_width = sine / np.sqrt(1 - sine**2)  # of the window, at depth 1
-    eye, x, y = _window_rays(stage.objects[target], T_world_target, eyes_m, axes, half_width, window)
+    eye, x, y = _window_rays(scene.objects[target], T_world_target, eyes_m, axes, half_width, window)
 
     # Alone, in the target's own frame.
     local_axes = T_world_target[:3, :3].T @ axes
     local_eyes = ((eyes_m - T_world_target[:3, 3]) @ T_world_target[:3, :3]).astype(np.float32)
     parameter = nearest(
-        stage.objects[target], local_eyes.take(eye, axis=0), _directions(local_axes, eye, x, y)
+        scene.objects[target], local_eyes.take(eye, axis=0), _directions(local_axes, eye, x, y)
     )
     hit = np.flatnonzero(parameter < MISS)
     eye, limits = eye[hit], parameter[hit] - np.float32(_SKIN_M)
@@ -58,17 +58,17 @@ def _count(stage: RayStage, target: int, eyes_m: F64, distance_m: F64, window: i
     alone = np.bincount(eye, minlength=n).astype(np.int32)
 
     # What is left of these rays after the house and each other object that may stand before it.
-    free = ~occluded(stage.house, eyes_m.astype(np.float32).take(eye, axis=0), directions, limits)
-    for k in range(len(stage.objects)):
+    free = ~occluded(scene.house, eyes_m.astype(np.float32).take(eye, axis=0), directions, limits)
+    for k in range(len(scene.objects)):
         if k == target:
             continue
-        between = np.flatnonzero(_may_hide(stage, k, target, eyes_m, distance_m)[eye] & free)
+        between = np.flatnonzero(_may_hide(scene, k, target, eyes_m, distance_m)[eye] & free)
         if len(between):
-            T = stage.T_world_object[k]
+            T = scene.T_world_object[k]
             local = ((eyes_m - T[:3, 3]) @ T[:3, :3]).astype(np.float32)
             towards = directions.take(between, axis=0) @ T[:3, :3].astype(np.float32)
             origins_m = local.take(eye.take(between), axis=0)
-            free[between] = ~occluded(stage.objects[k], origins_m, towards, limits.take(between))
+            free[between] = ~occluded(scene.objects[k], origins_m, towards, limits.take(between))
     return alone, np.bincount(eye[free], minlength=n).astype(np.int32)
 
 
@@ -112,12 +112,12 @@ def _window_rays(
     return eye, (centres[u] * scale).astype(np.float32), (centres[v] * scale).astype(np.float32)
 
 
-def _may_hide(stage: RayStage, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:
+def _may_hide(scene: RayScene, k: int, target: int, eyes_m: F64, distance_m: F64) -> npt.NDArray[np.bool_]:
     """Whether object k's bounding sphere cuts the capsule around the sight line; per eye (N,)."""
-    centre_m = stage.T_world_object[target, :3, 3]
+    centre_m = scene.T_world_object[target, :3, 3]
     along = (centre_m - eyes_m) / distance_m[:, None]
-    rel = stage.T_world_object[k, :3, 3] - eyes_m
+    rel = scene.T_world_object[k, :3, 3] - eyes_m
     t = np.clip((rel * along).sum(1), 0.0, distance_m)
     gap = np.linalg.norm(rel - t[:, None] * along, axis=1)
     # The window's rays to the target stay within its sphere's radius of the sight line.
-    return gap < stage.radii_m[k] + stage.radii_m[target]
+    return gap < scene.radii_m[k] + scene.radii_m[target]

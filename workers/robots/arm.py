@@ -13,11 +13,11 @@ from datagen.workers.geometry.mesh import F64, Mesh
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.robots.assembly import Assembly, assemble, gripper_of
 from datagen.workers.robots.description import RobotDescription
-from datagen.workers.robots.inverse import solve
-from datagen.workers.robots.looks import body_mesh
+from datagen.workers.robots.inverse_kinematics import solve
 from datagen.workers.robots.robot import Gripper, Parts
+from datagen.workers.robots.robot_files import RobotFiles, hull_of
 from datagen.workers.robots.self_collision import SelfCollision
-from datagen.workers.robots.written import RobotFiles, hull_of
+from datagen.workers.robots.visual_meshes import body_mesh
 
 # Its binary modules have no types.
 pin: Any = pinocchio

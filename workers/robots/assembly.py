@@ -16,14 +16,14 @@ from datagen.workers.robots.chain import Chain, largest_reach_m
 from datagen.workers.robots.description import HandDescription, RobotDescription, robots_folder
 from datagen.workers.robots.hulls import shape_parts
 from datagen.workers.robots.robot import Gripper, Parts
-from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, Tree, read_urdf, scaled_inertial
+from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, read_urdf, scaled_inertial
 
 _TUBE_SIDES = 12
 _REACH_TOLERANCE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class LinkBody:
     """A link that carries shape, with all that is fixed to it."""
 
     name: str
@@ -39,7 +39,7 @@ class Body:
 class Assembly:
     """Bodies 0 (root), 1..A (arm), then palm and two fingers. Joint k moves body k + 1."""
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[LinkBody, ...]
     arm: tuple[Joint, ...]  # (A,), with scaled origins; names of parent and child are those of bodies
     palm: Joint
     fingers: tuple[Joint, Joint]
@@ -111,7 +111,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
 _Cluster = dict[str, tuple[Link, F64]]  # links that do not move against the head, with their poses in it
 
 
-def _cluster(tree: Tree, head: str, stops: set[str], held: dict[str, float]) -> _Cluster:
+def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float]) -> _Cluster:
     found: _Cluster = {head: (tree.link(head), np.eye(4))}
     waiting = [head]
     while waiting:
@@ -130,13 +130,13 @@ def _cluster(tree: Tree, head: str, stops: set[str], held: dict[str, float]) -> 
     return found
 
 
-def _joint_names_above(tree: Tree, link: str) -> tuple[str, ...]:
+def _joint_names_above(tree: UrdfTree, link: str) -> tuple[str, ...]:
     joint = tree.joint_above(link) if link in tree.links else None
     return (joint.name,) if joint else ()
 
 
 def _joints(
-    description: RobotDescription, tree: Tree, clusters: list[_Cluster], scale: float, extension_m: float
+    description: RobotDescription, tree: UrdfTree, clusters: list[_Cluster], scale: float, extension_m: float
 ) -> tuple[tuple[Joint, ...], Joint, Chain]:
     heads = [next(iter(cluster)) for cluster in clusters]
     arm: list[Joint] = []
@@ -173,7 +173,11 @@ def _joints(
 
 
 def _scale_for(
-    description: RobotDescription, tree: Tree, clusters: list[_Cluster], extension_m: float, reach_m: float
+    description: RobotDescription,
+    tree: UrdfTree,
+    clusters: list[_Cluster],
+    extension_m: float,
+    reach_m: float,
 ) -> float:
     """The scale at which the arm reaches so far, by the secant method: reach is nearly linear in it."""
 
@@ -195,7 +199,7 @@ def _scale_for(
 
 def _body(
     path: Path, name: str, cluster: _Cluster, scale: float, cuts_m: Mapping[str, tuple[float, ...]]
-) -> Body:
+) -> LinkBody:
     parts: list[F32] = []
     unscaled: list[F32] = []
     visuals: list[Shape] = []
@@ -214,7 +218,7 @@ def _body(
     if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
         visuals = []
     drawn = () if visuals else tuple(parts)
-    return Body(name, inertial, tuple(parts), tuple(unscaled), tuple(visuals), scale, drawn)
+    return LinkBody(name, inertial, tuple(parts), tuple(unscaled), tuple(visuals), scale, drawn)
 
 
 def _placed(shape: Shape, T: F64) -> Shape:
@@ -244,7 +248,7 @@ def _tube(T_flange: F64, length_m: float, radius_m: float) -> F32:
     return (points @ T_flange[:3, :3].T + T_flange[:3, 3]).astype(np.float32)
 
 
-def _fingers(hand: Tree, description: HandDescription) -> tuple[Joint, Joint]:
+def _fingers(hand: UrdfTree, description: HandDescription) -> tuple[Joint, Joint]:
     left, right = (hand.joint(name) for name in description.finger_joints)
     R = description.T_palm_tcp[:3, :3]
     for joint, side in ((left, 1.0), (right, -1.0)):

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.robots.robot import Parts
 from datagen.workers.robots.urdf import Shape

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.foreign_files import read_regular
+from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20
@@ -65,7 +65,7 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class UrdfTree:
     """A URDF's links and joints by name, in the file's order."""
 
     path: Path
@@ -93,7 +93,7 @@ class Tree:
         return next((joint for joint in self.joints.values() if joint.child == link), None)
 
 
-def read_urdf(path: Path) -> Tree:
+def read_urdf(path: Path) -> UrdfTree:
     """All links and joints of a URDF; paths of meshes are resolved against its folder.
 
     Raises InputError naming the file and the element: unreadable, not XML, a number that is not
@@ -116,7 +116,7 @@ def read_urdf(path: Path) -> Tree:
                 raise _wrong(path, f"joint {joint.name}", f"link {end!r} does not exist")
     if len({joint.child for joint in joints.values()}) < len(joints):
         raise _wrong(path, "joints", "a link has two parents")
-    tree = Tree(path, links, joints)
+    tree = UrdfTree(path, links, joints)
     for name in links:
         above, steps = tree.joint_above(name), 0
         while above is not None:

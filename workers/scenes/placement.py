@@ -13,7 +13,7 @@ from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40
@@ -64,7 +64,7 @@ def drop_poses(
 
     Object 0, the target, goes anywhere; the others within `clutter_radius_m` of it, then up to
     twice as far, and anywhere once that is full.
-    `taken` are footprints in the surface frame that are kept free. Raises Redraw("no_placement").
+    `taken` are footprints in the surface frame that are kept free. Raises SceneRejected("no_placement").
     """
     half = np.array(surface.size_m) / 2 - params.edge_margin_m
     placed: list[F64] = [np.asarray(p) for p in taken]
@@ -88,7 +88,7 @@ def drop_poses(
             if on_surface and not any(_overlap(outline, placed[i]) for i in _boxes_meet(outline, low, high)):
                 break
         else:
-            raise Redraw("no_placement")
+            raise SceneRejected("no_placement")
         if k == 0:
             target_xy = xy
         placed.append(outline)

@@ -10,7 +10,7 @@ from datagen.workers.houses.house import Surface
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.rendering.cloud import Cloud
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.rays import RayScene
 from datagen.workers.settling.settler import SettleResult
 from datagen.workers.world import PreparedHouse
 
@@ -36,7 +36,7 @@ class SettledScene(Protocol):
         ...
 
     @property
-    def rays(self) -> RayStage: ...
+    def rays(self) -> RayScene: ...
 
     @property
     def target_center_m(self) -> F64:
@@ -55,7 +55,7 @@ class Scene:
     surface: Surface
     models: tuple[ObjectModel, ...]
     settled: SettleResult
-    rays: RayStage
+    rays: RayScene
     camera: Camera
     target_visible_fraction: float
     cloud: Cloud

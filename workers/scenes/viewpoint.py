@@ -10,17 +10,17 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.houses.house import Room
-from datagen.workers.redraw import Redraw
 from datagen.workers.rendering.frame import Camera
-from datagen.workers.rendering.rays import RayStage
+from datagen.workers.rendering.rays import RayScene
 from datagen.workers.rendering.visibility import visible_pixels
+from datagen.workers.scene_rejected import SceneRejected
 
 _WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
 _BLOCK = 8
 
 
 def draw_viewpoint(
-    rays: RayStage,
+    rays: RayScene,
     room: Room,
     obstacles: Obstacles,
     target_center_m: F64,
@@ -31,7 +31,7 @@ def draw_viewpoint(
     """A camera at a free place on the room's floor, and the share of the target that it sees.
 
     The carrier is a column of the robot's base radius up to the camera. Raises
-    Redraw("no_viewpoint") when none of `max_viewpoints` places serves.
+    SceneRejected("no_viewpoint") when none of `max_viewpoints` places serves.
     """
     n = params.max_viewpoints
     angle = rng.uniform(-np.pi, np.pi, n)
@@ -51,7 +51,7 @@ def draw_viewpoint(
         if len(good):
             row = rows[good[0]]
             return camera_at(eyes_m[row], target_center_m, params), float(share[good[0]])
-    raise Redraw("no_viewpoint")
+    raise SceneRejected("no_viewpoint")
 
 
 def camera_at(eye_m: F64, target_m: F64, params: ObservationParams) -> Camera:

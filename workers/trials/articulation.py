@@ -10,7 +10,7 @@ import numpy as np
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.robot import Robot
-from datagen.workers.robots.urdf import Joint, Tree, read_urdf
+from datagen.workers.robots.urdf import Joint, UrdfTree, read_urdf
 
 # Bodies that carry no mass of their own still need some: a speck at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6
@@ -70,7 +70,7 @@ def articulation_of(robot: Robot) -> Articulation:
     return Articulation(tuple(bodies), tuple(by_joint[name] for name in moving), robot.T_base_root)
 
 
-def _rigid_links(tree: Tree, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
+def _rigid_links(tree: UrdfTree, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
     """The link and all that hangs on it by joints that do not move, with their poses in its frame."""
     found = [(link, np.eye(4))]
     for name, T in found:
@@ -81,7 +81,7 @@ def _rigid_links(tree: Tree, link: str, moving: tuple[str, ...]) -> list[tuple[s
 
 
 def _body(
-    tree: Tree,
+    tree: UrdfTree,
     rigid: list[tuple[str, F64]],
     parent: int,
     joint: Joint | None,

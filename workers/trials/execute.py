@@ -9,19 +9,22 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.trials.drive_targets import (
+    PHASES,
+    ControlPeriod,
+    drive_targets,
+    planned_rise_m,
+    pressing_target_m,
+)
 from datagen.workers.trials.physics import TrialWorld
-from datagen.workers.trials.prepared import (
+from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
+from datagen.workers.trials.trial_scene import (
     TrialScene,
     disturbed_things,
     pedestal_below,
-    prepare_trials,
     still_parts_near,
 )
-from datagen.workers.trials.script import PHASES, Tick, planned_rise_m, pressing_target_m, script_of
-from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
-
-__all__ = ["TrialScene", "prepare_trials", "run_trial"]
 
 # At the end of reach and approach no joint may be farther off than this, nor the TCP.
 _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015
@@ -101,7 +104,7 @@ class _Trial:
         }
         if ended := self._settle():
             return ended
-        for tick in script_of(self.plan, self.prepared.robot, self.prepared.params):
+        for tick in drive_targets(self.plan, self.prepared.robot, self.prepared.params):
             if ended := self._take(tick):
                 return ended
             if tick.ends_phase and (ended := ask_at_end[tick.phase](tick)):
@@ -125,7 +128,7 @@ class _Trial:
 
     # -- a tick -------------------------------------------------------------------------------------
 
-    def _take(self, tick: Tick) -> str | None:
+    def _take(self, tick: ControlPeriod) -> str | None:
         finger_m, joints = tick.finger_m, self.world.joints
         if finger_m is None:
             finger_m = pressing_target_m(joints[-2:], self.prepared.params.grip_force_n)
@@ -168,24 +171,24 @@ class _Trial:
 
     # -- ends of phases -----------------------------------------------------------------------------
 
-    def _arrived(self, tick: Tick) -> str | None:
+    def _arrived(self, tick: ControlPeriod) -> str | None:
         q = self.world.joints[:-2]
         T_base_tcp = self.prepared.robot.T_base_tcp
         off_m = np.linalg.norm(T_base_tcp(q)[:3, 3] - T_base_tcp(tick.joints_rad)[:3, 3])
         off_rad = np.abs(q - tick.joints_rad).max()
         return "not_reached" if off_rad > _JOINT_OFF_RAD or off_m > _TCP_OFF_M else None
 
-    def _closed(self, tick: Tick) -> str | None:
+    def _closed(self, tick: ControlPeriod) -> str | None:
         if self.world.joints[-2:].sum() < _EMPTY_OPENING_M or not self.gripped:
             return "missed"
         self.T_tcp_target = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
         return None
 
-    def _lifted(self, tick: Tick) -> str | None:
+    def _lifted(self, tick: ControlPeriod) -> str | None:
         risen = self.risen_m >= _RISEN_SHARE * self.rise_m
         return None if self.gripped and risen else self._lost()
 
-    def _held(self, tick: Tick) -> str | None:
+    def _held(self, tick: ControlPeriod) -> str | None:
         if not self.gripped:
             return self._lost()
         lifted = self._lift_m() >= LIFTED_SHARE * self.rise_m

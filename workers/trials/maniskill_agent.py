@@ -20,7 +20,7 @@ from mani_skill.agents.controllers.pd_joint_pos import (
 from mani_skill.agents.registration import register_agent
 
 from datagen.workers.robots.robot import Robot
-from datagen.workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
 
 
 class _FromLastTarget(PDJointPosController):

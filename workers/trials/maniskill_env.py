@@ -22,10 +22,16 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
 from datagen.workers.settling.sapien_bodies import sapien_pose
+from datagen.workers.trials.drive_targets import (
+    ControlPeriod,
+    drive_targets,
+    planned_rise_m,
+    pressing_target_m,
+)
 from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
 from datagen.workers.trials.maniskill_agent import agent_of
 from datagen.workers.trials.physics import (
@@ -43,9 +49,8 @@ from datagen.workers.trials.physics import (
     tune_pad,
     tune_shape,
 )
-from datagen.workers.trials.prepared import TrialScene, disturbed_things, pedestal_below, still_parts_near
-from datagen.workers.trials.script import Tick, planned_rise_m, pressing_target_m, script_of
 from datagen.workers.trials.trial import Disturbance
+from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, pedestal_below, still_parts_near
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
@@ -282,8 +287,8 @@ def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
     return success
 
 
-def _script(task: GraspTask) -> list[Tick]:
-    return script_of(task.plan, task.prepared.robot, task.prepared.params)
+def _script(task: GraspTask) -> list[ControlPeriod]:
+    return drive_targets(task.plan, task.prepared.robot, task.prepared.params)
 
 
 def _poses(T: Sequence[F64], device: torch.device) -> Pose:

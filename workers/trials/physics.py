@@ -19,8 +19,8 @@ from datagen.workers.settling.sapien_bodies import (
     static_body,
 )
 from datagen.workers.trials.articulation import Articulation
-from datagen.workers.trials.prepared import Things
-from datagen.workers.trials.script import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
+from datagen.workers.trials.trial_scene import MovableObjects
 
 with warnings.catch_warnings():
     # SAPIEN warns about a missing Vulkan loader at import; physics alone does not use it.
@@ -93,7 +93,7 @@ class TrialWorld:
         self,
         still_parts_m: Sequence[F32],  # each (V, 3), world frame
         pedestal_m: F32 | None,  # (V, 3), world frame
-        things: Things,
+        things: MovableObjects,
         robot: Robot,
         articulation: Articulation,
         T_world_base: F64,

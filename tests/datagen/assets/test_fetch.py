@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.assets.catalogue import CATALOGUE, Asset, select
-from datagen.assets.download import Policy, download
+from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
+from datagen.assets.download import DownloadPolicy, download
 from datagen.assets.fetch import fetch
 from datagen.assets.lock import read_lock, verify
 from datagen.schemas.errors import InputError
@@ -34,7 +34,7 @@ def site() -> Iterator[Site]:
 
 def _get(site: Site, target: Path, *, sha256: str | None = DIGEST, size: int | None = None, tries: int = 4,
          max_bytes: int = 10**6) -> str:  # fmt: skip
-    policy = Policy(tries=tries, pause=lambda seconds: None, timeout_s=5)
+    policy = DownloadPolicy(tries=tries, pause=lambda seconds: None, timeout_s=5)
     return download(
         f"{site.url}/a.bin", target, sha256=sha256, size=size, max_bytes=max_bytes,
         progress=lambda here, total: None, policy=policy,
@@ -66,7 +66,7 @@ def _get_with_dead_server_after_first_cut(site: Site, tmp_path: Path) -> None:
 
     download(
         f"{site.url}/a.bin", tmp_path / "a", sha256=DIGEST, size=None, max_bytes=10**6,
-        progress=lambda here, total: None, policy=Policy(tries=2, pause=pause),
+        progress=lambda here, total: None, policy=DownloadPolicy(tries=2, pause=pause),
     )  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def test_changed_content_is_not_glued_to_the_old_half(site: Site, tmp_path: Path
 
     digest = download(
         f"{site.url}/a.bin", tmp_path / "a", sha256=None, size=None, max_bytes=10**6,
-        progress=lambda here, total: None, policy=Policy(pause=pause),
+        progress=lambda here, total: None, policy=DownloadPolicy(pause=pause),
     )  # fmt: skip
     assert digest == hashlib.sha256(BODY[::-1]).hexdigest()
 
@@ -110,7 +110,7 @@ def test_a_spoilt_half_is_found_and_fetched_anew(site: Site, tmp_path: Path) -> 
 def test_passing_errors_are_tried_again_with_growing_pauses(site: Site, tmp_path: Path) -> None:
     site.statuses = [503, 500, 429]
     pauses: list[float] = []
-    policy = Policy(tries=6, first_pause_s=1.0, longest_pause_s=5.0, pause=pauses.append)
+    policy = DownloadPolicy(tries=6, first_pause_s=1.0, longest_pause_s=5.0, pause=pauses.append)
     download(
         f"{site.url}/a.bin", tmp_path / "a", sha256=DIGEST, size=None, max_bytes=10**6,
         progress=lambda here, total: None, policy=policy,
@@ -172,15 +172,15 @@ def _zip(files: dict[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def _asset(**changes: object) -> Asset:
+def _asset(**changes: object) -> CatalogueEntry:
     values: dict[str, object] = {"name": "toy", "file": "toy.zip", "url": "http://127.0.0.1:9/toy.zip"}
     values |= {"licence": "CC0-1.0", "into": "toy", "about": "a toy", "archive": True}
-    return Asset(**(values | changes))  # type: ignore[arg-type]
+    return CatalogueEntry(**(values | changes))  # type: ignore[arg-type]
 
 
 def test_first_use_is_recorded_and_then_held_to(site: Site, tmp_path: Path) -> None:
     site.files["/toy.zip"] = _zip({"a/b.txt": b"hello", "c.txt": b"there"})
-    quick = Policy(pause=lambda seconds: None)
+    quick = DownloadPolicy(pause=lambda seconds: None)
     done = fetch(_asset(), tmp_path / "out", cache=tmp_path / "c1", mirror=site.url, policy=quick)
     assert (done.trust, done.files, done.from_cache) == ("first-use", 2, False)
     assert (tmp_path / "out/toy/a/b.txt").read_bytes() == b"hello"

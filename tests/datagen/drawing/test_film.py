@@ -13,8 +13,8 @@ from datagen.drawing.film import Film, film_of, pictures, told_moments
 from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree_renderer import cast_pixels
-from datagen.workers.rendering.rays import RayStage
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.rendering.rays import RayScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials.trial import Recording
 from tests.datagen.drawing.trials_to_draw import base_pose, cut, recalled, recording_of, robot
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, table_house
@@ -25,7 +25,7 @@ TITLE = Title("#0a9148", "candidate 3: success", ("a scene", "numbers"))
 
 
 @pytest.fixture(scope="module")
-def scene() -> RecalledScene:
+def scene() -> ReconstructedScene:
     return recalled()
 
 
@@ -35,12 +35,12 @@ def bodies() -> RobotBodies:
 
 
 @pytest.fixture(scope="module")
-def recording(scene: RecalledScene, bodies: RobotBodies) -> Recording:
+def recording(scene: ReconstructedScene, bodies: RobotBodies) -> Recording:
     return recording_of(bodies.robot, scene, base_pose())
 
 
 @pytest.fixture(scope="module")
-def film(scene: RecalledScene, bodies: RobotBodies, recording: Recording) -> Film:
+def film(scene: ReconstructedScene, bodies: RobotBodies, recording: Recording) -> Film:
     told = told_moments(recording)
     return film_of(scene, bodies, base_pose(), recording, told, *SIZES)
 
@@ -87,7 +87,7 @@ def test_both_views_show_target_and_hand(film: Film, bodies: RobotBodies) -> Non
     row = next(row for row, words in film.told if words == "at the grasp")
     stage = film.stage(row)
     for shot in (film.wide, film.near):
-        full = RayStage(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
+        full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
         n = shot.camera.width_px * shot.camera.height_px
         body = cast_pixels(full, shot.camera, np.arange(n)).body - 1
         hand = [2 + k for k in bodies.hand]
@@ -99,7 +99,7 @@ def test_a_picture_is_what_the_renderer_shows(film: Film) -> None:
     stage = film.stage(0)
     (_, near), *_ = pictures(film, [0], 1)
     shot = film.near
-    full = RayStage(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
+    full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
     whole = cast_pixels(full, shot.camera, np.arange(near.shape[0] * near.shape[1])).rgb
     assert (whole.reshape(near.shape) == near).all(axis=2).mean() > 0.9999
 
@@ -118,7 +118,7 @@ def test_walls_before_the_camera_are_left_out(bodies: RobotBodies) -> None:
     eye_m = film.wide.camera.T_world_camera[:2, 3]
     assert np.abs(eye_m - (cx, cy)).max() > 1.1  # outside
     stage = film.stage(len(recording.phase) - 1)
-    full = RayStage(film.wide.house, stage.objects, stage.radii_m, stage.T_world_object)
+    full = RayScene(film.wide.house, stage.objects, stage.radii_m, stage.T_world_object)
     body = cast_pixels(full, film.wide.camera, np.arange(96 * 72)).body - 1
     assert (body == 0).any() and (body >= 2).sum() > 200
 
@@ -141,7 +141,7 @@ def test_a_sheet_has_eight_moments(film: Film, tmp_path: Path) -> None:
 
 
 def test_a_sheet_of_one_pose(
-    scene: RecalledScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
+    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     still = cut(recording, 1)
     film = film_of(scene, bodies, base_pose(), still, told_moments(still), *SIZES)
@@ -151,7 +151,7 @@ def test_a_sheet_of_one_pose(
 
 
 def test_a_film_moves(
-    scene: RecalledScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
+    scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     told = told_moments(recording)
     film = film_of(scene, bodies, base_pose(), recording, told, *SIZES)

@@ -7,10 +7,10 @@ import numpy as np
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.houses.house import House
-from datagen.workers.rendering.embree_renderer import ray_stage
+from datagen.workers.rendering.embree_renderer import ray_scene
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.trials.trial import Recording
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_model, camera_at, stage_with
@@ -18,7 +18,7 @@ from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_model, camera_at, stag
 _PHASES = (("reach", 12), ("approach", 6), ("close", 4), ("lift", 6), ("hold", 3))
 
 
-def recalled(house: House | None = None) -> RecalledScene:
+def recalled(house: House | None = None) -> ReconstructedScene:
     """A tall box in the middle of the table, a low one beside it."""
     models = (
         box_model("target", (0.05, 0.05, 0.16)),
@@ -26,8 +26,8 @@ def recalled(house: House | None = None) -> RecalledScene:
     )
     stage = stage_with(models, ((0.0, 0.0), (0.25, 0.15)), house)
     camera = camera_at((0.4, 0.4, 1.4), (ROOM_M[0] / 2, ROOM_M[1] / 2, TABLE_TOP_M))
-    return RecalledScene(
-        0, 0, PreparedHouse(stage.house), models, stage.T_world_object, ray_stage(stage), camera
+    return ReconstructedScene(
+        0, 0, PreparedHouse(stage.house), models, stage.T_world_object, ray_scene(stage), camera
     )
 
 
@@ -41,7 +41,7 @@ def base_pose(side_m: float = 0.62) -> F64:
     return yaw_pose(ROOM_M[0] / 2, ROOM_M[1] / 2 - side_m, TABLE_TOP_M, np.pi / 2)
 
 
-def recording_of(arm: Robot, scene: RecalledScene, T_world_base: F64) -> Recording:
+def recording_of(arm: Robot, scene: ReconstructedScene, T_world_base: F64) -> Recording:
     """The hand comes from above and lifts the target by 10 cm."""
     T_grasp = np.diag([1.0, -1.0, -1.0, 1.0])
     T_grasp[:3, 3] = scene.target_center_m + (0, 0, 0.05)

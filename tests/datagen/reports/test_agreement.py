@@ -18,7 +18,7 @@ from datagen.reports.agreement import (
     confusion,
     outcome_report,
 )
-from datagen.reports.labelled import join_labelled
+from datagen.reports.label_arrays import join_labelled
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, DISTANCE_EDGES_M, VISIBILITY_EDGES, bands
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.train.inputs import Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Batch, CandidateInputs, Clouds, RobotInputs
 
 PER_CANDIDATE = ("base_is_clear", "base_clearance_m")
 
@@ -35,13 +35,13 @@ def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: in
             target_height_m=rng.uniform(0.5, 1.0, n_scenes).astype(np.float32),
             target_radius_m=np.full(n_scenes, 0.08, np.float32),
         ),
-        robots=Robots(
+        robots=RobotInputs(
             cloud_row=np.repeat(np.arange(n_scenes), 2),
             camera_height_m=rng.uniform(0.8, 1.5, robots).astype(np.float32),
             base_height_m=rng.uniform(0.5, 1.0, robots).astype(np.float32),
             arm_reach_m=reach_m,
         ),
-        candidates=Candidates(robot_row=robot_row, base_xy_m=base_xy_m),
+        candidates=CandidateInputs(robot_row=robot_row, base_xy_m=base_xy_m),
         label=(near & clear).astype(np.int64),
         sample_id=rng.integers(0, 256, (n, 16)).astype(np.uint8),
         extra={
@@ -59,7 +59,7 @@ def take(batch: Batch[Any], rows: np.ndarray) -> Batch[Any]:
     c = batch.candidates
     return replace(
         batch,
-        candidates=Candidates(c.robot_row[rows], c.base_xy_m[rows]),
+        candidates=CandidateInputs(c.robot_row[rows], c.base_xy_m[rows]),
         label=batch.label[rows],
         sample_id=batch.sample_id[rows],
         extra={**batch.extra, **{name: batch.extra[name][rows] for name in PER_CANDIDATE}},
@@ -68,4 +68,6 @@ def take(batch: Batch[Any], rows: np.ndarray) -> Batch[Any]:
 
 def moved(batch: Batch[Any], base_xy_m: np.ndarray) -> Batch[Any]:
     """The candidates elsewhere."""
-    return replace(batch, candidates=Candidates(batch.candidates.robot_row, base_xy_m.astype(np.float32)))
+    return replace(
+        batch, candidates=CandidateInputs(batch.candidates.robot_row, base_xy_m.astype(np.float32))
+    )

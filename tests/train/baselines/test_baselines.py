@@ -22,7 +22,7 @@ from datagen.train.baselines.proximity import Proximity
 from datagen.train.baselines.scalars import FEATURES, Scalars, features
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import is_clear
-from datagen.workers.labels.heuristic import heuristic
+from datagen.workers.labels.distance_visibility_score import heuristic
 from tests.train.baselines.scenes import make_batch, moved, take
 
 

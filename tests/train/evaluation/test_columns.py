@@ -10,7 +10,7 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.train.evaluation.columns import gather
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
 from tests.train.evaluation.made_columns import make_columns
 
 CELLS = 4
@@ -57,8 +57,8 @@ def make_batch(first: int, robots: list[int], per_robot: int = CELLS) -> Batch[A
             np.ones(s, np.float32),
             np.ones(s, np.float32),
         ),
-        Robots(cloud_row, heights, heights, heights),
-        Candidates(np.repeat(np.arange(r), per_robot), rng.uniform(-1, 1, (n, 2)).astype(np.float32)),
+        RobotInputs(cloud_row, heights, heights, heights),
+        CandidateInputs(np.repeat(np.arange(r), per_robot), rng.uniform(-1, 1, (n, 2)).astype(np.float32)),
         np.ones(n, np.int64),
         ids,
         extra,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datagen.train.inputs import Candidates, Clouds, Robots
+from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models import Model, build_model
 
 SMALL: dict[str, dict[str, Any]] = {
@@ -30,7 +30,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 REACH_M = 0.8
 
-Tables = tuple[Clouds[Tensor], Candidates[Tensor], Robots[Tensor]]
+Tables = tuple[Clouds[Tensor], CandidateInputs[Tensor], RobotInputs[Tensor]]
 
 
 def small_model(name: str, seed: int = 0, **changes: Any) -> Model:
@@ -64,13 +64,13 @@ def drawn_tables(
         target_height_m=torch.tensor(rng.uniform(0.6, 1.0, scenes), dtype=torch.float32),
         target_radius_m=torch.tensor(rng.uniform(0.05, 0.1, scenes), dtype=torch.float32),
     )
-    of_robots = Robots(
+    of_robots = RobotInputs(
         cloud_row=torch.arange(robots) % max(scenes, 1),
         camera_height_m=torch.tensor(rng.uniform(0.8, 1.5, robots), dtype=torch.float32),
         base_height_m=torch.tensor(rng.uniform(0.5, 1.0, robots), dtype=torch.float32),
         arm_reach_m=torch.full((robots,), REACH_M),
     )
-    of_candidates = Candidates(
+    of_candidates = CandidateInputs(
         robot_row=torch.tensor(rng.integers(0, robots, candidates)),
         base_xy_m=torch.tensor(rng.uniform(-0.9, 0.9, (candidates, 2)), dtype=torch.float32),
     )

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Candidates
+from datagen.train.inputs import CandidateInputs
 from datagen.train.models import MODELS, build_model, fast
 from tests.train.models.made_batches import drawn_tables, small_model
 
@@ -23,7 +23,7 @@ def test_logits_follow_the_order_of_candidates(name: str):
     model = small_model(name)
     clouds, candidates, robots = drawn_tables(1, candidates=40)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    permuted = Candidates(candidates.robot_row[order], candidates.base_xy_m[order])
+    permuted = CandidateInputs(candidates.robot_row[order], candidates.base_xy_m[order])
     logits = model.score(clouds, candidates, robots)
     torch.testing.assert_close(model.score(clouds, permuted, robots), logits[order], atol=1e-5, rtol=1e-5)
     assert logits.dtype == torch.float32
@@ -36,7 +36,7 @@ def test_a_candidate_is_scored_the_same_alone(name: str):
     clouds, candidates, robots = drawn_tables(2, candidates=70)
     logits = model.score(clouds, candidates, robots)
     for row in (0, 33, 69):
-        one = Candidates(torch.zeros(1, dtype=torch.int64), candidates.base_xy_m[row : row + 1])
+        one = CandidateInputs(torch.zeros(1, dtype=torch.int64), candidates.base_xy_m[row : row + 1])
         robot = candidates.robot_row[row : row + 1]
         alone = replace(
             robots,

@@ -22,7 +22,7 @@ from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.noise import add_noise
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 
@@ -62,7 +62,7 @@ def draw_seen(index: int, seed: int = 0, houses: str = "builtin", objects: str =
     opened = open_houses(houses), open_objects(objects)
     house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
     spec = Specification(seed=seed, houses=house, objects=thing, observation=OBSERVATION)
-    scene, _ = draw_scene(assemble_world(spec, *opened, houses, objects), index, StageClock())
+    scene, _ = generate_scene(assemble_world(spec, *opened, houses, objects), index, StageClock())
     return Seen(scene, render_rays(scene.rays, scene.camera))
 
 

@@ -14,7 +14,7 @@ from datagen.schemas.specification import CandidateParams
 from datagen.train.baselines.analytic import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, load_scorer, predict, read_place
-from datagen.train.prediction.candidates import STATES
+from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.ground import level_pose
 from datagen.train.prediction.predict import Prediction
 from datagen.train.scorers import ModelScorer, Scorer

@@ -12,21 +12,23 @@ import numpy as np
 import torch
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, Candidates, Clouds, Robots
-from datagen.train.training.loop import run
+from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.training.callbacks import CallbackList
+from datagen.train.training.loop import run_training
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import Job, keep, prepare
-from datagen.train.training.watching import Watchers
+from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 
-def train_and_tell(job: Job, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
+def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
     """Train, and leave this rank's weights and samples beside the checkpoint.
 
     Then the second rank refuses something while the first still waits for it.
     """
     torch.set_num_threads(1)
-    training, head = prepare(job, ranks)
-    assert run(training, lambda: keep(job.out, training, head), Watchers([]), stopping)
+    training, head = prepare_training(job, ranks)
+    assert run_training(
+        training, lambda: save_checkpoint(job.out, training, head), CallbackList([]), stopping
+    )
     samples = [batch.sample_id for batch in training.train.epoch(0)]
     told = {"weights": training.model.state_dict(), "ids": torch.from_numpy(np.concatenate(samples))}
     torch.save(told, f"{job.out}.{ranks.rank}")
@@ -79,8 +81,8 @@ def joined(parts: list[Batch[Array]]) -> Batch[Array]:
 
     return Batch(
         clouds=table(Clouds, "clouds"),
-        robots=table(Robots, "robots"),
-        candidates=table(Candidates, "candidates"),
+        robots=table(RobotInputs, "robots"),
+        candidates=table(CandidateInputs, "candidates"),
         label=np.concatenate([p.label for p in parts]),
         sample_id=np.concatenate([p.sample_id for p in parts]),
     )

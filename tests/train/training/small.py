@@ -8,11 +8,11 @@ from typing import Any
 
 from torch import Tensor
 
-from datagen.train.training.loop import run
+from datagen.train.training.callbacks import CallbackList, TrainingStep
+from datagen.train.training.loop import run_training
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import Job, keep, prepare
-from datagen.train.training.watching import Step, Watchers
+from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 TINY: dict[str, Any] = {
     "n_points": 64,
@@ -37,18 +37,18 @@ def options_of(**changes: Any) -> Options:
     return Options(**{**fields, **changes})
 
 
-def job_of(runs: Path, out: Path, val: Path | None = None, **changes: Any) -> Job:
-    return Job(options_of(**changes), (str(runs),), (str(val),) if val else (), str(out))
+def job_of(runs: Path, out: Path, val: Path | None = None, **changes: Any) -> TrainingJob:
+    return TrainingJob(options_of(**changes), (str(runs),), (str(val),) if val else (), str(out))
 
 
 class Recorder:
     """Remembers what it was told."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
+        self.steps: list[TrainingStep] = []
         self.epochs: list[dict[str, Any]] = []
 
-    def step(self, step: Step) -> None:
+    def step(self, step: TrainingStep) -> None:
         self.steps.append(step)
 
     def epoch(self, record: dict[str, Any]) -> None:
@@ -58,15 +58,17 @@ class Recorder:
         pass
 
 
-def train_until(job: Job, step: int | None = None) -> tuple[bool, Recorder]:
+def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Recorder]:
     """Go on with a job, as the verb does, until it ends or Ctrl-C comes during the given step."""
-    training, head = prepare(job, Ranks())
+    training, head = prepare_training(job, Ranks())
     seen = Recorder()
 
     def stopping() -> bool:
         return step is not None and training.position.step + 1 >= step
 
-    done = run(training, lambda: keep(job.out, training, head), Watchers([seen]), stopping)
+    done = run_training(
+        training, lambda: save_checkpoint(job.out, training, head), CallbackList([seen]), stopping
+    )
     return done, seen
 
 

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.train.dataset import Origin
+from datagen.train.dataset import DataOrigin
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import (
     Checkpoint,
@@ -29,10 +29,10 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.inert import MAX_BYTES
+from datagen.train.training.torch_file_check import MAX_BYTES
 from tests.train.training.small import TINY, equal
 
-ORIGIN: Origin = {
+ORIGIN: DataOrigin = {
     "spec_hashes": ["b"], "schema": "sim", "schema_version": 2, "n_samples": 3, "n_scenes": 1,
     "samples_sha256": "a", "cost": {"cpu_s": 0.1},
 }  # fmt: skip

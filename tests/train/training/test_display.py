@@ -13,8 +13,8 @@ from rich.console import Console
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import Progress
+from datagen.train.training.callbacks import TensorBoardCallback, TrainingStep
 from datagen.train.training.display import TrainingProgress
-from datagen.train.training.watching import Step, TensorBoard
 from tests.cluster.simulated import FakeClock
 
 RECORD: dict[str, Any] = {
@@ -23,8 +23,8 @@ RECORD: dict[str, Any] = {
 }  # fmt: skip
 
 
-def step(k: int, step_s: float = 2.0) -> Step:
-    return Step(k, 100, 1, 0.5, 1e-3, samples=60, wait_s=0.1 * step_s, step_s=step_s)
+def step(k: int, step_s: float = 2.0) -> TrainingStep:
+    return TrainingStep(k, 100, 1, 0.5, 1e-3, samples=60, wait_s=0.1 * step_s, step_s=step_s)
 
 
 def test_the_speed_is_that_of_the_last_minute():
@@ -71,4 +71,4 @@ def test_lines_are_json_also_on_a_terminal():
 def test_curves_need_their_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(InputError, match="--tensorboard: the package tensorboard is not installed"):
-        TensorBoard(str(tmp_path))
+        TensorBoardCallback(str(tmp_path))

@@ -19,9 +19,9 @@ import pytest
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import read_checkpoint
 from datagen.train.training.launching import interruptible, train_in_processes
-from datagen.train.training.loop import run
+from datagen.train.training.loop import run_training
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import Job, prepare
+from datagen.train.training.training_setup import TrainingJob, prepare_training
 from tests.train.training.rank_work import Union, told_by, train_and_tell
 from tests.train.training.small import TINY, Recorder, equal, job_of
 
@@ -29,7 +29,7 @@ from tests.train.training.small import TINY, Recorder, equal, job_of
 STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
 
 
-def still_job(run_: Path, out: Path) -> Job:
+def still_job(run_: Path, out: Path) -> TrainingJob:
     return job_of(run_, out, epochs=1, model_config=STILL)
 
 
@@ -49,10 +49,12 @@ def test_two_processes_train_like_one_on_both_their_batches_and_end_together(
     assert not ids[0] & ids[1]
     assert len(ids[0] | ids[1]) == sum(r["n_samples"] for r in kept.head.data)
 
-    ranks = [prepare(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks(r, 2))[0] for r in (0, 1)]
-    alone, _ = prepare(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks())
+    ranks = [
+        prepare_training(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks(r, 2))[0] for r in (0, 1)
+    ]
+    alone, _ = prepare_training(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks())
     union = Union([r.train for r in ranks])
-    assert run(dataclasses.replace(alone, train=union), lambda: None, Recorder())
+    assert run_training(dataclasses.replace(alone, train=union), lambda: None, Recorder())
     for name, value in alone.model.state_dict().items():
         np.testing.assert_allclose(value, told[0]["weights"][name], rtol=1e-3, atol=1e-5, err_msg=name)
     one, two = alone.position.history[0], kept.head.history[0]
@@ -121,4 +123,4 @@ def test_the_first_interrupt_is_noted_and_the_second_ends():
 
 def test_steps_share_out_whole_scenes(heuristic_run: Path, tmp_path: Path):
     with pytest.raises(InputError, match="cannot be shared out evenly among 3"):
-        prepare(still_job(heuristic_run, tmp_path / "c.ckpt"), Ranks(0, 3))
+        prepare_training(still_job(heuristic_run, tmp_path / "c.ckpt"), Ranks(0, 3))

@@ -14,9 +14,9 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.training.checkpoints import load_model, read_checkpoint
-from datagen.train.training.loop import Batches, run
+from datagen.train.training.loop import Batches, run_training
 from datagen.train.training.ranks import Ranks
-from datagen.train.training.stages import keep, prepare
+from datagen.train.training.training_setup import prepare_training, save_checkpoint
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
 
 
@@ -81,7 +81,7 @@ def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_pa
 
 
 def test_classes_weigh_alike_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
-    training, _ = prepare(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
     counts = np.array(training.train.class_counts())  # type: ignore[attr-defined]
     weights = training.class_weights.numpy()
     assert weights[0] * counts[0] == pytest.approx(weights[1] * counts[1])
@@ -109,13 +109,15 @@ class Spoilt:
 
 def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_run: Path, tmp_path: Path):
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
-    training, _ = prepare(job, Ranks())
+    training, _ = prepare_training(job, Ranks())
     rows = [3, 5, 6, 20, 21]
     spoilt = Spoilt(training.train, 4, rows)
     kept: list[int] = []
     seen = Recorder()
     with pytest.raises(InputError, match="loss: not a number") as error:
-        run(dataclasses.replace(training, train=spoilt), lambda: kept.append(training.position.step), seen)
+        run_training(
+            dataclasses.replace(training, train=spoilt), lambda: kept.append(training.position.step), seen
+        )
     assert error.value.place == "training, epoch 2, batch 2"
     assert f"at 5 of its samples: {', '.join(spoilt.ids[:4])}, ..." in error.value.problem
     assert spoilt.ids[4] not in str(error.value)
@@ -124,12 +126,12 @@ def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_
 
 
 def test_a_gradient_that_is_no_number_ends_it_too(heuristic_run: Path, tmp_path: Path):
-    training, _ = prepare(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
+    training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
     first = next(iter(training.model.parameters()))
     first.register_hook(lambda gradient: gradient * float("nan"))
     before = {k: v.clone() for k, v in training.model.state_dict().items()}
     with pytest.raises(InputError, match="gradient: not a number, at "):
-        run(training, lambda: None, Recorder())
+        run_training(training, lambda: None, Recorder())
     assert equal(training.model.state_dict(), before)
 
 
@@ -138,11 +140,11 @@ def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: P
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
     assert train_until(job, 2)[0] is False
     before = Path(job.out).read_bytes()
-    training, head = prepare(job, Ranks())
+    training, head = prepare_training(job, Ranks())
     weight = next(iter(training.model.parameters()))
     training.optimiser.register_step_post_hook(lambda *_: weight.data.fill_(float("inf")))
     with pytest.raises(InputError, match=r"holds NaN or infinite numbers\. Nothing was overwritten"):
-        run(training, lambda: keep(job.out, training, head), Recorder(), lambda: True)
+        run_training(training, lambda: save_checkpoint(job.out, training, head), Recorder(), lambda: True)
     assert Path(job.out).read_bytes() == before
 
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import CandidateParams
-from datagen.workers.bases.candidates import Candidates, distances, draw_candidates, grid_offsets
+from datagen.workers.bases.candidates import SceneCandidates, distances, draw_candidates, grid_offsets
 from datagen.workers.bases.clearance import base_clearance_m, obstacles_of
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, table_house
 
 TARGET = np.array([ROOM_M[0] / 2 - 0.35, ROOM_M[1] / 2 - 0.2, TABLE_TOP_M + 0.05])  # near a corner
@@ -19,12 +19,12 @@ SAME_HEIGHTS = {"camera_height_m": {"low": 1.2, "high": 1.2}, "base_height_m": {
 FAR_ARMS = {"low": 0.8, "high": 1.0}
 
 
-def draw(seed: int = 0, **params: object) -> Candidates:
+def draw(seed: int = 0, **params: object) -> SceneCandidates:
     chosen = CandidateParams.model_validate(params)
     return draw_candidates(TARGET, OBSTACLES, chosen, np.random.default_rng(seed))
 
 
-def cells_of(candidates: Candidates) -> np.ndarray:
+def cells_of(candidates: SceneCandidates) -> np.ndarray:
     """The grid cell (N, 2) that each candidate stands in."""
     return np.rint((candidates.base_xy_m.astype(np.float64) - TARGET[:2]) * 12)
 
@@ -152,6 +152,6 @@ def test_cells_come_again_only_where_too_few_serve() -> None:
     ],
 )
 def test_a_scene_without_such_a_place_is_to_be_drawn_again(params: dict[str, object]) -> None:
-    with pytest.raises(Redraw) as redraw:
+    with pytest.raises(SceneRejected) as redraw:
         draw(**params)
     assert redraw.value.cause == "no_base"

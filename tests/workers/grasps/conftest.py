@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-import datagen.workers.grasps.keep
+import datagen.workers.grasps.grasp_cache
 
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A fresh cache folder, and nothing in memory."""
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
-    datagen.workers.grasps.keep.forget()
+    datagen.workers.grasps.grasp_cache.forget()
     return tmp_path / "cache"

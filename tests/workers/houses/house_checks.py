@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from datagen.workers.geometry.planar import inside_polygon
-from datagen.workers.houses.house import Body, House
+from datagen.workers.houses.house import House, StaticBody
 
 
 def check_house(house: House) -> None:
@@ -36,7 +36,7 @@ def check_house(house: House) -> None:
         assert min(s.size_m) > 0
 
 
-def check_body(body: Body) -> None:
+def check_body(body: StaticBody) -> None:
     mesh = body.visual
     assert mesh.vertices_m.dtype == np.float32 and mesh.vertices_m.shape[1] == 3
     assert mesh.faces.dtype == np.int32 and mesh.face_rgb.dtype == np.uint8
@@ -58,17 +58,17 @@ def is_convex(points: np.ndarray) -> bool:
     return bool((depth.max(0) > -1e-5).all())
 
 
-def signed_volume(body: Body) -> float:
+def signed_volume(body: StaticBody) -> float:
     """By the divergence theorem: the sum of the parts' volumes where all faces look outwards."""
     a, b, c = (body.visual.vertices_m[body.visual.faces[:, k]].astype(np.float64) for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-def hull_volume(body: Body) -> float:
+def hull_volume(body: StaticBody) -> float:
     return sum(ConvexHull(p.astype(np.float64)).volume for p in body.convex_parts_m)
 
 
-def covers(body: Body, xy: tuple[float, float], z: float) -> bool:
+def covers(body: StaticBody, xy: tuple[float, float], z: float) -> bool:
     """Whether some convex part holds the point."""
     point = np.array([*xy, z])
     for part in body.convex_parts_m:

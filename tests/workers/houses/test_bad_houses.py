@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.workers.houses import furnishing, line_index, open_houses
-from datagen.workers.houses.asset_table import Asset
+from datagen.workers.furniture.asset_table import Asset
+from datagen.workers.houses import furniture_bodies, line_index, open_houses
 from datagen.workers.houses.loader import build_house
-from datagen.workers.houses.reading import Node
+from datagen.workers.json_document import JsonNode
 from tests.workers.houses.house_files import SIZES, thing, two_rooms, write_houses, xyz
 
 NAN, INFINITY = float("nan"), float("inf")
@@ -218,7 +218,7 @@ def test_a_house_that_is_not_there(tmp_path: Path):
 
 
 def test_a_house_of_more_things_than_memory_would_bear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(furnishing, "MAX_BODIES", 50)
+    monkeypatch.setattr(furniture_bodies, "MAX_BODIES", 50)
     document = two_rooms()
     document["objects"] = [thing(f"0|{k}", "Mug_1", xyz(1, 0.05, 1)) for k in range(60)]
     source = open_houses(f"procthor:{write_houses(tmp_path, [document])}")
@@ -257,7 +257,7 @@ def test_any_value_anywhere_gives_a_house_or_an_input_error(data: st.DataObject)
         except (KeyError, IndexError, TypeError):
             continue  # an earlier change removed what lies on the path
     try:
-        house = build_house(Node("file", "$", document), "h", "0" * 64, ASSETS)
+        house = build_house(JsonNode("file", "$", document), "h", "0" * 64, ASSETS)
     except InputError as error:
         assert str(error).startswith("file: $")
     else:

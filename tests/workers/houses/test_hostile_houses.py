@@ -17,7 +17,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Source, Specification
 from datagen.workers import content_cache
 from datagen.workers.houses import line_index, open_houses
-from datagen.workers.houses.reading import parse_json
+from datagen.workers.json_document import parse_json
 from datagen.workers.world import World
 from tests.workers.houses.house_files import SIZES, two_rooms, write_houses
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.workers.houses import open_houses
-from datagen.workers.houses.furnishing import unity_rotation
+from datagen.workers.houses.furniture_bodies import unity_rotation
 from datagen.workers.houses.house import House
 from tests.workers.houses.house_checks import check_house, covers, top_below_m
 from tests.workers.houses.house_files import thing, two_rooms, wall, write_houses, xyz

@@ -21,11 +21,11 @@ from datagen.schemas.specification import (
     TrialParams,
     VisibilityParams,
 )
-from datagen.workers.bases.candidates import Candidates
+from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.transforms import translation
-from datagen.workers.labels import load_label_source, plan
-from datagen.workers.labels.trials import arm_in_scene, try_candidate
+from datagen.workers.labels import load_label_source, plan_source
+from datagen.workers.labels.arm_labelling import arm_in_scene, try_candidate
 from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import scene_of
 from tests.workers.worlds import box_model, on_table, table_house
@@ -56,14 +56,16 @@ def scene() -> SettledScene:
     return scene_of(table_house(), objects, poses)
 
 
-def candidates(at: SettledScene) -> Candidates:
+def candidates(at: SettledScene) -> SceneCandidates:
     n = len(OFFSETS_M)
     xy = (at.target_center_m[:2] + np.array(OFFSETS_M)).astype(np.float32)
     ones = np.ones(n, np.float32)
     camera_m, height_m = ones * np.float32(1.2), ones * np.float32(HEIGHT_M)
     params = CandidateParams(base_radius_m=0.2)
     clearance = base_clearance_m(xy, height_m, camera_m, at.house.obstacles, params)
-    return Candidates(xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance)
+    return SceneCandidates(
+        xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
+    )
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +133,7 @@ def test_a_candidate_alone_has_the_label_it_has_among_others(labelled: dict[str,
 def test_every_attempt_takes_another_grasp_and_the_one_that_came_furthest_counts() -> None:
     """Without friction nothing holds: one candidate, three grasps, and the last of them is not the best."""
     at, spec = scene(), specification(trial=TrialParams(object_friction=0.0))
-    _, trials = plan.label_with_trials(at, candidates(at), spec, StageClock())
+    _, trials = plan_source.label_with_trials(at, candidates(at), spec, StageClock())
     tried = [trial for trial in trials if trial.results]
     assert len(tried) == 3
     for trial in tried:
@@ -182,7 +184,7 @@ def test_the_clock_has_its_stages() -> None:
 def test_a_target_without_grasps_is_told_and_not_tried() -> None:
     wide = box_model("wide", (0.3, 0.3, 0.2))
     at = scene_of(table_house(), [wide], [on_table(wide)])
-    columns = plan.label(at, candidates(at), specification(), StageClock())
+    columns = plan_source.label(at, candidates(at), specification(), StageClock())
     assert {NAMES[code] for code in columns["outcome"]} == {"base_collision", "no_grasp"}
 
 
@@ -190,11 +192,11 @@ def test_a_target_inside_another_body_is_an_outcome() -> None:
     block = box_model("block", (0.07, 0.07, 0.14))
     T = on_table(TARGET, 0.0, -0.2)
     at = scene_of(table_house(), [TARGET, block], [T, T @ translation(0, 0, 0.01)])
-    columns = plan.label(at, candidates(at), specification(), StageClock())
+    columns = plan_source.label(at, candidates(at), specification(), StageClock())
     assert NAMES[columns["outcome"][0]] == "no_grasp" and not columns["label"].any()
 
 
 def test_an_arm_needs_its_section() -> None:
     at = scene()
     with pytest.raises(InputError, match="arm"):
-        plan.label(at, candidates(at), specification().model_copy(update={"arm": None}), StageClock())
+        plan_source.label(at, candidates(at), specification().model_copy(update={"arm": None}), StageClock())

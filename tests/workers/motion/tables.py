@@ -12,15 +12,15 @@ from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.houses.house import Body, House
-from datagen.workers.motion.plan import MotionPlan
-from datagen.workers.motion.scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.houses.house import House, StaticBody
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.rendering.embree_renderer import ray_stage
-from datagen.workers.rendering.frame import Stage
+from datagen.workers.rendering.embree_renderer import ray_scene
+from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.robot import Robot
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.world import PreparedHouse
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, on_table, table_house
@@ -66,12 +66,12 @@ def scene_of(
     house: House, objects: Sequence[ObjectModel], poses: Sequence[F64], index: int = 0
 ) -> SettledScene:
     T = np.stack(poses)
-    rays = ray_stage(Stage(house, tuple(objects), T))
-    return RecalledScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
+    rays = ray_scene(SceneGeometry(house, tuple(objects), T))
+    return ReconstructedScene(index, 0, PreparedHouse(house), tuple(objects), T, rays, camera=None)  # type: ignore[arg-type]
 
 
 def table_scene(
-    furniture: Sequence[Body] = (),
+    furniture: Sequence[StaticBody] = (),
     clutter: Sequence[tuple[ObjectModel, float, float]] = (),
     target_xy_m: tuple[float, float] = TARGET_XY_M,
 ) -> SettledScene:
@@ -84,7 +84,7 @@ def table_scene(
 
 def over_target(
     body_id: str, size_m: tuple[float, float, float], low_m: float, shift_y_m: float = 0.0
-) -> Body:
+) -> StaticBody:
     """A static board whose underside is `low_m` above the table, over the target."""
     x, y = ROOM_M[0] / 2 + TARGET_XY_M[0], ROOM_M[1] / 2 + TARGET_XY_M[1] + shift_y_m
     return box_body(body_id, "furniture", "Shelf", size_m, (x, y, TABLE_TOP_M + low_m + size_m[2] / 2))

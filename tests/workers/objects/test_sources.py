@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from datagen.schemas.errors import InputError
 from datagen.workers.objects import OBJECT_SOURCES, ObjectModel, ObjectSource, open_objects
 from datagen.workers.objects.builtin_table import RECIPES
-from datagen.workers.objects.credibility import EXCLUDED, MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
+from datagen.workers.objects.exclusions import EXCLUDED, MAX_DENSITY_KG_M3, MIN_DENSITY_KG_M3
 from datagen.workers.objects.obj_file import read_obj
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 

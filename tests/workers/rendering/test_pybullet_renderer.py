@@ -9,9 +9,9 @@ import pybullet
 import pytest
 
 from datagen.workers.geometry.mesh import Mesh
-from datagen.workers.rendering.embree_renderer import ray_stage, render_embree
-from datagen.workers.rendering.frame import Camera, Stage
-from datagen.workers.rendering.pybullet_renderer import PybulletStage, render_pybullet
+from datagen.workers.rendering.embree_renderer import ray_scene, render_embree
+from datagen.workers.rendering.frame import Camera, SceneGeometry
+from datagen.workers.rendering.pybullet_renderer import PybulletScene, render_pybullet
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
 from tests.workers.worlds import box_body, camera_at, table_house
@@ -41,10 +41,10 @@ def test_textures_and_face_colours_are_where_they_belong() -> None:
 @pytest.mark.parametrize("towards_m", [(2.0, 1.5, 0.8), (0.0, 0.2, 1.4)])
 def test_an_eye_within_a_wall_sees_the_wall(towards_m: tuple[float, float, float]) -> None:
     thick = box_body("wall|9", "wall", "Wall", (0.2, 1.0, 2.0), (1.0, 1.5, 1.0))
-    stage = Stage(table_house([thick]), (), np.zeros((0, 4, 4)))
+    stage = SceneGeometry(table_house([thick]), (), np.zeros((0, 4, 4)))
     camera = camera_at((1.02, 1.4, 1.2), towards_m, 80, 60, 60.0)
     assert_same_view(render_pybullet(stage, camera), render_embree(stage, camera))
-    with PybulletStage(mixed_stage()) as loaded:
+    with PybulletScene(mixed_stage()) as loaded:
         assert loaded.visible_pixels(0, np.array([[2.0, -0.004, 1.0], [2.0, -0.05, 1.0]]), 32)[
             1
         ].tolist() == [0, 0]
@@ -66,7 +66,7 @@ def test_a_mesh_with_more_faces_than_bullet_takes_at_once_is_whole() -> None:
     heavy = replace(body, visual=Mesh(body.visual.vertices_m, faces, colours))
     house = replace(stage.house, bodies=(*stage.house.bodies[:-1], heavy))
     camera = cameras()[0]
-    whole = render_pybullet(Stage(house, stage.objects, stage.T_world_object), camera)
+    whole = render_pybullet(SceneGeometry(house, stage.objects, stage.T_world_object), camera)
     np.testing.assert_array_equal(whole.body, render_pybullet(stage, camera).body)
     np.testing.assert_array_equal(whole.depth_m, render_pybullet(stage, camera).depth_m)
 
@@ -76,8 +76,8 @@ def test_rho_agrees_with_embree_from_all_sides() -> None:
     rng = np.random.default_rng(3)
     angle = rng.uniform(0, 2 * np.pi, 40)
     eyes = np.stack([2 + 0.7 * np.cos(angle), 1.5 + 0.7 * np.sin(angle), rng.uniform(0.8, 1.4, 40)], axis=1)
-    rays = ray_stage(stage)
-    with PybulletStage(stage) as loaded:
+    rays = ray_scene(stage)
+    with PybulletScene(stage) as loaded:
         for target in (0, 1):
             ours_alone, ours_seen = loaded.visible_pixels(target, eyes, 48)
             alone, seen = visible_pixels(rays, target, eyes, 48)
@@ -90,7 +90,7 @@ def test_rho_agrees_with_embree_from_all_sides() -> None:
 
 def test_an_eye_within_the_target_sees_nothing() -> None:
     stage = mixed_stage()
-    with PybulletStage(stage) as loaded:
+    with PybulletScene(stage) as loaded:
         counts = loaded.visible_pixels(0, stage.T_world_object[0, :3, 3][None], 16)
     assert [c.tolist() for c in counts] == [[0], [0]]
 
@@ -98,7 +98,7 @@ def test_an_eye_within_the_target_sees_nothing() -> None:
 def test_worlds_are_closed_at_the_end() -> None:
     free = pybullet.connect(pybullet.DIRECT)
     pybullet.disconnect(physicsClientId=free)
-    stage = Stage(table_house(), (), np.zeros((0, 4, 4)))
+    stage = SceneGeometry(table_house(), (), np.zeros((0, 4, 4)))
     render_pybullet(stage, cameras()[0])
     assert not pybullet.isConnected(physicsClientId=free)
     broken = replace(

@@ -14,14 +14,14 @@ pytest.importorskip(
 
 from datagen.schemas.errors import InputError
 from datagen.workers.rendering.embree_renderer import render_embree
-from datagen.workers.rendering.frame import Camera, Frame, Stage
+from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 from datagen.workers.rendering.sapien_renderer import render_sapien
 from tests.conftest import REPOSITORY
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
 from tests.workers.worlds import camera_at
 
 
-def rendered(stage: Stage, camera: Camera) -> Frame:
+def rendered(stage: SceneGeometry, camera: Camera) -> Frame:
     try:
         return render_sapien(stage, camera)
     except InputError as error:
@@ -44,7 +44,7 @@ def test_textures_are_where_they_belong() -> None:
 def test_what_came_before_leaves_nothing_in_the_kept_scene() -> None:
     stage, camera = mixed_stage(), cameras()[0]
     first = rendered(stage, camera)
-    rendered(Stage(stage.house, stage.objects[::-1], stage.T_world_object), camera)
+    rendered(SceneGeometry(stage.house, stage.objects[::-1], stage.T_world_object), camera)
     again = rendered(stage, camera)
     assert (first.body == again.body).all()
     assert (first.depth_m == again.depth_m).all()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.workers.rendering.embree_renderer import ray_stage
-from datagen.workers.rendering.frame import Stage
+from datagen.workers.rendering.embree_renderer import ray_scene
+from datagen.workers.rendering.frame import SceneGeometry
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.independent import pixel_counts
 from tests.workers.worlds import (
@@ -24,12 +24,12 @@ from tests.workers.worlds import (
 CENTRE = (ROOM_M[0] / 2, ROOM_M[1] / 2)
 
 
-def rho(stage: Stage, eye_m: tuple[float, float, float], window: int = 64) -> float:
-    alone, seen = visible_pixels(ray_stage(stage), 0, np.array([eye_m]), window)
+def rho(stage: SceneGeometry, eye_m: tuple[float, float, float], window: int = 64) -> float:
+    alone, seen = visible_pixels(ray_scene(stage), 0, np.array([eye_m]), window)
     return seen[0] / alone[0]
 
 
-def triangles_of(stage: Stage) -> list[np.ndarray]:
+def triangles_of(stage: SceneGeometry) -> list[np.ndarray]:
     """World triangles (F, 3, 3) of each object and, last, of the house."""
     placed = [m.visual.transformed(T) for m, T in zip(stage.objects, stage.T_world_object, strict=True)]
     bodies = [b.visual for b in stage.house.bodies]
@@ -74,13 +74,13 @@ def test_furniture_counts_as_much_as_objects() -> None:
 def test_an_eye_inside_the_target_sees_nothing() -> None:
     stage = stage_with([ball_model("target", 0.05)], [(0, 0)])
     eye = stage.T_world_object[:1, :3, 3]
-    alone, seen = visible_pixels(ray_stage(stage), 0, eye, 64)
+    alone, seen = visible_pixels(ray_scene(stage), 0, eye, 64)
     assert (alone[0], seen[0]) == (0, 0)
 
 
 def test_a_ball_fills_its_window_as_a_disc_does() -> None:
     stage = stage_with([ball_model("target", 0.06)], [(0, 0)])
-    alone, _ = visible_pixels(ray_stage(stage), 0, np.array([[0.6, 1.5, 1.4], [2.0, 0.2, 0.9]]), 64)
+    alone, _ = visible_pixels(ray_scene(stage), 0, np.array([[0.6, 1.5, 1.4], [2.0, 0.2, 0.9]]), 64)
     np.testing.assert_allclose(alone / 64**2, np.pi / 4, rtol=0.03)
 
 
@@ -111,14 +111,14 @@ def test_pixel_counts_equal_those_of_a_second_implementation(
     )
     centre = stage.T_world_object[0, :3, 3]
     expected = pixel_counts(triangles[0], np.concatenate(triangles[1:]), centre, models[0].radius_m, eye, 48)
-    alone, seen = visible_pixels(ray_stage(stage), 0, eye[None], 48)
+    alone, seen = visible_pixels(ray_scene(stage), 0, eye[None], 48)
     # A pixel centre that falls on an edge may round either way.
     assert alone[0] == pytest.approx(expected[0], abs=3)
     assert seen[0] == pytest.approx(expected[1], abs=6)
 
 
 def test_blocks_of_rays_do_not_change_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = ray_stage(
+    stage = ray_scene(
         stage_with([ball_model("t", 0.05), box_model("a", (0.1, 0.1, 0.2))], [(0, 0), (0.15, 0)])
     )
     eyes = np.random.default_rng(1).uniform((0.2, 0.2, 0.8), (3.8, 2.8, 1.5), (50, 3))

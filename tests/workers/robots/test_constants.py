@@ -19,11 +19,11 @@ from datagen.workers.robots.fetch import FETCH
 from datagen.workers.robots.franka_hand import FRANKA_HAND
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
 from datagen.workers.robots.panda import PANDA, PANDA_SCALED
-from datagen.workers.robots.urdf import Inertial, Tree, read_urdf, scaled_inertial
+from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
 from datagen.workers.robots.xarm7 import XARM7
 
 
-def tree_of(description: RobotDescription) -> Tree:
+def tree_of(description: RobotDescription) -> UrdfTree:
     return read_urdf(robots_folder() / description.urdf)
 
 

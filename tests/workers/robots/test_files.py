@@ -16,8 +16,8 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 
 from datagen.workers.robots.arm import Arm
 from datagen.workers.robots.panda import PANDA_SCALED
+from datagen.workers.robots.robot_files import RobotFiles
 from datagen.workers.robots.urdf import read_urdf
-from datagen.workers.robots.written import RobotFiles
 
 
 @pytest.fixture(autouse=True)
@@ -86,8 +86,8 @@ def test_what_is_asked_for_again_is_marked_as_used_and_mended(folder: Path) -> N
 
 
 def test_only_what_is_long_unused_is_dropped(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("datagen.workers.robots.written._MOST_FILES", 20)
-    monkeypatch.setattr("datagen.workers.robots.written._WRITTEN_BETWEEN_PRUNINGS", 1)
+    monkeypatch.setattr("datagen.workers.robots.robot_files._MOST_FILES", 20)
+    monkeypatch.setattr("datagen.workers.robots.robot_files._WRITTEN_BETWEEN_PRUNINGS", 1)
     robots = [arm(reach_m) for reach_m in np.linspace(0.6, 0.9, 8)]
     for robot in robots:
         assert robot.urdf.is_file()
@@ -105,7 +105,7 @@ def test_only_what_is_long_unused_is_dropped(folder: Path, monkeypatch: pytest.M
 _CHILD = """
 import os, sys
 from datagen.workers.content_cache import alone_in, drop_unused
-from datagen.workers.robots import written
+from datagen.workers.robots import robot_files
 from datagen.workers.robots.arm import Arm
 from datagen.workers.robots.panda import PANDA_SCALED
 from datagen.workers.robots.urdf import read_urdf

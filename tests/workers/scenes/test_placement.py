@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.schemas.specification import SceneParams
-from datagen.workers.redraw import Redraw
+from datagen.workers.scene_rejected import SceneRejected
 from datagen.workers.scenes.placement import drop_poses, eligible_surfaces, nearby_parts, standing_footprints
 from tests.workers.worlds import ROOM_M, TABLE_TOP_M, box_body, box_model, cylinder_model, table_house
 
@@ -83,7 +83,7 @@ def test_things_that_stand_there_are_kept_free() -> None:
 
 def test_a_full_surface_is_a_redraw_with_its_cause() -> None:
     cover = [np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)]
-    with pytest.raises(Redraw) as caught:
+    with pytest.raises(SceneRejected) as caught:
         drop_poses(MODELS, table_house().surfaces[0], cover, PARAMS, np.random.default_rng(0))
     assert caught.value.cause == "no_placement"
 
@@ -107,4 +107,4 @@ def test_only_parts_around_the_support_go_into_the_physics() -> None:
 
 def test_an_unknown_cause_is_a_defect() -> None:
     with pytest.raises(KeyError, match="unknown redraw cause"):
-        Redraw("bored")
+        SceneRejected("bored")

@@ -11,8 +11,8 @@ pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datag
 
 from datagen.schemas.specification import SettleParams
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.redraw import Redraw
-from datagen.workers.scenes.draw import check_settled
+from datagen.workers.scene_rejected import SceneRejected
+from datagen.workers.scenes.generate import check_settled
 from datagen.workers.settling.sapien_settler import settle_sapien
 from datagen.workers.settling.settler import SettleResult
 from tests.workers.worlds import TABLE_TOP_M, ball_model, box_model, cylinder_model, on_table, table_house
@@ -74,7 +74,7 @@ def test_mass_and_inertia_are_those_of_the_model() -> None:
 
 
 def cause_of(result: SettleResult, models: list[ObjectModel]) -> str:
-    with pytest.raises(Redraw) as caught:
+    with pytest.raises(SceneRejected) as caught:
         check_settled(result, tuple(models), HOUSE.surfaces[0], PARAMS)
     return caught.value.cause
 

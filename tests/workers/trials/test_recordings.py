@@ -16,16 +16,16 @@ import pytest
 
 pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
+from datagen.configuration.specify import specify
 from datagen.schemas.cost import StageClock
-from datagen.specifying.specify import specify
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation
 from datagen.workers.houses import open_houses
-from datagen.workers.labels.trials import ArmInScene, arm_in_scene, try_candidate
-from datagen.workers.motion.plan import MotionPlan
-from datagen.workers.motion.scene import pose_of_base
+from datagen.workers.labels.arm_labelling import ArmInScene, arm_in_scene, try_candidate
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion.planning_scene import pose_of_base
 from datagen.workers.objects import open_objects
-from datagen.workers.scenes.draw import draw_scene
+from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.trials.trial import Recording, TrialResult
 from datagen.workers.world import assemble_world
 from tests.workers.motion.tables import HalfSpaces
@@ -75,7 +75,7 @@ def successes(assets: Path) -> list[Seen]:
     world = assemble_world(spec, houses, objects, house_source, object_source)
     found: list[Seen] = []
     for index in range(SCENES):
-        scene, candidates = draw_scene(world, index, StageClock())
+        scene, candidates = generate_scene(world, index, StageClock())
         at = arm_in_scene(scene, candidates, 0, spec, StageClock())
         for row in range(len(candidates)):
             trial = try_candidate(at, candidates, row, spec, record=True)

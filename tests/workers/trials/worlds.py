@@ -8,8 +8,8 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
-from datagen.workers.houses.house import Body
-from datagen.workers.motion.plan import MotionPlan
+from datagen.workers.houses.house import StaticBody
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
@@ -22,7 +22,9 @@ DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def scene_with(
-    models: Sequence[ObjectModel], offsets_m: Sequence[tuple[float, float]], furniture: Sequence[Body] = ()
+    models: Sequence[ObjectModel],
+    offsets_m: Sequence[tuple[float, float]],
+    furniture: Sequence[StaticBody] = (),
 ) -> SettledScene:
     """Objects upright on the table, each off its middle by its (dx, dy)."""
     poses = [on_table(m, dx, dy) for m, (dx, dy) in zip(models, offsets_m, strict=True)]

@@ -1,0 +1,180 @@
+"""Runs an attempt in its worker: deadline with stack, note of the process, cost.
+
+A worker that is killed cannot report. So it first writes a note of its process and points `faulthandler`
+at a file next to it, from which `post_mortem` reports whatever ends the process.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import platform
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TypeVar
+
+from datagen.cluster.post_mortem import STACK_LIMIT, note_path, short_line, stack_path
+from datagen.cluster.task import AttemptReport, AttemptResult, JobCannotContinue, Task
+from datagen.schemas.cost import StageClock
+from datagen.schemas.locked_folders import is_private
+from datagen.schemas.record_files import utc_now
+from datagen.schemas.run_records import Cost, Host
+from datagen.schemas.storage.errors import FULL, StoreUnavailable, machine_error
+from datagen.schemas.whole_files import whole_file
+
+T = TypeVar("T", bound=Task)
+
+
+class Meter:
+    """Counts what an attempt costs from the moment it is made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        _reset_peak_memory()
+
+    def cost(self, clock: StageClock | None = None, written_bytes: int = 0) -> Cost:
+        """The cost so far. What no stage of `clock` claimed is wall and CPU time without a name."""
+        clock = clock or StageClock()
+        return Cost(
+            wall_s=time.perf_counter() - self._wall,
+            cpu_s=time.process_time() - self._cpu,
+            stage_wall_s=clock.wall_s,
+            stage_cpu_s=clock.cpu_s,
+            peak_rss_bytes=_peak_memory_bytes(),
+            written_bytes=written_bytes,
+        )
+
+
+def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bool = True) -> AttemptReport:
+    """Run one attempt and tell how it ended. Exceptions become failed reports with their stack.
+
+    With `deadline`, the process ends itself when the task takes longer than `task.deadline_s`,
+    also when native code hangs with the interpreter's lock held.
+    """
+    started, meter = utc_now(), Meter()
+    try:
+        with _notes(task, started, deadline):
+            try:
+                product = function(task, meter)
+            except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
+                return _failure(task, started, meter, error)
+    except (OSError, JobCannotContinue) as error:  # of the note itself
+        return _failure(task, started, meter, error)
+    return AttemptReport(
+        attempt=task.attempt,
+        shard=task.shard,
+        outcome="committed" if product.won else "superseded",
+        started=started,
+        ended=utc_now(),
+        labels=product.labels,
+        positives=product.positives,
+        cost=product.cost,
+        host=this_host(),
+    )
+
+
+def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
+    # A store that gives no answer gives none to the next shard either, and a full disk stays full.
+    final = error if isinstance(error, JobCannotContinue | StoreUnavailable) else machine_error(error, FULL)
+    cause = " ".join(str(final or error).split())
+    return AttemptReport(
+        attempt=task.attempt,
+        shard=task.shard,
+        outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
+        cause=cause if final else short_line(f"{type(error).__name__}: {cause}"),
+        stack=traceback.format_exc()[-STACK_LIMIT:],
+        started=started,
+        ended=utc_now(),
+        cost=meter.cost(),
+        host=this_host(),
+        ends_job=final is not None,
+    )
+
+
+@contextmanager
+def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
+    """Keep the note and the stack file of an attempt while it runs, and remove them after it."""
+    if not task.notes:
+        yield
+        return
+    note, stack = note_path(task.notes, task.attempt), stack_path(task.notes, task.attempt)
+    note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not is_private(note.parent.lstat()):
+        problem = f"{note.parent}: another user's folder, or others can write to it"
+        raise JobCannotContinue(f"{problem}. Name a folder of your own as TMPDIR")
+    with whole_file(note, alone=True) as file:
+        file.write(json.dumps({"host": this_host().model_dump(), "started": started}).encode())
+    if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
+        try:
+            yield
+        finally:
+            note.unlink(missing_ok=True)
+        return
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+    with stack.open("w") as file:
+        faulthandler.enable(file)  # a native crash leaves its stack here too
+        faulthandler.dump_traceback_later(task.deadline_s, exit=True, file=file)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            faulthandler.disable()
+    if sys.__stderr__ is not None:
+        faulthandler.enable(sys.__stderr__)
+    note.unlink(missing_ok=True)
+    stack.unlink(missing_ok=True)
+
+
+@cache
+def this_host() -> Host:
+    """Fingerprint of this machine and process."""
+    cpu = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = (
+            line.split(":", 1)[1]
+            for line in cpuinfo.read_text().splitlines()
+            if line.startswith("model name")
+        )
+        cpu = next(names, cpu).strip()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return Host(
+        name=platform.node(), cpu=cpu, cores=os.cpu_count() or 1, memory_bytes=memory, pid=os.getpid()
+    )
+
+
+def _reset_peak_memory() -> None:
+    # Linux: makes VmHWM start again from what is resident now, so that the peak is the attempt's.
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return  # elsewhere, or forbidden: the peak is then that of the whole process
+
+
+def _peak_memory_bytes() -> int:
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def resident_bytes() -> int:
+    """Memory that this process holds now; 0 where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")

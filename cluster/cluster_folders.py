@@ -1,0 +1,78 @@
+"""Folders below /tmp that only this user can enter, and the processes that belong to them.
+
+Ray opens its own folders to everybody, so each cluster of this machine has its folder inside a closed one.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+
+from datagen.schemas.locked_folders import locked_folder
+from datagen.schemas.whole_files import whole_file
+
+_PARENT = Path("/tmp")  # sockets need a short path
+_KIND = "datagen-ray-"
+_STOP_WITHIN_S = 4.0  # politely; some of Ray's processes ignore that
+
+# Variable that names the folder to each process that belongs to it; Ray reads it too.
+OWNER = "RAY_TMPDIR"
+RAY = "ray"  # the part that Ray writes to, and opens to everybody who can reach it
+
+
+@contextmanager
+def private_folder() -> Generator[Path]:
+    """Give a new folder of mode 0700; when the block ends, its processes are ended and it is removed.
+
+    First removes what killed programs of this user left.
+    """
+    with locked_folder(_KIND, _PARENT, remove_folder) as folder:
+        (folder / RAY).mkdir()
+        yield folder
+
+
+def new_folder(kind: str) -> Path:
+    """A new folder below /tmp with mode 0700; its name begins with `kind`."""
+    return Path(tempfile.mkdtemp(prefix=kind, dir=_PARENT))
+
+
+def write_private(path: Path, text: str) -> None:
+    """Write a file of mode 0600 that appears whole."""
+    with whole_file(path, mode=0o600) as file:
+        file.write(text.encode())
+
+
+def remove_folder(folder: Path) -> None:
+    """End every process of this user that belongs to a private folder, and remove it."""
+    end_processes([p for p in psutil.process_iter() if _belongs(p, str(folder))])
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def end_processes(processes: list[psutil.Process]) -> None:
+    """SIGTERM, and SIGKILL some seconds later to those that are still there."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        for process in processes:
+            try:
+                process.send_signal(number)
+            except psutil.Error:
+                continue
+        _, processes = psutil.wait_procs(processes, timeout=_STOP_WITHIN_S)
+
+
+def _belongs(process: psutil.Process, folder: str) -> bool:
+    try:
+        if process.pid == os.getpid() or process.uids().real != os.getuid():
+            return False
+        # Each sign is missing somewhere: a process that changes its title may overwrite the others.
+        options = [word for word in process.cmdline() if word.startswith("--")]
+        files = [file.path for file in process.open_files()]
+        return process.environ().get(OWNER) == folder or any(folder in text for text in [*options, *files])
+    except psutil.Error:
+        return False

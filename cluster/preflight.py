@@ -1,0 +1,75 @@
+"""Whether every machine of a cluster can make the shards of a run: asked before the first one."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from datagen.cluster.attempt import open_task
+from datagen.cluster.task import JobCannotContinue, ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+
+_PATIENCE_S = 120.0  # sources are opened, and the first time their digests are taken
+_SHARED = "Put the run and its sources where every machine has them under the same name, or on s3://"
+
+
+@dataclass(frozen=True)
+class MachineReport:
+    """Why a machine cannot make shards of the run ("" when it can), and its versions of what matters."""
+
+    problem: str
+    versions: dict[str, str]
+
+
+def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: ShardTask) -> None:
+    """Raise InputError that names the first machine that cannot make the run's shards.
+
+    `ask(function, *arguments, patience_s=...)` gives each other machine's answer by its name. A
+    machine is fit when it sees this very run and can write to it, finds the sources, and has the
+    same versions of what moves bits of labels. One that does not answer in time is passed over.
+    """
+    names, probe = sorted(task.spec.engines), f".probe-{secrets.token_hex(8)}"
+    run.storage.put_new(probe, b"driver")
+    try:
+        found: dict[str, MachineReport] = ask(inspect_machine, task, probe, names, patience_s=_PATIENCE_S)
+    finally:
+        run.storage.delete([probe])
+    here = versions_of(names)
+    for machine, fitness in sorted(found.items()):
+        place = f"machine {machine}"
+        if fitness.problem:
+            raise InputError(place, "", fitness.problem, _SHARED)
+        if others := {n: v for n, v in fitness.versions.items() if v != here[n]}:
+            name, its = min(others.items())
+            problem = f"it has {its or 'none'}, and this machine {here[name]}"
+            raise InputError(place, name, problem, "Install the versions of constraints.txt on every machine")
+
+
+def inspect_machine(task: ShardTask, probe: str, names: Iterable[str]) -> MachineReport:
+    """What this machine, asked by another, can say of itself."""
+    versions = versions_of(names)
+    try:
+        run, _, _ = open_task(task)
+        if not run.storage.exists(probe):
+            return MachineReport(f"{task.run}: another folder has this name there", versions)
+        answer = f"{probe}-{secrets.token_hex(8)}"
+        run.storage.put_new(answer, b"seen")
+        run.storage.delete([answer])
+    except (JobCannotContinue, InputError) as error:
+        return MachineReport(" ".join(str(error).split()), versions)
+    return MachineReport("", versions)
+
+
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Installed versions of those names that are distributions; "" for what is not installed."""
+    found: dict[str, str] = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = ""
+    return found

@@ -1,0 +1,94 @@
+"""Records how the attempts of a run ended, its quarantined shards and lost attempts; keeps its index."""
+
+from __future__ import annotations
+
+import time
+
+from datagen.cluster.retry_policy import ShardFailures
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import commit_key
+from datagen.schemas.ledger import end_from_commit, lost_end
+from datagen.schemas.record_files import utc_now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.summaries import refresh
+
+# The index is brought up to date after so many attempts, and not before so many times the time that it
+# took last: a job of a million shards spends a small share of its driver on it.
+_INDEX_EVERY = 500
+_INDEX_FACTOR = 30.0
+
+
+class RunRecorder:
+    """Writes the ledger and the quarantine of one run, and now and then its index."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._since_index, self._index_s = 0, time.monotonic()
+
+    def close(self, entry: LedgerEntry) -> None:
+        """Note how an attempt ended. An end that was noted before stands, unless it was a guess."""
+        self._run.ledger.end(entry)
+        self._since_index += 1
+        if self._since_index >= _INDEX_EVERY and time.monotonic() >= self._index_s:
+            start_s = time.monotonic()
+            refresh_index(self._run)
+            end_s = time.monotonic()
+            self._since_index, self._index_s = 0, end_s + _INDEX_FACTOR * (end_s - start_s)
+
+    def quarantine(self, shard: int, trouble: ShardFailures) -> None:
+        """Give a shard up, with all that is needed to run it alone."""
+        scenes = self._run.layout.scenes_per_shard
+        self._run.quarantine(
+            QuarantineRecord(
+                shard=shard,
+                seed=self._run.manifest.spec.seed,
+                first_scene=shard * scenes,
+                scenes=scenes,
+                attempts=trouble.attempts,
+                causes=trouble.causes,
+                stacks=trouble.stacks,
+                created=utc_now(),
+            )
+        )
+
+    def commit_of(self, shard: int) -> Commit | None:
+        """The shard's commit record, or None while there is none."""
+        return self._run.commit_of(shard) if self._run.storage.exists(commit_key(shard)) else None
+
+    def missing(self) -> ShardRanges:
+        """Planned shards that are neither committed nor in quarantine, by listing."""
+        return self._run.missing()
+
+
+def refresh_index(run: Run) -> None:
+    """Bring the run's index up to date where that is possible."""
+    try:
+        refresh(run)
+    except InputError:
+        return  # a full disk, say: answers take longer without it, and nothing else is lost
+
+
+def close_lost_attempts(run: Run) -> int:
+    """Close in the ledger what a former driver left open; return how many attempts that were.
+
+    Call it when a job has ended; it brings the run's index up to date, too. An attempt that began and
+    never ended belonged to a driver that was killed; its worker may outlive the driver by moments and
+    still reach its commit. So an attempt is judged only once its shard is decided: the one that won is
+    closed as committed, at the commit's cost, others as lost, at a cost that nobody knows; where the
+    driver lives after all, its own note replaces this one. Where the shard is still open they stay
+    open, for the job that resumes.
+    """
+    recorder, quarantined, closed = RunRecorder(run), run.quarantined(), 0
+    for start in run.ledger.unfinished():
+        commit = recorder.commit_of(start.shard)
+        if commit is None and start.shard not in quarantined:
+            continue
+        if commit is not None and commit.attempt == start.attempt:
+            recorder.close(end_from_commit(commit, start.started))
+        else:
+            recorder.close(lost_end(start, utc_now()))
+        closed += 1
+    refresh_index(run)
+    return closed

@@ -1,0 +1,39 @@
+"""The manifest of a new run: what makes it, and what it is made with."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+
+from datagen import __version__
+from datagen.configuration.arms import arm_versions
+from datagen.schemas.fields import SCHEMAS
+from datagen.schemas.record_files import utc_now
+from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.specification import Specification
+from datagen.workers.labels import load_label_source
+
+_LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
+
+
+def manifest_of(
+    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
+) -> Manifest:
+    """The manifest of a new run in shards of this layout.
+
+    `schema_version` is that of the run whose scenes are taken: what their rows lack cannot be stored.
+    """
+    source = load_label_source(spec.label_source)
+    newest = SCHEMAS[source.schema].version
+    return Manifest(
+        spec=spec,
+        spec_hash=spec.hash(),
+        schema_name=source.schema,
+        schema_version=newest if schema_version is None else min(schema_version, newest),
+        layout=layout,
+        code_version=__version__,
+        libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
+        platform=platform.platform(),
+        created=utc_now(),
+        sources=sources,
+    )

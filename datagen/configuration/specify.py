@@ -1,0 +1,199 @@
+"""From options and a TOML file to a specification and a layout."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from datagen.configuration.arms import (
+    ARM_PACKAGES,
+    arm_versions,
+    complete_arm,
+    narrow_candidates,
+    refuse_unsuited,
+    robot_of,
+)
+from datagen.schemas.errors import InputError, choices
+from datagen.schemas.run_records import Layout
+from datagen.schemas.specification import Source, Specification
+from datagen.schemas.untrusted_files import read_regular
+from datagen.workers.houses.house import HouseSource
+from datagen.workers.labels import load_label_source
+from datagen.workers.objects.model import ObjectSource
+from datagen.workers.rendering import RENDERERS, load_renderer
+from datagen.workers.scenes import VERSION as SCENES_VERSION
+from datagen.workers.settling import SETTLERS, first_settler, load_settler
+
+Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
+
+_MAX_CONFIG_BYTES = 1 << 20
+_MAX_DEPTH = 16
+# Distributions whose version can move bits of a sample, by the engine that needs them.
+_ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
+_SCENES_PER_SHARD = 32
+_SHARDS_AT_LEAST = 8
+
+
+def specify(
+    label_source: str,
+    houses: HouseSource,
+    objects: ObjectSource,
+    options: Options,
+    config: Path | None,
+    robot: str | None = None,
+    repeats: int | None = None,
+) -> Specification:
+    """The specification that the options (dotted names, None where not given) and the file ask for.
+
+    An option wins over the file, the file over the default. `robot` and `repeats` are --robot and
+    --perturb. Raises InputError naming the option or the file and the field, or an engine that
+    cannot be imported here.
+    """
+    place = str(config) if config else "options"
+    fields = read_fields(config)
+    for name, value in options.items():
+        if value is not None:
+            put_field(fields, name, value, config)
+    settle = fields.setdefault("settle", {})
+    if isinstance(settle, dict):
+        # SAPIEN where its libraries are, else what works here; the choice is recorded.
+        settle.setdefault("engine", first_settler())
+    complete_arm(label_source, fields, robot, repeats, place)
+    chosen = robot_of(fields, robot)
+    if chosen is not None:
+        narrow_candidates(fields, chosen)
+    candidates = fields.setdefault("candidates", {})
+    if isinstance(candidates, dict):
+        if label_source in ARM_PACKAGES and "within" not in candidates:
+            candidates.setdefault("per_scene", "grid")
+        if candidates.get("per_scene") == "grid":
+            # The cells of a whole grid are ranked against each other, so one robot stands on all.
+            candidates.setdefault("robots_per_scene", 1)
+    fields |= {
+        "label_source": label_source,
+        "houses": Source(kind=houses.kind, digest=houses.digest),
+        "objects": Source(kind=objects.kind, digest=objects.digest),
+    }
+    spec = validated(fields, place)
+    if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
+        problem = f"a whole grid is not only {spec.candidates.within}"
+        raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
+    if chosen is not None:
+        refuse_unsuited(spec, chosen, place, "Correct the values, or take another --robot")
+    for field, name, registry in (
+        ("settle.engine", spec.settle.engine, SETTLERS),
+        ("observation.renderer", spec.observation.renderer, RENDERERS),
+    ):
+        if name not in registry:
+            raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
+    load_settler(spec.settle.engine)
+    load_renderer(spec.observation.renderer)
+    return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
+
+
+def read_fields(config: Path | None) -> dict[str, Any]:
+    """The fields that the file sets. Raises InputError for those that are not set there."""
+    fields = read_toml(config) if config else {}
+    for reserved in ("label_source", "houses", "objects", "engines", "scenes_from"):
+        if reserved in fields:
+            raise InputError(
+                config or "", reserved, "is not set in this file", "Give it on the command line instead"
+            )
+    return fields
+
+
+def validated(fields: dict[str, Any], place: str) -> Specification:
+    """The specification of these fields. Raises InputError naming the first that is wrong."""
+    try:
+        return Specification.model_validate(fields)
+    except ValidationError as error:
+        raise first_of(error, place) from None
+
+
+def first_of(error: ValidationError, place: str, *section: str) -> InputError:
+    """The first field that is wrong in a file, or in this section of it, as one line."""
+    first = error.errors()[0]
+    field = ".".join((*section, *map(str, first["loc"])))
+    mend = (
+        "Take the key out, or correct it: docs/specification.md lists all"
+        if (first["type"] == "extra_forbidden")
+        else "Correct the value"
+    )
+    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend)
+
+
+def layout_of(spec: Specification, n: int) -> Layout:
+    """Scenes in shards of about 32, fewer for a small run so that workers share it evenly.
+
+    A number of scenes that divides evenly is preferred: then nothing beyond n is made.
+    """
+    scenes = -(-n // spec.candidates.count)
+    most = max(1, min(_SCENES_PER_SHARD, scenes // _SHARDS_AT_LEAST))
+    even = next((k for k in range(most, most // 2, -1) if scenes % k == 0), most)
+    return Layout(scenes_per_shard=even, candidates_per_scene=spec.candidates.count)
+
+
+def scene_engine_names(spec: Specification) -> set[str]:
+    """Names in `engines` of what moves bits of the scenes and candidates of this specification."""
+    used = (spec.settle.engine, spec.observation.renderer)
+    return {"scenes", *(_ENGINE_PACKAGES[name] for name in used)}
+
+
+def label_engines(label_source: str) -> dict[str, str]:
+    """Versions of what moves bits of labels, and of the random streams that scenes and labels draw from."""
+    return {
+        _ENGINE_PACKAGES["embree"]: version(_ENGINE_PACKAGES["embree"]),
+        # numpy may change what a generator draws between feature releases, never between patches.
+        "numpy": ".".join(version("numpy").split(".")[:2]),
+        "labels": str(load_label_source(label_source).version),
+        **arm_versions(label_source),
+    }
+
+
+def scene_engines(spec: Specification) -> dict[str, str]:
+    """Versions here of what moves bits of the scenes and candidates of this specification."""
+    packages = sorted(scene_engine_names(spec) - {"scenes"})
+    return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
+
+
+def read_toml(path: Path, mend: str = "Give a TOML file as docs/specification.md shows it") -> dict[str, Any]:
+    """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
+    data = read_regular(path, _MAX_CONFIG_BYTES, mend)
+    try:
+        return parse_toml(data.decode())
+    except ValueError as error:
+        raise InputError(path, "", f"is not TOML: {error}", mend) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """What TOML text holds. ValueError where it is none, or nested more deeply than any configuration."""
+    # The parser's memory grows with the square of the parts of a dotted key.
+    if any(line.count(".") > 1000 for line in text.splitlines()):
+        raise ValueError("nested too deeply: more than 1000 dots in a line")
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level: list[Any] = [document]
+    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond what can be printed
+        tables = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [value for table in tables for value in table if isinstance(value, dict | list)]
+    if level:
+        raise ValueError("nested too deeply")
+    return document
+
+
+def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None) -> None:
+    """Set a dotted name in nested dictionaries."""
+    *parents, leaf = name.split(".")
+    for parent in parents:
+        below = fields.setdefault(parent, {})
+        if not isinstance(below, dict):
+            raise InputError(config or "", parent, "is a value where a section belongs", f"Write [{parent}]")
+        fields = below
+    fields[leaf] = value

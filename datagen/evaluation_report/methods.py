@@ -1,0 +1,133 @@
+"""The methods that are evaluated: models by their checkpoints, and baselines by their names."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from datagen.schemas.errors import InputError
+from datagen.train.baselines.scalars import Scalars
+from datagen.train.evaluation.comparisons import NO_TRAINING, TrainedBy
+from datagen.train.evaluation.evaluation import Method
+from datagen.train.scorers import ModelScorer, Scorer
+
+if TYPE_CHECKING:
+    from datagen.train.training.checkpoints import CheckpointHead
+
+# What a checkpoint's stage is called as a regime of training: stage 2 is the end of two.
+REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedMethod:
+    """One method with where it comes from.
+
+    Models have a place and a checkpoint, baselines their fitted numbers. `note` is what else has to be
+    said of it wherever it is named.
+    """
+
+    name: str
+    scorer: Scorer
+    place: str = ""
+    head: CheckpointHead | None = None
+    state: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+    @property
+    def regime(self) -> str:
+        """How the model was trained; "" of a baseline."""
+        return REGIMES.get(self.head.stage, self.head.stage) if self.head else ""
+
+    @property
+    def origin(self) -> TrainedBy:
+        """What trained it, for comparisons of like with like."""
+        if self.head is None:
+            return NO_TRAINING
+        return TrainedBy(self.regime, self.head.model, house_share(self.head))
+
+    @property
+    def method(self) -> Method:
+        """As metrics know it."""
+        is_probability = self.head is not None or isinstance(self.scorer, Scalars)
+        return Method(self.name, self.scorer.threshold, self.origin, is_probability)
+
+    @property
+    def houses(self) -> frozenset[str]:
+        """Houses that it was trained on, or by which its best epoch was chosen."""
+        return frozenset(self.head.house_ids + self.head.val_house_ids) if self.head else frozenset()
+
+    @property
+    def objects(self) -> frozenset[str]:
+        """Digests of the objects that it was trained on."""
+        return frozenset(self.head.object_digests) if self.head else frozenset()
+
+    def record(self) -> dict[str, Any]:
+        """What the report says of it."""
+        base = {
+            "name": self.name,
+            "regime": self.regime or None,
+            "threshold": None if self.method.only_picks else self.scorer.threshold,
+            "note": self.note or None,
+        }
+        if self.head is None:
+            return {**base, "checkpoint": None, "state": dict(self.state)}
+        head = self.head
+        return {
+            **base,
+            "checkpoint": {
+                "place": self.place,
+                "sha256": head.digest,
+                "model": head.model,
+                "config": head.model_config,
+                "stage": head.stage,
+                "data": list(head.data),
+                "best_epoch": head.best_epoch,
+                "finished": head.finished,
+                "cost": head.cost,
+                "init": head.init,
+            },
+        }
+
+
+def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
+    """The models of these checkpoints, named by their regimes, and by what else tells equal ones apart."""
+    if not places:
+        return []
+    from datagen.train.training.checkpoints import load_model
+
+    loaded = [(place, *load_model(place)) for place in places]
+    names = _names([(_regime_name(head), head.model) for _, _, head in loaded])
+    by_digest: dict[str, str] = {}
+    for place, _, head in loaded:
+        if head.digest in by_digest:
+            raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
+        by_digest[head.digest] = place
+    return [
+        EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), place, head)
+        for (place, model, head), name in zip(loaded, names, strict=True)
+    ]
+
+
+def house_share(head: CheckpointHead) -> float:
+    """Of the houses that it could have learned from, the share that it did learn from."""
+    share = head.options.get("house_share", 1.0)
+    return float(share) if isinstance(share, (int, float)) else 1.0
+
+
+def _regime_name(head: CheckpointHead) -> str:
+    regime, share = REGIMES.get(head.stage, head.stage), house_share(head)
+    return regime if share == 1 else f"{regime} {share:.0%}"
+
+
+def _names(known: Sequence[tuple[str, str]]) -> list[str]:
+    """A name for each (regime, model): the regime alone, with the model, or with a number as well."""
+    regimes, both = Counter(regime for regime, _ in known), Counter(known)
+    numbers: Counter[tuple[str, str]] = Counter()
+    names: list[str] = []
+    for regime, model in known:
+        numbers[regime, model] += 1
+        name = regime if regimes[regime] == 1 else f"{regime} {model}"
+        names.append(name if both[regime, model] == 1 else f"{name} {numbers[regime, model]}")
+    return names

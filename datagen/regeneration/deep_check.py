@@ -1,0 +1,120 @@
+"""Deep checks of a run: samples recomputed from their stored poses, scenes drawn again from their seeds.
+
+Digests say that bytes are those that were written; these checks say that what was written is what the
+specification means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+
+import numpy as np
+
+from datagen.regeneration.scenes import Replayer, chosen_rows, open_replayer, what_differs_here
+from datagen.regeneration.shards import OpenedSources
+from datagen.regeneration.stage_comparison import (
+    DRAWN,
+    RECOMPUTED,
+    STAGES,
+    StageComparison,
+    beyond_tolerance,
+    compare_stages,
+)
+from datagen.schemas.checking.finding import Finding
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import shard_folder
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
+
+_MEND = "Trust neither it nor its neighbours: find out what made it"
+# Candidates of a drawn scene that are labelled where a label is a plan or a trial.
+_TRIED = 4
+
+
+def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Generator) -> Iterator[Finding]:
+    """What is wrong with k random committed samples and k random committed scenes of a run.
+
+    The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
+    Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
+    tolerances, and of scenes what is drawn before any physics (docs/determinism.md). Scenes of another
+    run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys of the
+    findings are those below the run's own place.
+    """
+    shards = sorted(run.committed())
+    if not shards or k < 1:
+        return
+    replayer = open_replayer(run, origin)
+    per_shard, per_scene = run.layout.samples_per_shard, run.layout.candidates_per_scene
+    of_shard = rng.choice(len(shards), k)
+    within = rng.integers(per_shard, size=k)
+    places = sorted(
+        {(shards[s] * per_shard + i) for s, i in zip(of_shard.tolist(), within.tolist(), strict=True)}
+    )
+    for scene, group in groupby(places, key=lambda place: place // per_scene):
+        yield from _checked(run, scene, _sample_findings(replayer, scene, [p % per_scene for p in group]))
+    if replayer.drawing is None:
+        return
+    of_shard = rng.choice(len(shards), k)
+    within = rng.integers(run.layout.scenes_per_shard, size=k)
+    scenes = {
+        shards[s] * run.layout.scenes_per_shard + i
+        for s, i in zip(of_shard.tolist(), within.tolist(), strict=True)
+    }
+    for scene in sorted(scenes):
+        count = per_scene if run.manifest.spec.arm is None else min(_TRIED, per_scene)
+        rows = sorted(rng.choice(per_scene, count, replace=False).tolist())
+        yield from _checked(run, scene, _scene_findings(replayer, scene, rows))
+
+
+def _checked(run: Run, scene: int, findings: Iterator[Finding]) -> Iterator[Finding]:
+    """The findings; what refuses the stored rows is one of them."""
+    try:
+        yield from findings
+    except InputError as error:
+        key, problem = str(error.place).removeprefix(f"{run.storage.url}/"), f"scene {scene}: {error.problem}"
+        yield Finding(key, "deep", problem, _MEND, scene // run.layout.scenes_per_shard)
+
+
+def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
+    run = replayer.run
+    shard = scene // run.layout.scenes_per_shard
+    stored = next(read_scenes(run, [scene]))
+    made = replayer.recompute(stored, rows)
+    kept = chosen_rows(stored, rows)
+    if what_differs_here(run, shard):
+        problems = beyond_tolerance(run.manifest.spec, kept.samples, made.samples)
+        if problems:
+            yield _finding(run, shard, scene, f"recomputed from stored poses: {'; '.join(problems)}")
+        yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, ("candidates",)))
+        return
+    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, RECOMPUTED))
+
+
+def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
+    run = replayer.run
+    shard = scene // run.layout.scenes_per_shard
+    stored = next(read_scenes(run, [scene]))
+    made = replayer.redraw(scene, rows)
+    kept = chosen_rows(stored, rows)
+    stages = tuple(STAGES)
+    if what_differs_here(run, shard):
+        # Physics that ends otherwise may ask for another try, and then all draws are others.
+        stages = DRAWN[:1] if int(made.record["retry"]) == int(stored.record["retry"]) else ()
+    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, stages), "drawn again")
+
+
+def _of_stages(
+    run: Run, shard: int, scene: int, stages: list[StageComparison], how: str = "recomputed from stored poses"
+) -> Iterator[Finding]:
+    apart = [stage for stage in stages if not stage.equal]
+    if apart:
+        # Later stages follow from the first that differs.
+        first = apart[0]
+        text = "; ".join(str(d) for d in first.differences)
+        yield _finding(run, shard, scene, f"{how}: {first.stage}: {text}", first.differences[0].field)
+
+
+def _finding(run: Run, shard: int, scene: int, problem: str, field: str = "label") -> Finding:
+    folder = shard_folder(shard, run.commit_of(shard).attempt)
+    return Finding(f"{folder}/{field}", "deep", f"scene {scene}, {problem}", _MEND, shard)

@@ -1,0 +1,139 @@
+"""Scenes of a run made again: drawn from their seeds, or reconstructed from what is stored, and labelled."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+
+import numpy as np
+
+from datagen.cluster.attempt_guard import this_host
+from datagen.configuration.specify import label_engines, scene_engines
+from datagen.regeneration.shards import OpenedSources, source_of
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.run import Run
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.labels import load_label_source
+from datagen.workers.run_shard import Columns, candidate_columns, scene_row
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.world import World, assemble_world
+
+
+@dataclass(frozen=True, eq=False)
+class Replayer:
+    """A run opened to make its scenes again.
+
+    `drawing` draws its scenes; None where they come from another run that is not there any more.
+    """
+
+    run: Run
+    world: World
+    drawing: World | None
+
+    def redraw(self, scene: int, rows: Sequence[int] | None = None) -> SceneRows:
+        """Scene `scene` drawn from its seeds as a worker does, redraws included, and labelled.
+
+        `rows` chooses the candidates that are labelled; by default all. Raises InputError where the
+        scene cannot be drawn.
+        """
+        if self.drawing is None:
+            raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _MEND)
+        drawn, candidates = generate_scene(self.drawing, scene, StageClock())
+        plain = scene_row(drawn)
+        fields = self.run.schema.scene_fields
+        record = {f.name: np.array(plain[f.name], object if f.is_text else f.dtype) for f in fields}
+        settled: SettledScene = drawn
+        if self.drawing is not self.world:  # another run drew it: it reaches the labels as a record
+            settled = reconstruct_scene(self.world, record)
+        chosen = range(len(candidates)) if rows is None else rows
+        return SceneRows(record, self._samples(settled, candidates, chosen))
+
+    def recompute(self, stored: SceneRows, rows: Sequence[int]) -> SceneRows:
+        """The candidates `rows` of a stored scene, labelled again from the stored poses.
+
+        InputError where the record names what is not there, or poses that nothing can have.
+        """
+        scene = reconstruct_scene(self.world, stored.record)
+        candidates = reconstruct_candidates(stored.samples, scene)
+        return SceneRows(stored.record, self._samples(scene, candidates, rows))
+
+    def _samples(self, scene: SettledScene, candidates: SceneCandidates, rows: Sequence[int]) -> Columns:
+        spec = self.run.manifest.spec
+        source = load_label_source(spec.label_source)
+        common = candidate_columns(scene.index, candidates, self.run.manifest.spec_hash, source)
+        chosen = {name: values[list(rows)] for name, values in common.items()}
+        return chosen | source.columns(scene, candidates, spec, rows)
+
+
+_NO_DRAWING = "the run that drew the scenes is not there any more"
+_MEND = "Give --scenes-from the run that drew them"
+
+
+def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
+    """A run opened to make its scenes again from its origin, where whatever drew them is there."""
+    drawn_by = run if origin.scenes is None else origin.scenes
+    while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
+        drawn_by = _source_if_there(drawn_by)
+    if drawn_by is run:
+        return Replayer(run, origin.world, origin.world)
+    if drawn_by is None:
+        return Replayer(run, origin.world, None)
+    houses, objects = origin.world.houses, origin.world.objects
+    drawing = assemble_world(drawn_by.manifest.spec, houses, objects, "--houses", "--objects")
+    return Replayer(run, origin.world, drawing)
+
+
+def _source_if_there(run: Run) -> Run | None:
+    try:
+        return source_of(run)
+    except InputError:
+        return None
+
+
+def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:
+    """The same scene with these of its samples."""
+    return SceneRows(stored.record, {name: values[list(rows)] for name, values in stored.samples.items()})
+
+
+def what_differs_here(run: Run, shard: int | None = None) -> list[str]:
+    """In what this machine differs from the one that made the run, as far as bits depend on it.
+
+    Empty where a replay must be equal bit for bit. With `shard`, the processor of its commit counts too:
+    what its vector units make of a sum may differ.
+    """
+    manifest = run.manifest
+    found: list[str] = []
+    if _platform_name(manifest.platform) != _platform_name(platform.platform()):
+        found.append(f"platform {manifest.platform}, here {platform.platform()}")
+    for name, (made, here) in _differing(manifest.spec.engines, _engines_here(run)):
+        found.append(f"{name} {made}, here {here}")
+    if shard is not None:
+        cpu = run.commit_of(shard).host.cpu
+        if cpu != this_host().cpu:
+            found.append(f"processor {cpu}, here {this_host().cpu}")
+    return found
+
+
+def _engines_here(run: Run) -> dict[str, str]:
+    spec = run.manifest.spec
+    try:
+        return scene_engines(spec) | label_engines(spec.label_source)
+    except (PackageNotFoundError, InputError):
+        return {}
+
+
+def _differing(made: Mapping[str, str], here: Mapping[str, str]) -> list[tuple[str, tuple[str, str]]]:
+    pairs = {name: (version, here.get(name, "none")) for name, version in made.items()}
+    return [(name, pair) for name, pair in sorted(pairs.items()) if pair[0] != pair[1]]
+
+
+def _platform_name(text: str) -> tuple[str, str]:
+    """System, and machine with its C library: what the kernel's version between them does not change."""
+    machine = platform.machine()
+    return text.partition("-")[0], text.rpartition(machine)[2] if machine in text else text

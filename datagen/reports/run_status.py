@@ -1,0 +1,166 @@
+"""How far runs are, as plain values: sums over commits and ledger, from their summaries."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from datagen.cluster.retry_policy import RetryPolicy
+from datagen.schemas.lineage import lineage_summary
+from datagen.schemas.merged_runs import open_runs
+from datagen.schemas.quarantine import lifted_records
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Outcome
+from datagen.schemas.sealing import SealedPart, SealedRoot, sealed_root
+from datagen.schemas.shard_ranges import ShardRanges
+from datagen.schemas.storage import Storage
+from datagen.schemas.summaries import Summaries
+
+_SHOWN = 20  # causes and stacks
+_GOOD = ("committed", "superseded", "cancelled")
+# Of what a shard may spend in one job; crash, hang and failure have one budget together.
+_BUDGETS: dict[Outcome, int] = {
+    "failed": RetryPolicy.max_failures,
+    "crashed": RetryPolicy.max_failures,
+    "hung": RetryPolicy.max_failures,
+    "out_of_memory": RetryPolicy.max_out_of_memory,
+    "lost": RetryPolicy.max_lost,
+}
+
+
+def runs_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
+    """The state of the run at a place, or of several that were merged: their sums, and each under `parts`."""
+    runs, root = open_runs(place), sealed_root(place)
+    reports = [status_report(run, root, stacks) for run in runs]
+    return reports[0] if len(reports) == 1 else _sum(place, reports)
+
+
+def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
+    """The state of a run. `root` is of the store that holds it, by default the run's own."""
+    summaries, n = Summaries(run), run.n
+    planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(summaries.shards)
+    given_up = run.quarantine_records()
+    quarantined = [record.shard for record in given_up]
+    labels = labels_made = positives = 0
+    winners: set[str] = set()
+    for commit in summaries.commits():
+        labels += run.layout.rows_wanted(commit.shard, n)[1]
+        labels_made += commit.samples
+        positives += commit.positives
+        winners.add(commit.attempt)
+    outcomes: Counter[str] = Counter()
+    causes: Counter[str] = Counter()
+    examples: dict[str, str] = {}  # an attempt of each cause
+    spent: dict[Outcome, Counter[int]] = {}  # attempts by shard
+    for entry in summaries.ends():
+        outcomes[entry.outcome] += 1
+        if entry.outcome not in _GOOD:
+            spent.setdefault(entry.outcome, Counter())[entry.shard] += 1
+        if entry.cause:
+            cause = f"{entry.outcome}: {entry.cause}"
+            causes[cause] += 1
+            examples.setdefault(cause, entry.attempt)
+    unfinished = {start.attempt for start in summaries.unfinished()} - winners
+    root = root or sealed_root(run.storage)
+    absent, part = planned.without(committed), root.part(run.manifest.spec_hash) if root else None
+    common = dict(causes.most_common(_SHOWN))
+    report: dict[str, Any] = {
+        "run": run.storage.url,
+        "label_source": run.manifest.spec.label_source,
+        "spec_hash": run.manifest.spec_hash,
+        "scenes_from": run.manifest.sources.get("scenes_from"),
+        "created": run.manifest.created,
+        "n": n,
+        "labels": labels,
+        # Commits count whole shards, and so more than n where the last one is cut.
+        "labels_made": labels_made,
+        "positives": positives,
+        "shards": {
+            "planned": len(planned),
+            "committed": len(planned) - len(absent),
+            "quarantined": quarantined,
+            "missing": len(absent.without(ShardRanges.of(quarantined))),
+        },
+        "attempts": dict(sorted(outcomes.items())),
+        "attempts_without_end": len(unfinished),
+        "causes": common,
+        "budgets": [
+            {
+                "outcome": outcome,
+                "attempts": counts.total(),
+                "shards": len(counts),
+                "most_on_one_shard": max(counts.values()),
+                "budget": _BUDGETS.get(outcome),
+            }
+            for outcome, counts in sorted(spent.items())
+        ],
+        "quarantine": [
+            {
+                "shard": record.shard,
+                "attempts": len(record.attempts),
+                "cause": record.causes[-1] if record.causes else "",
+            }
+            for record in given_up
+        ],
+        "taken_out_of_quarantine": len(lifted_records(run)),
+        "lineage": lineage_summary(run),
+        # An older seal, of a shorter run or with fewer shards, does not count.
+        "sealed": part is not None and part.n == n and absent == part.missing_shards,
+        "sealed_labels": _sealed_labels(run, part) if part else None,
+        "complete": not absent,
+    }
+    if stacks:
+        ends = {cause: run.ledger.end_of(examples[cause]) for cause in common}
+        report["stacks"] = {cause: end.stack for cause, end in ends.items() if end is not None and end.stack}
+    return report
+
+
+def _sealed_labels(run: Run, part: SealedPart) -> int:
+    """Rows of a run in a store that was sealed without some of its shards."""
+    return part.n - sum(run.layout.rows_wanted(shard, part.n)[1] for shard in part.missing_shards)
+
+
+def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
+    total: dict[str, Any] = {
+        "run": place.url,
+        "label_source": parts[0]["label_source"],
+        "spec_hash": "",
+        "scenes_from": None,
+        "created": min(part["created"] for part in parts),
+        "complete": all(part["complete"] for part in parts),
+        "sealed": all(part["sealed"] for part in parts),
+        "lineage": [],
+    }
+    for key in ("n", "labels", "labels_made", "positives", "attempts_without_end", "taken_out_of_quarantine"):
+        total[key] = sum(part[key] for part in parts)
+    for key in ("attempts", "causes"):
+        counts = sum((Counter[str](part[key]) for part in parts), Counter[str]())
+        total[key] = dict(counts.most_common(_SHOWN))
+    shards = [part["shards"] for part in parts]
+    counted = {key: sum(s[key] for s in shards) for key in ("planned", "committed", "missing")}
+    # A shard's number says nothing without its part.
+    given_up = [f"{number}:{shard}" for number, s in enumerate(shards) for shard in s["quarantined"]]
+    total["shards"] = counted | {"quarantined": given_up}
+    total["quarantine"] = [
+        q | {"shard": f"{number}:{q['shard']}"}
+        for number, part in enumerate(parts)
+        for q in part["quarantine"]
+    ]
+    total["budgets"] = _sum_budgets([row for part in parts for row in part["budgets"]])
+    known = [part["sealed_labels"] for part in parts if part["sealed_labels"] is not None]
+    total["sealed_labels"] = sum(known) if known else None
+    if "stacks" in parts[0]:
+        total["stacks"] = {cause: stack for part in parts for cause, stack in part["stacks"].items()}
+    return total | {"parts": parts}
+
+
+def _sum_budgets(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        before = found.get(row["outcome"], {"attempts": 0, "shards": 0, "most_on_one_shard": 0})
+        found[row["outcome"]] = row | {
+            "attempts": before["attempts"] + row["attempts"],
+            "shards": before["shards"] + row["shards"],
+            "most_on_one_shard": max(before["most_on_one_shard"], row["most_on_one_shard"]),
+        }
+    return [found[outcome] for outcome in sorted(found)]

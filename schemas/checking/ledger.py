@@ -1,0 +1,114 @@
+"""The rest of the ledger, without the accounts of committed attempts: ends, starts, what is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from datagen.schemas.checking.commits import account_finding, odd_cost
+from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.checking.records import read
+from datagen.schemas.ledger import lost_end, start_from_end
+from datagen.schemas.quarantine import name_before
+from datagen.schemas.record_files import encode_record, utc_now
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
+
+_GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, at a cost unknown"
+
+
+@dataclass
+class LedgerTotals:
+    """Wall seconds as the records have them: the ledger's must be the commits' and the waste's."""
+
+    committed_wall_s: float = 0.0
+    wasted_wall_s: float = 0.0
+    attempts: int = 0
+    without_account: int = 0
+    unfinished: int = 0  # began, left no end, and may still run
+    lost_shards: dict[int, str] = field(default_factory=dict[int, str])  # committed by the ledger alone
+
+
+def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> Iterator[Finding]:
+    """Every ledger record but those of `committed` attempts (shard -> attempt); adds to the totals."""
+    names: set[str] = set()
+    for file in run.storage.list("ledger"):
+        name = file.key.removeprefix("ledger/")
+        if name.endswith(".json") and "/" not in name:
+            names.add(name.removesuffix(".json"))
+        elif not name.endswith(".part"):  # what a killed writer left
+            yield Finding(file.key, "foreign", "is no record of the ledger", "Move it away")
+    done = set(committed.values())
+    ends = {name for name in names if not name.endswith(".start")}
+    starts = {name.removesuffix(".start") for name in names if name.endswith(".start")}
+    quarantined = run.quarantined()
+    for attempt in sorted(ends - done):
+        yield from _check_end(run, attempt, attempt in starts, committed, totals)
+    for attempt in sorted(starts - ends - done):
+        yield from _check_unfinished(run, attempt, committed, quarantined, totals)
+
+
+def _check_end(
+    run: Run, attempt: str, has_start: bool, committed: Mapping[int, str], totals: LedgerTotals
+) -> Iterator[Finding]:
+    end = read(run.storage, f"ledger/{attempt}.json", LedgerEntry, lambda e: _misnamed(e.attempt, attempt))
+    start = read(
+        run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
+    )
+    totals.attempts += 1
+    if end.record is None:
+        yield Finding(end.key, "account", end.problem, _GONE)
+        if start.record is None:
+            yield Finding(start.key, "account", start.problem, _GONE)
+        return
+    noted = end.record
+    if start.record is None:
+        yield account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
+    if odd := odd_cost(noted.cost):
+        mend = "Look at what wrote it: the record is as it was written"
+        yield Finding(end.key, "account", odd, mend, noted.shard)
+    totals.without_account += noted.cost is None
+    totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
+    if noted.outcome == "committed" and noted.shard not in committed:
+        totals.lost_shards[noted.shard] = attempt
+
+
+def _check_unfinished(
+    run: Run, attempt: str, committed: Mapping[int, str], quarantined: set[int], totals: LedgerTotals
+) -> Iterator[Finding]:
+    start = read(
+        run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
+    )
+    totals.attempts += 1
+    if start.record is None:
+        yield Finding(start.key, "account", start.problem, _GONE)
+    elif start.record.shard in committed or start.record.shard in quarantined:
+        shard = start.record.shard
+        problem = "missing, though its shard is decided; what it cost is lost"
+        totals.without_account += 1
+        cure = Restore(encode_record(lost_end(start.record, utc_now())), is_guess=True)
+        yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
+    else:
+        totals.unfinished += 1
+
+
+def check_quarantine(run: Run) -> Iterator[Finding]:
+    """The records of shards that were given up."""
+    mend = "Restore the file from a backup; or remove it: the shard is then tried again"
+    for file in run.storage.list("quarantine"):
+        name = file.key.removeprefix("quarantine/")
+        if name.endswith(".part"):
+            continue
+        record = read(run.storage, file.key, QuarantineRecord)
+        problem = record.problem
+        if record.record is not None:
+            shard = record.record.shard
+            problem = _misnamed(f"{shard:06d}.json", name_before(name))
+            first, seed = shard * run.layout.scenes_per_shard, run.manifest.spec.seed
+            problem = problem or ": ".join(other_value(record.record, seed=seed, first_scene=first) or ())
+        if problem:
+            yield Finding(file.key, "record", problem, mend)
+
+
+def _misnamed(named: str, file: str) -> str:
+    return "" if named == file else "is the record of another"

@@ -1,0 +1,75 @@
+"""A place that holds one run, or several that were merged: the parts of a merged one are runs themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.keys import MERGED, part_folder
+from datagen.schemas.record_files import read_record
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import FORMAT_VERSION, Merged, other_value
+from datagen.schemas.storage import Storage, open_storage
+
+
+def open_runs(place: Storage | Path | str) -> list[Run]:
+    """The run at `place`, or the parts of a merged one, in the order of their rows in its store.
+
+    InputError when there is no run, or it is damaged or of another format.
+    """
+    storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
+    merged = read_record(storage, MERGED, Merged)
+    if merged is None:
+        return [Run.open(storage)]
+    if merged.format_version != FORMAT_VERSION:
+        raise InputError(
+            f"{storage.url}/{MERGED}",
+            "format_version",
+            f"{merged.format_version}, and this program reads {FORMAT_VERSION}",
+            "Use the version of the program that made the run",
+        )
+    runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
+    for run, spec_hash in zip(runs, merged.parts, strict=True):
+        if found := other_value(run.manifest, spec_hash=spec_hash):
+            raise InputError(f"{run.storage.url}/manifest.json", *found, "Mend it with `datagen repair`")
+    return runs
+
+
+@dataclass(frozen=True)
+class LabelCounts:
+    """What runs together want and have: labels, and planned shards without a commit."""
+
+    n: int
+    labels: int
+    missing: int
+
+
+def label_counts(runs: Iterable[Run]) -> LabelCounts:
+    """Sums over the runs of a place. Shards beyond a run's n do not count, and the last one is cut."""
+    n = labels = missing = 0
+    for run in runs:
+        run_n = run.n
+        shards = run.layout.shards_for(run_n)
+        done = [shard for shard in run.committed() if shard < shards]
+        n += run_n
+        labels += sum(run.layout.rows_wanted(shard, run_n)[1] for shard in done)
+        missing += shards - len(done)
+    return LabelCounts(n, labels, missing)
+
+
+def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
+    """The run that has scene `scene` of a place, and its index there: runs follow each other in order.
+
+    InputError where the place wants fewer scenes.
+    """
+    left = scene
+    for run in runs:
+        scenes = -(-run.n // run.layout.candidates_per_scene)
+        if 0 <= left < scenes:
+            return run, left
+        left -= scenes
+    last = scene - left - 1
+    problem = f"{scene} is not in this run" if len(runs) == 1 else f"{scene} is in none of these runs"
+    raise InputError(runs[0].storage.url, "--scene", problem, f"Choose one from 0 to {last}")

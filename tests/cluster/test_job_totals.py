@@ -1,0 +1,51 @@
+"""The account of one job over several runs."""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import pytest
+
+from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
+
+
+def summary(end: End, cause: str = "", committed: int = 1) -> JobSummary:
+    return JobSummary(end, cause, JobTotals(shards=3, committed=committed, labels=10 * committed), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("ends", "worst", "code"),
+    [
+        (("complete", "failed", "complete"), "failed", 1),
+        (("interrupted", "failed"), "interrupted", 130),
+        (("aborted", "interrupted", "failed"), "aborted", 2),
+        (("complete", "complete"), "complete", 0),
+    ],
+)
+def test_a_job_over_several_runs_ends_as_the_worst_of_them(
+    ends: tuple[End, ...], worst: End, code: int
+) -> None:
+    for order in (ends, ends[::-1]):
+        whole = reduce(JobSummary.plus, map(summary, order), empty_summary())
+        assert (whole.end, whole.exit_code) == (worst, code)
+
+
+def test_the_first_cause_of_the_worst_end_is_told() -> None:
+    parts = [summary("failed", "many"), summary("aborted", "disk"), summary("aborted", "gone")]
+    assert reduce(JobSummary.plus, parts).cause == "disk"
+
+
+def test_sums_are_over_all_runs() -> None:
+    whole = empty_summary().plus(summary("complete", committed=3)).plus(summary("interrupted", committed=1))
+    assert (whole.totals.shards, whole.totals.committed, whole.totals.labels) == (6, 4, 40)
+    assert (whole.remaining, whole.elapsed_s) == (2, 4.0)
+    assert (empty_summary().remaining, empty_summary().exit_code) == (0, 0)
+
+
+def test_only_the_first_shards_in_quarantine_are_named() -> None:
+    parts = [JobTotals(shards=30), JobTotals(shards=30)]
+    for totals in parts:
+        for shard in range(30):
+            totals.count_quarantined(shard)
+    both = parts[0].plus(parts[1])
+    assert both.quarantined == 60 and both.quarantined_shards == list(range(20))

@@ -1,0 +1,81 @@
+"""A machine that cannot make a run's shards is named before the first one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen.cluster.preflight import MachineReport, inspect_machine, refuse_unfit_machines, versions_of
+from datagen.cluster.task import ShardTask
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.storage import open_storage
+from tests.small_runs import files_of, make_small_run
+
+Ask = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("fitness") / "run"
+    make_small_run(folder, 8)
+    return Run.open(folder)
+
+
+def task_of(made: Run, run: str = "", houses: str = "builtin", objects: str = "builtin") -> ShardTask:
+    place, spec = run or made.storage.url, made.manifest.spec
+    return ShardTask(place, spec, made.layout, 0, "probe", houses, objects, deadline_s=0.0)
+
+
+def one_machine(seen: ShardTask | None = None, **answered: Any) -> Ask:
+    """A cluster of one other machine, which is this one, or sees other places, or answers as told."""
+
+    def ask(function: Any, task: ShardTask, *arguments: Any, patience_s: float) -> dict[str, Any]:
+        assert function is inspect_machine and patience_s > 0
+        return {"192.0.2.7 (node abc)": answered.get("finding") or inspect_machine(seen or task, *arguments)}
+
+    return ask
+
+
+def test_a_machine_that_sees_run_and_sources_is_fit_and_leaves_nothing_behind(run: Run) -> None:
+    before = files_of(Path(run.storage.url))
+    refuse_unfit_machines(one_machine(), run, task_of(run))
+    assert files_of(Path(run.storage.url)) == before
+    refuse_unfit_machines(lambda *arguments, patience_s: {}, run, task_of(run))  # nobody answers in time
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"run": "/no/such/run"}, "no such folder"),
+        ({"houses": "procthor:/no/such/houses"}, "/no/such/houses"),
+        ({"objects": "ycb:/no/such/objects"}, "/no/such/objects"),
+    ],
+)
+def test_a_machine_that_lacks_something_is_named(run: Run, changes: dict[str, str], problem: str) -> None:
+    with pytest.raises(InputError) as told:
+        refuse_unfit_machines(one_machine(task_of(run, **changes)), run, task_of(run))
+    assert str(told.value).startswith("machine 192.0.2.7 (node abc): ") and problem in str(told.value)
+    assert str(told.value).endswith("or on s3://")
+
+
+def test_another_folder_of_the_same_name_is_not_the_run(run: Run, tmp_path: Path) -> None:
+    for key, data in files_of(Path(run.storage.url)).items():
+        (tmp_path / key).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / key).write_bytes(data)
+    assert Run.open(tmp_path).manifest == run.manifest
+    copy = task_of(run, run=open_storage(tmp_path).url)
+    with pytest.raises(InputError, match="another folder has this name there"):
+        refuse_unfit_machines(one_machine(copy), run, task_of(run))
+
+
+def test_a_machine_with_other_versions_is_named(run: Run) -> None:
+    names = sorted(run.manifest.spec.engines)
+    here = versions_of(names)
+    assert here["numpy"] and here["scenes"] == ""
+    other = MachineReport("", {**here, "numpy": "1.0"})
+    with pytest.raises(InputError, match=r"numpy: it has 1\.0, and this machine .* Install"):
+        refuse_unfit_machines(one_machine(finding=other), run, task_of(run))

@@ -1,0 +1,166 @@
+"""The arm of a specification: filled in as the label source has it, and held against the robot's limits."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen import cli
+from datagen.configuration import arms
+from datagen.configuration.arms import (
+    complete_arm,
+    narrow_candidates,
+    refuse_missing_packages,
+    refuse_unsuited,
+    robot_of,
+)
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
+from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.specification import (
+    ArmParams,
+    CandidateParams,
+    DisturbanceParams,
+    Specification,
+    TrialParams,
+)
+from datagen.schemas.storage import open_storage
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.robots import ROBOTS, robot_limits
+
+SOURCES = {"houses": {"kind": "a", "digest": "1" * 64}, "objects": {"kind": "b", "digest": "2" * 64}}
+
+
+def completed(
+    source: str, fields: dict[str, Any] | None = None, robot: str | None = None, repeats: int | None = None
+) -> ArmParams | None:
+    fields = copy.deepcopy(fields or {})
+    complete_arm(source, fields, robot, repeats, "run.toml")
+    return Specification.model_validate(SOURCES | fields).arm
+
+
+def test_each_label_source_gets_the_sections_it_has() -> None:
+    assert completed("heuristic") is None
+    assert completed("plan") == ArmParams()
+    assert completed("sim") == ArmParams(trial=TrialParams())
+    assert completed("sim", repeats=3) == ArmParams(
+        trial=TrialParams(), disturbance=DisturbanceParams(repeats=3)
+    )
+
+
+def test_the_option_wins_over_the_file_and_the_file_over_the_default() -> None:
+    file = {"arm": {"robot": "panda", "motion": {"ik_seeds": 7}, "disturbance": {"base_yaw_std_rad": 0.1}}}
+    arm = completed("sim", file, robot="panda-scaled", repeats=2)
+    assert arm is not None and arm.disturbance is not None
+    assert (arm.robot, arm.motion.ik_seeds) == ("panda-scaled", 7)
+    assert (arm.disturbance.repeats, arm.disturbance.base_yaw_std_rad) == (2, 0.1)
+    kept = completed("sim", file)
+    assert kept is not None and kept.robot == "panda"
+
+
+@pytest.mark.parametrize(
+    ("source", "fields", "repeats", "words"),
+    [
+        ("heuristic", {"arm": {}}, None, ["run.toml", "arm", "heuristic has no arm"]),
+        ("plan", {"arm": {"trial": {}}}, None, ["run.toml", "arm.trial", "submit sim"]),
+        ("plan", {"arm": {"disturbance": {}}}, None, ["run.toml", "arm.disturbance", "submit sim"]),
+        ("plan", {}, 3, ["--perturb", "plan"]),
+        ("heuristic", {}, 3, ["--perturb", "heuristic"]),
+        ("sim", {}, 0, ["--perturb: 0:", "greater than or equal to 1"]),
+        ("sim", {}, -1, ["--perturb: -1:", "greater than or equal to 1"]),
+        ("sim", {}, 1001, ["--perturb: 1001:", "less than or equal to 1000"]),
+        ("plan", {"arm": {"robot": "hal"}}, None, ["run.toml: arm.robot:", "'hal'", "panda-scaled"]),
+    ],
+)
+def test_contradictions_are_refused(
+    source: str, fields: dict[str, Any], repeats: int | None, words: list[str]
+) -> None:
+    with pytest.raises(InputError) as error:
+        complete_arm(source, fields, None, repeats, "run.toml")
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_the_robot_is_that_of_the_option_or_of_the_arm() -> None:
+    assert robot_of({}, None) is None
+    assert robot_of({}, "panda") == "panda"
+    assert robot_of({"arm": {}}, None) == ArmParams().robot
+    assert robot_of({"arm": {"robot": "fetch"}}, None) == "fetch"
+    assert robot_of({"arm": {"robot": "fetch"}}, "panda") == "panda"
+
+
+@pytest.mark.parametrize("robot", sorted(ROBOTS))
+def test_narrowed_candidates_suit_the_robot(robot: str) -> None:
+    fields: dict[str, Any] = {}
+    narrow_candidates(fields, robot)
+    spec = Specification.model_validate(SOURCES | fields)
+    refuse_unsuited(spec, robot, "options", "")
+    limits, defaults = robot_limits(robot), CandidateParams()
+    assert limits.reach_m[0] <= spec.candidates.arm_reach_m.low <= spec.candidates.arm_reach_m.high
+    if limits.base_height_m is None:
+        assert spec.candidates.base_height_m == defaults.base_height_m
+    if limits.base_radius_m is not None:
+        assert spec.candidates.base_radius_m == limits.base_radius_m
+
+
+def test_the_scaled_family_leaves_the_papers_ranges_alone() -> None:
+    fields: dict[str, Any] = {}
+    narrow_candidates(fields, "panda-scaled")
+    assert Specification.model_validate(SOURCES | fields).candidates == CandidateParams()
+
+
+@pytest.mark.parametrize(
+    ("robot", "candidates", "field"),
+    [
+        ("panda-scaled", {"arm_reach_m": {"low": 0.2, "high": 0.5}}, "arm_reach_m"),
+        ("panda-scaled", {"arm_reach_m": {"low": 0.5, "high": 1.1}}, "arm_reach_m"),
+        ("panda", {"arm_reach_m": {"low": 0.7, "high": 0.947}}, "arm_reach_m"),
+    ],
+)
+def test_what_a_file_sets_stays_and_is_refused_where_the_robot_has_it_not(
+    robot: str, candidates: dict[str, Any], field: str
+) -> None:
+    fields: dict[str, Any] = {"candidates": candidates}
+    narrow_candidates(fields, robot)
+    spec = Specification.model_validate(SOURCES | fields)
+    assert getattr(spec.candidates, field).low == candidates[field]["low"]
+    with pytest.raises(InputError, match=f"candidates.{field}: .*{robot}"):
+        refuse_unsuited(spec, robot, "run.toml", "Correct it")
+
+
+def test_candidates_for_a_narrower_base_than_the_robot_has_are_refused() -> None:
+    fields: dict[str, Any] = {"candidates": {"base_radius_m": 0.1}}
+    narrow_candidates(fields, "fetch")
+    spec = Specification.model_validate(SOURCES | fields)
+    with pytest.raises(InputError, match=r"candidates.base_radius_m: .*fetch"):
+        refuse_unsuited(spec, "fetch", "run.toml", "Correct it")
+
+
+def test_a_missing_library_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse_missing_packages("heuristic")
+    monkeypatch.setitem(arms.ARM_PACKAGES, "plan", ("numpy", "no-such-planner"))
+    with pytest.raises(InputError, match=r"no-such-planner.*pip install pin coal mani-skill"):
+        refuse_missing_packages("plan")
+
+
+def test_the_help_of_submit_names_every_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["submit", "--help"]) == 0
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(name in told for name in ROBOTS)
+
+
+def test_whether_worlds_are_disturbed_is_said_for_each_run(tmp_path: Path) -> None:
+    spec = specify("sim", open_houses("builtin"), open_objects("builtin"), {}, None, repeats=4)
+    assert spec.arm is not None and spec.arm.disturbance is not None
+    manifest = manifest_of(spec, layout_of(spec, 625), {})
+    Run.create_or_open(open_storage(str(tmp_path / "run")), manifest, 625)
+    stored = open_stored_scenes(str(tmp_path / "run"), None, None, {})
+    still, disturbed = specify_again("sim", stored, None), specify_again("sim", stored, None, repeats=2)
+    assert still.arm == spec.arm.model_copy(update={"disturbance": None})
+    assert disturbed.arm is not None and disturbed.arm.disturbance is not None
+    assert disturbed.arm.disturbance.repeats == 2

@@ -1,0 +1,229 @@
+"""Fitting the distance-visibility rule: labels made by a hidden rule are found again, in any order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.heuristic_fit import (
+    FORMS,
+    Trials,
+    agreements,
+    begin_from,
+    fit,
+    fit_leaving_houses_out,
+    reach_in_sigmas,
+    refuse_too_little,
+)
+from datagen.workers.labels.distance_visibility_score import visibility_score
+
+BEFORE = HeuristicParams()
+N, SCENES = 600, 30
+
+
+def make_trials(seed: int, n: int = N, scenes: int = SCENES, houses: int = 12) -> Trials:
+    """Random candidates, seen like stored ones: hidden, half hidden or in full sight. Labels are noise."""
+    rng = np.random.default_rng(seed)
+    planar_m = rng.uniform(0.1, 1.2, n)
+    seen = rng.choice([0.0, 0.5, 1.0], n, p=[0.15, 0.25, 0.6])
+    return Trials(
+        scene=np.arange(n) % scenes,
+        house=np.array([f"house-{k % houses}" for k in range(scenes)], object),
+        distance_m=planar_m.astype(np.float32),
+        mount_distance_m=np.hypot(planar_m, rng.uniform(0, 0.4, n)).astype(np.float32),
+        arm_reach_m=rng.uniform(0.5, 1.0, n).astype(np.float32),
+        visibility=np.where(seen == 0.5, rng.uniform(0, 1, n), seen).astype(np.float32),
+        label=rng.random(n) < 0.4,
+    )
+
+
+def labelled_by(trials: Trials, params: HeuristicParams) -> Trials:
+    return replace(trials, label=trials.said(params))
+
+
+def permuted(trials: Trials, order: np.ndarray[Any, Any]) -> Trials:
+    """The same candidates in another order of rows; scenes keep their numbers."""
+    columns = ("scene", "distance_m", "mount_distance_m", "arm_reach_m", "visibility", "label")
+    return replace(trials, **{name: getattr(trials, name)[order] for name in columns})
+
+
+def share_equal(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
+    return float((a == b).mean())
+
+
+hidden_rules = st.builds(
+    lambda form, mu, sigma_l, sigma_r, sigmas: begin_from(BEFORE, form).model_copy(
+        update={
+            "mu": mu,
+            "sigma_l": sigma_l,
+            "sigma_r": sigma_r,
+            "tau": 0.51 * 0.6 + 0.49 * float(np.exp(-0.5 * sigmas**2)),
+        }
+    ),
+    st.sampled_from(FORMS),
+    st.floats(0.35, 0.8),
+    st.floats(0.05, 0.4),
+    st.floats(0.05, 0.4),
+    st.floats(0.8, 2.2),
+)
+
+
+@given(hidden_rules, st.integers(0, 1000), st.sampled_from(["balanced", "accuracy"]))
+@settings(max_examples=4, deadline=None)
+def test_labels_of_a_hidden_rule_are_found_again(hidden: HeuristicParams, seed: int, objective: Any) -> None:
+    trials = labelled_by(make_trials(seed), hidden)
+    if trials.label.sum() < 20:
+        return  # nothing but luck says where so few come from
+    found = fit(trials, BEFORE, [hidden.distance], objective)
+    assert share_equal(trials.said(found), trials.label) > 0.99
+    assert (found.distance, found.alpha, found.a) == (hidden.distance, hidden.alpha, hidden.a)
+    assert (found.d_min, found.d_max) == (hidden.d_min, hidden.d_max)
+
+
+def test_a_hidden_rule_of_another_weight_and_form_is_found_too() -> None:
+    hidden = begin_from(BEFORE, "mount-over-reach").model_copy(
+        update={"mu": 0.7, "sigma_l": 0.3, "sigma_r": 0.15, "alpha": 0.3, "tau": 0.45}
+    )
+    trials = labelled_by(make_trials(3), hidden)
+    found = fit(trials, BEFORE, ["planar", "mount-over-reach"], fit_alpha=True)
+    assert found.distance == hidden.distance
+    assert share_equal(trials.said(found), trials.label) > 0.99
+
+
+@pytest.mark.parametrize("objective", ["balanced", "accuracy"])
+def test_the_order_of_rows_changes_no_fit(objective: Any) -> None:
+    trials = make_trials(4, n=240)
+    other = permuted(trials, np.random.default_rng(5).permutation(len(trials)))
+    fitted = fit(trials, BEFORE, ["planar"], objective)
+    assert fitted == fit(other, BEFORE, ["planar"], objective) == fit(trials, BEFORE, ["planar"], objective)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=10, deadline=None)
+def test_the_order_of_rows_changes_no_figure(seed: int) -> None:
+    trials = make_trials(seed)
+    order = np.random.default_rng(seed).permutation(len(trials))
+    other = permuted(trials, order)
+
+    def refit(some: Trials) -> HeuristicParams:
+        return BEFORE.model_copy(update={"mu": float(np.median(some.distance_m[some.label]))})
+
+    ours, theirs = (fit_leaving_houses_out(t, refit, seed) for t in (trials, other))
+    assert ours.params == theirs.params
+    np.testing.assert_array_equal(ours.said[order], theirs.said)
+    a, b = (agreements(t, [left.said], 50, seed)[0] for t, left in ((trials, ours), (other, theirs)))
+    np.testing.assert_array_equal(a.confusion, b.confusion)
+    np.testing.assert_array_equal(a.balanced_accuracy.resamples, b.balanced_accuracy.resamples)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
+    """On labels that no rule explains, the fit is at least as good as the best of 2,000 guesses."""
+    trials, rng = make_trials(7, n=400), np.random.default_rng(8)
+    # Good ones lie nearer, so that there is something to find.
+    near = trials.distance_m < rng.normal(0.6, 0.3, len(trials))
+    trials = replace(trials, label=near)
+
+    def balanced(params: HeuristicParams) -> float:
+        return agreements(trials, [trials.said(params)], 1, 0)[0].balanced_accuracy.value
+
+    start = begin_from(BEFORE, form)
+    guesses = (
+        start.model_copy(update=dict(zip(("mu", "sigma_l", "sigma_r", "tau"), drawn, strict=True)))
+        for drawn in rng.uniform([0.2, 0.02, 0.02, 0.31], [1.0, 1.0, 1.0, 0.75], (2000, 4)).tolist()
+    )
+    assert balanced(fit(trials, BEFORE, [form])) >= max(map(balanced, guesses))
+
+
+@given(st.floats(0, 1), st.floats(0.31, 0.7), st.floats(0, 2))
+@settings(max_examples=50, deadline=None)
+def test_reach_in_sigmas_is_where_the_score_is_tau(rho: float, tau: float, sigmas: float) -> None:
+    params = BEFORE.model_copy(update={"tau": tau})
+    visible = visibility_score(np.array([rho]))
+    k = reach_in_sigmas(visible, params)[0]
+    score = params.alpha * visible[0] + (1 - params.alpha) * np.exp(-0.5 * sigmas**2)
+    if np.isnan(k):
+        assert params.alpha * visible[0] + (1 - params.alpha) < tau
+    elif abs(sigmas - k) > 1e-6:
+        assert (score > tau) == (sigmas < k)
+
+
+def test_every_house_is_labelled_by_a_rule_that_never_saw_it() -> None:
+    trials, seen = labelled_by(make_trials(1), BEFORE), list[set[str]]()
+
+    def refit(some: Trials) -> HeuristicParams:
+        seen.append(set(some.house[np.unique(some.scene)]))
+        assert len(some.house) == some.n_scenes == len(np.unique(some.scene))
+        # A rule that is known by its mu: it says which fold it was fitted for.
+        return BEFORE.model_copy(update={"mu": 0.1 * len(seen)})
+
+    steps = list[int]()
+    left_out = fit_leaving_houses_out(trials, refit, 0, lambda: steps.append(1))
+    assert len(steps) == len(left_out.params) == 5
+    for k, (houses, params) in enumerate(zip(seen, left_out.params, strict=True)):
+        unseen = np.array([trials.house[s] not in houses for s in trials.scene])
+        assert unseen.any(), k
+        np.testing.assert_array_equal(left_out.said[unseen], trials.said(params)[unseen])
+    assert sorted(h for houses in seen for h in set(trials.house) - houses) == sorted(set(trials.house))
+
+
+def test_what_was_learned_of_noise_shows_on_it_alone() -> None:
+    trials = make_trials(6, n=300)
+
+    def refit(some: Trials) -> HeuristicParams:
+        return fit(some, BEFORE, ["planar"])
+
+    left_out = fit_leaving_houses_out(trials, refit, 0).said
+    fitted, unseen = agreements(trials, [trials.said(refit(trials)), left_out], 200, 0)
+    assert fitted.balanced_accuracy.interval()[0] > 0.5
+    low, high = unseen.balanced_accuracy.interval()
+    assert low < 0.5 < high
+
+
+def test_other_seeds_deal_houses_otherwise() -> None:
+    trials, seen = labelled_by(make_trials(1), BEFORE), list[frozenset[str]]()
+
+    def refit(some: Trials) -> HeuristicParams:
+        seen.append(frozenset(some.house))
+        return BEFORE
+
+    for seed in (0, 0, 1):
+        fit_leaving_houses_out(trials, refit, seed)
+    assert seen[:5] == seen[5:10] and set(seen[:5]) != set(seen[10:])
+
+
+def test_a_rule_that_is_right_is_left_alone_in_its_figures() -> None:
+    trials = labelled_by(make_trials(2), BEFORE)
+    right, wrong = agreements(trials, [trials.said(BEFORE), ~trials.label], 20, 0)
+    assert right.accuracy.value == right.balanced_accuracy.value == 1
+    assert right.accuracy.interval() == (1, 1) and wrong.accuracy.interval() == (0, 0)
+    assert right.confusion.tolist() == [trials.label.sum(), 0, 0, (~trials.label).sum()]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: replace(t, label=np.zeros(len(t), bool)), "label: all 600 labels are 0"),
+        (lambda t: t.at(t.scene < 9), "9 scenes"),
+        (lambda t: replace(t, house=np.full(SCENES, "one", object)), "one house"),
+        (lambda t: t.at(np.zeros(len(t), bool)), "no candidate"),
+    ],
+)
+def test_what_says_too_little_is_refused(change: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        refuse_too_little(change(make_trials(0)), "runs")
+    refuse_too_little(make_trials(0), "runs")
+
+
+def test_a_class_that_lies_in_one_house_is_refused() -> None:
+    trials = make_trials(0)
+    label = np.array([trials.house[s] == "house-3" for s in trials.scene])
+    with pytest.raises(InputError, match="too few houses"):
+        fit_leaving_houses_out(replace(trials, label=label), lambda _: BEFORE, 0)

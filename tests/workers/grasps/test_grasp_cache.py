@@ -1,0 +1,221 @@
+"""Grasps of known objects, equal everywhere, and a cache that only ever saves time."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.schemas.specification import GraspParams
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.grasp_cache import content_digest, forget, grasps_of, scored_grasps
+from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
+from datagen.workers.grasps.search import TABLE_GAP_M
+from datagen.workers.objects.model import ObjectModel
+from tests.workers.grasps.shapes import bowl_model, box_gripper
+from tests.workers.worlds import box_model, box_vertices, cylinder_model, model_of
+
+GRIPPER = box_gripper()
+FEW = GraspParams(per_object=24)
+SIX = GraspParams(per_object=6)
+
+
+def same(a: GraspSet, b: GraspSet) -> bool:
+    return all(
+        x.tobytes() == y.tobytes()
+        for x, y in zip(
+            (a.T_object_tcp, a.opening_m, a.score), (b.T_object_tcp, b.opening_m, b.score), strict=True
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        box_model("box", (0.05, 0.04, 0.1)),
+        cylinder_model("can", 0.03, 0.1),
+        cylinder_model("lying flat", 0.042, 0.033, mass_kg=0.17),
+        bowl_model(),
+    ],
+    ids=lambda m: m.name,
+)
+def test_grasps_fit_the_hand_and_most_of_them_hold(model: ObjectModel) -> None:
+    params = GraspParams(per_object=40, min_score=0.0)
+    grasps = grasps_of(model, GRIPPER, params)
+    assert 20 <= len(grasps) <= 40
+    T = grasps.T_object_tcp
+    np.testing.assert_allclose(np.linalg.det(T[:, :3, :3]), 1)
+    assert (grasps.opening_m > 0).all() and (grasps.opening_m <= GRIPPER.max_opening_m).all()
+    assert (np.diff(grasps.score) <= 0).all() and grasps.score.mean() > 0.5
+    assert HandClearance(model.convex_parts_m, GRIPPER).free(T, grasps.opening_m).all()
+    assert len(np.unique(np.round(T, 6), axis=0)) == len(T)
+    # Both closing directions are offered.
+    assert ((T[:, :3, 1] @ T[0, :3, 1] > 0.99) & (T[:, :3, 2] @ T[0, :3, 2] > 0.99)).any()
+    flips = [
+        (np.abs(T[:, :3, 3] - T[k, :3, 3]).max(1) < 1e-9) & (T[:, :3, 1] @ T[k, :3, 1] < -0.999)
+        for k in range(len(T) - 1)
+    ]
+    assert sum(f.any() for f in flips) >= len(T) // 2
+
+
+def test_a_bowl_is_taken_by_its_rim() -> None:
+    """One finger inside: the closing axis is level and the hand is over the wall, not over the middle."""
+    bowl = bowl_model()
+    T = grasps_of(bowl, GRIPPER, GraspParams(per_object=40)).T_object_tcp
+    from_above = T[:, 2, 2] < -0.8
+    radius = np.linalg.norm(T[:, :2, 3], axis=1)
+    at_rim = from_above & (np.abs(radius - 0.068) < 0.01) & (np.abs(T[:, 2, 3] - 0.03) < 0.03)
+    assert at_rim.sum() >= 5
+
+
+@pytest.mark.parametrize("size_m", [(0.15, 0.03, 0.012), (0.09, 0.06, 0.02), (0.2, 0.012, 0.008)])
+def test_flat_things_on_a_table_have_grasps_above_it(size_m: tuple[float, float, float]) -> None:
+    model = box_model("flat", size_m, mass_kg=0.1)
+    scored = scored_grasps(model, GRIPPER, FEW)
+    assert scored.is_clear.sum() >= 10
+    low = lowest_m(GRIPPER, scored.T_object_tcp, scored.opening_m)
+    np.testing.assert_array_equal(scored.is_clear, low > TABLE_GAP_M - size_m[2] / 2)
+    assert (low[scored.is_clear] > -size_m[2] / 2).all()
+    assert scored.score[scored.is_clear].max() == 1.0
+
+
+def test_a_hand_that_is_not_symmetric_is_turned_only_where_it_fits() -> None:
+    """A lug on one side of the palm: turned by half a turn it would cut what stands there."""
+    lug = box_vertices((0.04, 0.02, 0.07), (0.05, 0.0, -0.02))
+    gripper = replace(GRIPPER, palm_parts_m=(*GRIPPER.palm_parts_m, lug))
+    model = box_model("plank", (0.3, 0.04, 0.1))
+    grasps = grasps_of(model, gripper, GraspParams(per_object=24, min_score=0.0))
+    assert len(grasps) >= 8
+    assert HandClearance(model.convex_parts_m, gripper).free(grasps.T_object_tcp, grasps.opening_m).all()
+
+
+def test_what_cannot_be_grasped_gives_none_and_a_reason() -> None:
+    cube = box_model("cube", (0.12, 0.12, 0.12))
+    # Two boards with a rod between them: narrow enough, but the hand cannot come in.
+    boards = [box_vertices((0.3, 0.3, 0.1), (0, 0, z)) for z in (-0.07, 0.07)]
+    spool = model_of("spool", cube.visual, [*boards, box_vertices((0.02, 0.02, 0.06))], 0.3)
+    flat = replace(cube, name="sheet", convex_parts_m=(box_vertices((0.1, 0.1, 0.0)),))
+    bare = replace(cube, name="bare", convex_parts_m=())
+    nan = replace(cube, name="nan", convex_parts_m=(cube.convex_parts_m[0] * np.float32("nan"),))
+    heavy = box_model("lead", (0.05, 0.05, 0.1), mass_kg=50.0)
+    for model, reason in (
+        (cube, "near enough"),
+        (spool, "touches"),
+        (flat, "volume"),
+        (bare, "no collision parts"),
+        (nan, "not finite"),
+        (heavy, "holds"),
+    ):
+        scored = scored_grasps(model, GRIPPER, FEW)
+        assert reason in scored.reason
+        assert len(grasps_of(model, GRIPPER, FEW)) == 0
+
+
+def test_parameters_choose_how_many_and_how_good() -> None:
+    box = box_model("tall", (0.06, 0.05, 0.2), mass_kg=1.0)
+    all_of_them = grasps_of(box, GRIPPER, GraspParams(per_object=30, min_score=0.0))
+    good = grasps_of(box, GRIPPER, GraspParams(per_object=30, min_score=0.7))
+    assert (good.score >= 0.7).all() and len(good) == (all_of_them.score >= 0.7).sum()
+    assert len(grasps_of(box, GRIPPER, GraspParams(per_object=1, min_score=0.0))) == 1
+
+
+def test_content_alone_decides() -> None:
+    box = box_model("box", (0.05, 0.04, 0.1))
+    digest = content_digest(box, GRIPPER, FEW)
+    assert content_digest(replace(box, name="other", digest="f" * 64), GRIPPER, FEW) == digest
+    assert content_digest(box, GRIPPER, FEW.model_copy(update={"per_scene": 3, "min_score": 0.1})) == digest
+    for changed in (
+        content_digest(replace(box, mass_kg=0.31), GRIPPER, FEW),
+        content_digest(box_model("box", (0.05, 0.04, 0.11)), GRIPPER, FEW),
+        content_digest(box, box_gripper(0.07), FEW),
+        content_digest(box, GRIPPER, GraspParams(per_object=25)),
+    ):
+        assert changed != digest
+
+
+_CHILD = """
+import hashlib
+from tests.workers.grasps.test_grasp_cache import GRIPPER, ORDER, SIX, grasps_of
+for model in ORDER[::-1]:
+    found = grasps_of(model, GRIPPER, SIX)
+    print(model.name, hashlib.sha256(found.T_object_tcp.tobytes() + found.score.tobytes()).hexdigest())
+"""
+ORDER = [cylinder_model("can", 0.03, 0.1), bowl_model()]
+
+
+def test_bit_equal_across_processes_and_order(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[3]
+    answers: list[set[str]] = []
+    for child in range(2):
+        env = {**os.environ, "DATAGEN_CACHE": str(tmp_path / f"child-{child}"), "PYTHONPATH": str(root)}
+        done = subprocess.run(
+            [sys.executable, "-c", _CHILD], env=env, capture_output=True, text=True, check=True
+        )
+        answers.append(set(done.stdout.split("\n")))
+    ours = {
+        f"{m.name} {hashlib.sha256(g.T_object_tcp.tobytes() + g.score.tobytes()).hexdigest()}"
+        for m, g in ((m, grasps_of(m, GRIPPER, SIX)) for m in ORDER)
+    }
+    assert answers[0] - {""} == answers[1] - {""} == ours
+
+
+def test_what_is_kept_is_what_was_found(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    box = box_model("box", (0.05, 0.04, 0.1))
+    first = grasps_of(box, GRIPPER, FEW)
+    forget()
+    monkeypatch.setattr(
+        "datagen.workers.grasps.grasp_cache.search_grasps", lambda *_: pytest.fail("searched again")
+    )
+    assert same(first, grasps_of(box, GRIPPER, FEW))
+    assert [file.suffix for file in (own_cache / "grasps").iterdir()] == [".npz"]
+
+
+def test_broken_and_foreign_files_are_worked_out_again(own_cache: Path) -> None:
+    box = box_model("box", (0.05, 0.04, 0.1))
+    first = grasps_of(box, GRIPPER, SIX)
+    (file,) = (own_cache / "grasps").iterdir()
+    good = file.read_bytes()
+    with np.load(file) as data:
+        content = dict(data)
+
+    def with_changed(**changed: object) -> bytes:
+        with file.open("wb") as out:
+            np.savez(out, **{**content, **changed})  # pyright: ignore[reportArgumentType]
+        return file.read_bytes()
+
+    T: F64 = content["T_object_tcp"]
+    for bad in (
+        b"",
+        b"not a zip",
+        good[: len(good) // 2],
+        good[:-40],
+        with_changed(key=np.array("0" * 64)),
+        with_changed(T_object_tcp=T[:, :3]),
+        with_changed(T_object_tcp=2 * T),
+        with_changed(T_object_tcp=T.astype(np.float32)),
+        with_changed(score=content["score"] + 2),
+        with_changed(opening_m=content["opening_m"][:-1]),
+        with_changed(counts=np.array(["x"])),
+    ):
+        file.write_bytes(bad)
+        forget()
+        assert same(first, grasps_of(box, GRIPPER, SIX))
+        assert file.read_bytes() == good or len(file.read_bytes()) == len(good)
+
+
+def test_a_cache_that_cannot_be_written_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = box_model("box", (0.05, 0.04, 0.1))
+    first = grasps_of(box, GRIPPER, SIX)
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file"))
+    forget()
+    assert same(first, grasps_of(box, GRIPPER, SIX))

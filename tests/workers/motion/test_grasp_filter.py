@@ -1,0 +1,100 @@
+"""The hand alone among things, and the choice of grasps that differ."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datagen.schemas.specification import MotionParams
+from datagen.workers.geometry.transforms import translation
+from datagen.workers.motion.collision import object_hulls, place, place_object
+from datagen.workers.motion.grasp_filter import (
+    best_different,
+    can_be_lifted,
+    free_grasps,
+    hand_of,
+    line_offsets_m,
+)
+from tests.workers.motion.tables import BOX_M, arm, box_grasps
+from tests.workers.worlds import box_model, box_vertices
+
+PARAMS = MotionParams()
+NOTHING = place([])
+
+
+def free_with(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> np.ndarray:
+    """Which of the box's grasps stay free among boxes given by size and centre in the target's frame."""
+    grasps, box = box_grasps(), box_model("box", BOX_M)
+    around = place([box_vertices(size, centre) for size, centre in boxes])
+    target = place_object(box, np.eye(4))
+    openings = grasps.opening_m.astype(np.float64)
+    return free_grasps(hand_of(arm().gripper), grasps.T_object_tcp, openings, around, target, PARAMS)
+
+
+def test_in_the_air_every_grasp_is_free() -> None:
+    assert free_with().all()
+
+
+def test_things_take_the_grasps_they_stand_in_the_way_of() -> None:
+    approach = box_grasps().T_object_tcp[:, :3, 2]
+    above = free_with(((0.3, 0.3, 0.02), (0, 0, 0.2)))
+    assert not above[approach[:, 2] < -0.5].any()
+    assert above[approach[:, 2] > -0.5].all()
+    # The hand of a grasp along +x comes from -x.
+    beside = free_with(((0.02, 0.3, 0.3), (-0.15, 0, 0)))
+    assert not beside[approach[:, 0] > 0.5].any()
+    assert beside[approach[:, 0] < -0.5].all()
+
+
+def test_a_hand_within_a_block_is_not_free() -> None:
+    assert not free_with(((2.0, 2.0, 2.0), (0, 0, 0))).any()
+
+
+def test_fingers_do_not_fit_around_what_is_wider_than_their_opening() -> None:
+    grasps, wide = box_grasps(), box_model("wide", (0.09, 0.09, 0.12))
+    target, openings = place_object(wide, np.eye(4)), grasps.opening_m.astype(np.float64)
+    hand = hand_of(arm().gripper)
+    assert not free_grasps(hand, grasps.T_object_tcp, openings, NOTHING, target, PARAMS).any()
+
+
+def test_fingers_follow_the_opening() -> None:
+    hand = hand_of(arm().gripper)
+    T = np.stack([np.eye(4), translation(1, 2, 3)])
+    poses = hand.poses(T, np.array([0.04, 0.08]))
+    np.testing.assert_allclose(poses[:, 0], T)
+    np.testing.assert_allclose(poses[0, 1, :3, 3], [0, 0.02, 0])
+    np.testing.assert_allclose(poses[1, 2, :3, 3], [1, 1.96, 3])
+
+
+def test_a_target_is_lifted_off_its_support_but_not_through_a_board() -> None:
+    box = object_hulls(box_model("box", BOX_M))
+    table = place([box_vertices((1, 1, 0.04), (0, 0, -BOX_M[2] / 2 - 0.02 + 0.005))])  # settled 5 mm deep
+    assert can_be_lifted(box, np.eye(4), table, 0.1)
+    board = place([box_vertices((1, 1, 0.04), (0, 0, BOX_M[2] / 2 + 0.02 + 0.08))])
+    assert not can_be_lifted(box, np.eye(4), board, 0.1)
+    assert can_be_lifted(box, np.eye(4), board, 0.07)
+
+
+def test_line_offsets_span_the_line_in_small_steps() -> None:
+    for length_m in (0.01, 0.08, 0.1, 0.105):
+        offsets = line_offsets_m(length_m)
+        assert (offsets[0], offsets[-1]) == (0.0, length_m)
+        assert 0 < np.diff(offsets).max() <= 0.02 + 1e-9
+    np.testing.assert_array_equal(line_offsets_m(0.0), [0.0])
+
+
+def test_the_best_are_taken_and_what_differs_from_them() -> None:
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, 0, 3] = [0.0, 0.001, 0.002, 0.2, 0.201, 0.202]
+    score = np.array([0.9, 1.0, 0.8, 0.5, 0.6, 0.4], np.float32)
+    np.testing.assert_array_equal(best_different(T, score, 2), [1, 4])
+    np.testing.assert_array_equal(best_different(T, score, 6), [1, 4, 0, 2, 3, 5])
+    assert len(best_different(T[:0], score[:0], 4)) == 0
+
+
+def test_a_grasp_and_its_half_turn_are_one() -> None:
+    """Else each hand pose would be planned twice, and an attempt would repeat what has just failed."""
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[2:, 0, 3] = 0.2
+    T[[1, 3], :2, :2] *= -1
+    score = np.array([0.8, 0.9, 0.7, 0.7], np.float32)
+    np.testing.assert_array_equal(best_different(T, score, 4), [1, 2])

@@ -1,0 +1,285 @@
+"""The distance-visibility rule fitted to labels of grasp trials: parameters that the paper leaves open.
+
+With H = alpha vis(rho) + (1 - alpha) dist(d), a candidate is good where its distance is at most k(rho) sigmas
+from mu (`reach_in_sigmas`). Given mu, tau and alpha, a candidate nearer than mu thus depends on sigma_l alone
+and a farther one on sigma_r alone, and each sigma is the best cut of one sorted list: exact, and linear in
+the labels. What is left to search are mu and tau, and alpha where it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.specification import HeuristicParams
+from datagen.train.evaluation.bootstrap import Estimate, resample_weights, summed
+from datagen.train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from datagen.workers.labels.distance_visibility_score import effective_distance, heuristic, visibility_score
+
+Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
+Objective = Literal["balanced", "accuracy"]
+F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
+
+FORMS: tuple[Form, ...] = get_args(Form)
+FOLDS = 5
+# An interval by resampling fewer scenes says nothing.
+MIN_SCENES = 10
+# A parameter is written with so many decimals: a tenth of a millimetre.
+DECIMALS = 4
+
+# The grid that the search begins with, and how many of its best points it follows for how many rounds.
+_MUS = 49
+_ALPHAS = np.linspace(0.0, 0.9, 10)
+# k at rho = 1, in place of tau: from 0.1, where nothing less visible is good, to where dist hardly counts.
+_SIGMAS_IN_SIGHT = np.linspace(0.1, 3.5, 49)
+_BEAM, _ROUNDS = 16, 7
+# Below the first a sigma is a step at mu; beyond the second the specification ends.
+_SIGMA_LOW, _SIGMA_HIGH = 0.01, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """N labelled candidates of S scenes, each with at least one."""
+
+    scene: I64  # (N,) into `house`
+    house: npt.NDArray[Any]  # (S,) text
+    distance_m: F32  # (N,)
+    mount_distance_m: F32  # (N,)
+    arm_reach_m: F32  # (N,)
+    visibility: F32  # (N,)
+    label: Bools  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    @property
+    def n_scenes(self) -> int:
+        """S."""
+        return len(self.house)
+
+    def at(self, rows: Bools) -> Trials:
+        """Some of the candidates (N,), with the scenes that they belong to."""
+        scenes, scene = np.unique(self.scene[rows], return_inverse=True)
+        return Trials(
+            scene=scene,
+            house=self.house[scenes],
+            distance_m=self.distance_m[rows],
+            mount_distance_m=self.mount_distance_m[rows],
+            arm_reach_m=self.arm_reach_m[rows],
+            visibility=self.visibility[rows],
+            label=self.label[rows],
+        )
+
+    def said(self, params: HeuristicParams) -> Bools:
+        """The rule's labels (N,), by the code that labels runs."""
+        inputs = (self.distance_m, self.mount_distance_m, self.arm_reach_m, self.visibility)
+        return heuristic(*inputs, params)[1] == 1
+
+
+def begin_from(before: HeuristicParams, form: Form) -> HeuristicParams:
+    """The parameters that a fit in this form starts from: those that it does not fit stay.
+
+    Bounds in metres mean nothing in shares of the reach. There they are 0 and 1: nothing beyond the
+    reach can be taken, and what is too near is left to sigma_l.
+    """
+    if form == before.distance:
+        return before
+    bounds = (0.14, 0.92) if form == "planar" else (0.0, 1.0)
+    return before.model_copy(update={"distance": form, "d_min": bounds[0], "d_max": bounds[1]})
+
+
+def fit(
+    trials: Trials,
+    before: HeuristicParams,
+    forms: Sequence[Form],
+    objective: Objective = "balanced",
+    fit_alpha: bool = False,
+) -> HeuristicParams:
+    """The parameters mu, sigma_l, sigma_r, tau (and alpha) that agree best with the labels; others stay.
+
+    The first of the forms wins where several agree as well. tau stays above alpha vis(1), so that a
+    distance outside [d_min, d_max] is never good. Deterministic, and independent of the order of rows.
+    """
+    gains = _gains(trials.label, objective)
+    found = [_fit_form(trials, gains, begin_from(before, form), fit_alpha) for form in forms]
+    return max(found, key=lambda params: int(gains[trials.said(params)].sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What rules say of candidates (N,) in houses that they were not fitted on, and the rule of each fold."""
+
+    said: Bools
+    params: tuple[HeuristicParams, ...]
+
+
+def fit_leaving_houses_out(
+    trials: Trials,
+    refit: Callable[[Trials], HeuristicParams],
+    seed: int,
+    step: Callable[[], None] = lambda: None,
+) -> LeftOut:
+    """Houses dealt out to `FOLDS` folds, and the candidates of each labelled by a rule fitted on the others.
+
+    Needs at least two houses (`refuse_too_little`). InputError where all of a class lie in one fold.
+    """
+    houses, house = np.unique(trials.house.astype(str), return_inverse=True)
+    folds = min(FOLDS, len(houses))
+    dealt = np.random.default_rng([seed, 0]).permutation(len(houses)) % folds
+    fold = dealt[house][trials.scene]
+    said = np.zeros(len(trials), np.bool_)
+    params: list[HeuristicParams] = []
+    for k in range(folds):
+        inside = fold != k
+        if trials.label[inside].all() or not trials.label[inside].any():
+            problem = f"those of label {int(not trials.label[inside].any())} lie in too few houses"
+            raise InputError("labels", "house_id", problem, "Name runs of more houses")
+        params.append(refit(trials.at(inside)))
+        said[~inside] = trials.at(~inside).said(params[-1])
+        step()
+    return LeftOut(said, tuple(params))
+
+
+def refuse_too_little(trials: Trials, place: str) -> None:
+    """InputError where nothing can be fitted, or not said how well: one class, few scenes, one house."""
+    mend = "Name more runs, or make more labels with `datagen extend`"
+    if not len(trials):
+        raise InputError(place, "--candidates", "no candidate is of this set", "Choose another set")
+    if trials.label.all() or not trials.label.any():
+        problem = f"all {len(trials):,} labels are {int(trials.label[0])}"
+        raise InputError(place, "label", problem, "Choose other --candidates, or name more runs")
+    if trials.n_scenes < MIN_SCENES:
+        problem = f"{trials.n_scenes} scenes, and intervals need {MIN_SCENES}; 100 and more are sensible"
+        raise InputError(place, "scenes", problem, mend)
+    if len(set(trials.house)) < 2:
+        problem = "all scenes are in one house, and none is left to score on"
+        raise InputError(place, "house_id", problem, mend)
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How a rule's labels stand to those of trials: true and false positives, false and true negatives."""
+
+    confusion: F64  # (4,)
+    accuracy: Estimate
+    balanced_accuracy: Estimate
+
+
+def agreements(trials: Trials, said: Sequence[Bools], resamples: int, seed: int) -> list[Agreement]:
+    """One for each rule's labels (N,), all over the same resampled scenes."""
+    weights = resample_weights(trials.n_scenes, resamples, np.random.default_rng([seed, 1]))
+    found: list[Agreement] = []
+    for labels in said:
+        by_scene = confusion(labels.astype(np.float64), trials.label, trials.scene, trials.n_scenes)
+        counts, resampled = by_scene.sum(axis=0), summed(weights, by_scene)
+        estimates = (Estimate(float(of(counts)), of(resampled)) for of in (accuracy, balanced_accuracy))
+        found.append(Agreement(counts, *estimates))
+    return found
+
+
+def reach_in_sigmas(visible: F64, params: HeuristicParams) -> F64:
+    """How many sigmas from mu H is tau, for visibility scores (N,); nan where H is below tau even at mu.
+
+    From a exp(-k^2 / 2) = (tau - alpha vis) / (1 - alpha). Requires tau > alpha vis.
+    """
+    needed = (params.tau - params.alpha * visible) / ((1 - params.alpha) * params.a)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(-2 * np.log(needed))
+
+
+def _gains(label: Bools, objective: Objective) -> I64:
+    """What calling each candidate (N,) good adds to the objective, in whole units: any order, one sum."""
+    positives = int(label.sum())
+    for_good, for_bad = (len(label) - positives, -positives) if objective == "balanced" else (1, -1)
+    return np.where(label, for_good, for_bad).astype(np.int64)
+
+
+def _fit_form(trials: Trials, gains: I64, start: HeuristicParams, fit_alpha: bool) -> HeuristicParams:
+    d = effective_distance(trials.distance_m, trials.mount_distance_m, trials.arm_reach_m, start)
+    inside = (d >= start.d_min) & (d <= start.d_max)
+    d, gains = d[inside], gains[inside]
+    visible = visibility_score(trials.visibility[inside].astype(np.float64))
+    if not len(d):
+        return start
+
+    def at(point: Sequence[float]) -> tuple[int, HeuristicParams]:
+        mu, sigmas_in_sight, alpha = point
+        above = (1 - alpha) * start.a * np.exp(-0.5 * sigmas_in_sight**2)
+        tau = alpha * float(visibility_score(np.ones(1))[0]) + above
+        params = start.model_copy(update={"mu": mu, "tau": tau, "alpha": alpha})
+        return _with_best_sigmas(d, visible, gains, params)
+
+    mus = np.linspace(max(float(d.min()), 10.0**-DECIMALS), max(float(d.max()), 10.0**-DECIMALS), _MUS)
+    axes = (mus, _SIGMAS_IN_SIGHT, np.array([start.alpha]))
+    if fit_alpha:
+        axes = (mus[::2], _SIGMAS_IN_SIGHT[::2], _ALPHAS)
+    best = _beam_search(at, axes)
+    fitted = ("mu", "sigma_l", "sigma_r", "tau", *(("alpha",) if fit_alpha else ()))
+    rounded = {name: round(getattr(best, name), DECIMALS) for name in fitted}
+    return HeuristicParams.model_validate({**best.model_dump(), **rounded})
+
+
+def _with_best_sigmas(
+    d: F64, visible: F64, gains: I64, params: HeuristicParams
+) -> tuple[int, HeuristicParams]:
+    """The gain with the best sigmas for these mu, tau and alpha, and the parameters with them."""
+    k = reach_in_sigmas(visible, params)
+    possible = k > 0  # false for nan as well
+    off = (d[possible] - params.mu) / k[possible]
+    gain, far = gains[possible], off >= 0
+    gain_l, sigma_l = _best_cut(-off[~far], gain[~far], params.sigma_l)
+    gain_r, sigma_r = _best_cut(off[far], gain[far], params.sigma_r)
+    return gain_l + gain_r, params.model_copy(update={"sigma_l": sigma_l, "sigma_r": sigma_r})
+
+
+def _best_cut(needed: F64, gains: I64, otherwise: float) -> tuple[int, float]:
+    """The gain of calling good what needs at most sigma (M,), and sigma in the middle of its gap.
+
+    `otherwise` where there is nothing on this side.
+    """
+    if not len(needed):
+        return 0, otherwise
+    order = np.argsort(needed)
+    needed, total = needed[order], np.cumsum(gains[order])
+    # A cut lies between the last that is called good and the next; the first cut calls none good.
+    below, above = np.concatenate([[0.0], needed]), np.concatenate([needed, needed[-1:] * 1.05])
+    total = np.concatenate([[0], total])
+    cuts = np.flatnonzero((below < above) & (below < _SIGMA_HIGH) & (above > _SIGMA_LOW))
+    if not len(cuts):
+        return int(total[-1]), _SIGMA_LOW  # all are closer to mu than any sigma
+    at = cuts[np.argmax(total[cuts])]
+    return int(total[at]), float(np.clip((below[at] + above[at]) / 2, _SIGMA_LOW, _SIGMA_HIGH))
+
+
+def _beam_search(
+    at: Callable[[Sequence[float]], tuple[int, HeuristicParams]], axes: Sequence[F64]
+) -> HeuristicParams:
+    """The best of a grid, then of ever finer neighbourhoods of its best points."""
+    lows, highs = [axis[0] for axis in axes], [axis[-1] for axis in axes]
+    steps = [(axis[-1] - axis[0]) / max(len(axis) - 1, 1) for axis in axes]
+    points = [tuple(map(float, point)) for point in product(*axes)]
+    known: dict[tuple[float, ...], tuple[int, HeuristicParams]] = {}
+    for _ in range(_ROUNDS + 1):
+        known |= {point: at(point) for point in points if point not in known}
+        best = sorted(known, key=lambda point: -known[point][0])[:_BEAM]
+        known = {point: known[point] for point in best}
+        steps = [step / 2.5 for step in steps]
+        moves = [(-1, 0, 1) if step else (0,) for step in steps]
+        points = list(
+            dict.fromkeys(
+                tuple(
+                    float(np.clip(x + move * step, low, high))
+                    for x, move, step, low, high in zip(point, moved, steps, lows, highs, strict=True)
+                )
+                for point in best
+                for moved in product(*moves)
+            )
+        )
+    return known[next(iter(known))][1]

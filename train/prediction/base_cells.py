@@ -1,0 +1,135 @@
+"""Where a base could stand around the target, and what was seen of those places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from datagen.schemas.specification import CandidateParams
+from datagen.train.prediction.files import Bools
+from datagen.train.prediction.fusing import SeenPoints
+from datagen.train.prediction.ground import depth_error_m, floor_points
+from datagen.workers.bases.candidates import grid_offsets
+from datagen.workers.bases.clearance import STEP_M
+from datagen.workers.geometry.mesh import F32, F64
+
+CLEAR, BLOCKED, UNSEEN = STATES = ("clear", "blocked", "unseen")
+# Of the floor under a base, the share that must have been seen for nothing to stand there unseen.
+SEEN_SHARE = 0.8
+# One stray pixel of a stereo camera is no obstacle.
+_LEAST_POINTS = 3
+_CELL_M = 0.04
+_GAP_CELLS = 4  # gaps up to twice as wide are closed
+# Table tops and shelves reach down below the top that is seen of them, by about so much.
+_BOARD_M = 0.08
+_AROUND_M = 3.0  # farther from the grid's middle nothing matters
+
+
+@dataclass(frozen=True)
+class RobotSize:
+    """The robot whose base is looked for; heights above the floor."""
+
+    camera_height_m: float
+    base_height_m: float
+    arm_reach_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class BaseCells:
+    """N base positions around the target, with what stands there."""
+
+    offset_m: F32  # (N, 2), from the target's centre, world axes
+    state: npt.NDArray[np.int64]  # (N,), index into STATES
+    floor_seen: F64  # (N,), share of the floor under the base that was seen
+
+
+def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> BaseCells:
+    """The grid around the target, each place blocked, clear or unseen.
+
+    Blocked where observed points lie within the base's radius between the floor and a board's thickness
+    above the mount, or within the mast's from there to the camera; otherwise unseen where too little of its
+    floor was seen.
+    """
+    offsets = grid_offsets(params)
+    base_xy = center_m[:2] + offsets
+    z = seen.points_m[:, 2]
+    eyes = seen.eyes_m
+    gap_m = np.min([np.linalg.norm(seen.points_m - eye, axis=1) for eye in eyes], axis=0)
+    is_floor = np.any([floor_points(seen.points_m, eye) for eye in eyes], axis=0)
+    above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
+    mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
+    low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, params.base_radius_m)
+    high = _counts(seen.points_m[above & (z >= mount) & (z < top)], base_xy, params.mast_radius_m)
+    tops = seen.points_m[above & (z >= mount) & (z < top)]
+    blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
+    share = _floor_share(seen.points_m[is_floor], base_xy, params.base_radius_m)
+    state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
+    state[~blocked & (share >= SEEN_SHARE)] = STATES.index(CLEAR)
+    return BaseCells(offsets.astype(np.float32), state, share)
+
+
+def seen_share(cloud_m: F32, radius_m: float) -> float:
+    """Share of the disc around the target, from above, in which anything at all was measured.
+
+    `cloud_m` (N, 3) has the target's centre as origin.
+    """
+    n = int(np.ceil(radius_m / 0.05))
+    cells = np.floor(cloud_m[:, :2] / 0.05).astype(np.int64) + n
+    inside = ((cells >= 0) & (cells < 2 * n)).all(axis=1)
+    hit = np.zeros((2 * n, 2 * n), np.bool_)
+    hit[cells[inside, 0], cells[inside, 1]] = True
+    centres = (np.arange(2 * n) + 0.5 - n) * 0.05
+    disc = np.hypot(*np.meshgrid(centres, centres)) <= radius_m
+    return float(hit[disc].mean())
+
+
+def facing_yaw(offset_m: F32) -> F64:
+    """Yaw (N,) of bases at these offsets (N, 2) from the target that face it."""
+    return np.arctan2(-offset_m[:, 1].astype(np.float64), -offset_m[:, 0].astype(np.float64))
+
+
+def _counts(points_m: F32, base_xy: F64, radius_m: float) -> npt.NDArray[np.int64]:
+    """Points (N, 3) within the radius of each base, seen from above."""
+    if not len(points_m):
+        return np.zeros(len(base_xy), np.int64)
+    near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < _AROUND_M
+    if not near.any():
+        return np.zeros(len(base_xy), np.int64)
+    counts = KDTree(points_m[near, :2]).query_ball_point(base_xy, radius_m, return_length=True)
+    return np.asarray(counts, np.int64)
+
+
+def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
+    """Which bases (N,) stand in a gap of a surface above the mount: what stands there hides part of it."""
+    n = int(2 * _AROUND_M / _CELL_M)
+    low = base_xy.mean(axis=0) - _AROUND_M
+    cells = np.floor((tops_m[:, :2] - low) / _CELL_M).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < n)).all(axis=1)]
+    hit = np.zeros((n, n), np.bool_)
+    hit[cells[:, 0], cells[:, 1]] = True
+    closed = np.asarray(ndimage.binary_closing(hit, iterations=_GAP_CELLS), np.bool_)
+    rows = np.clip(np.floor((base_xy - low) / _CELL_M).astype(np.int64), 0, n - 1)
+    return closed[rows[:, 0], rows[:, 1]]
+
+
+def _floor_share(floor_m: F32, base_xy: F64, radius_m: float) -> F64:
+    """Share (N,) of the cells under each base in which floor was seen."""
+    low = base_xy.min(axis=0) - radius_m - _CELL_M
+    size = np.ceil((base_xy.max(axis=0) + radius_m + _CELL_M - low) / _CELL_M).astype(np.int64) + 1
+    cells = np.floor((floor_m[:, :2] - low) / _CELL_M).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
+    seen: Bools = np.zeros(tuple(size), np.bool_)
+    seen[cells[:, 0], cells[:, 1]] = True
+    # Far away, rows of pixels are farther apart than cells are wide.
+    seen |= np.asarray(ndimage.binary_closing(seen), np.bool_)
+    n = int(np.ceil(radius_m / _CELL_M))
+    step = (np.arange(-n, n + 1)) * _CELL_M
+    disc = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    disc = disc[np.linalg.norm(disc, axis=1) <= radius_m]
+    rows = np.floor((base_xy[:, None] + disc - low) / _CELL_M).astype(np.int64)  # (N, D, 2)
+    rows = np.clip(rows, 0, size - 1)
+    return seen[rows[..., 0], rows[..., 1]].mean(axis=1)

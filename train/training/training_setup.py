@@ -1,0 +1,265 @@
+"""Sets up the training of a stage: streams, checks, model, and the position from which it resumes."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.progress import Progress
+from datagen.train.augment import Augmentation
+from datagen.train.dataset import SampleStream
+from datagen.train.models import Model, build_model
+from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
+from datagen.train.training.callbacks import CallbackList, TensorBoardCallback, TrainingCallback
+from datagen.train.training.checkpoints import (
+    Checkpoint,
+    CheckpointHead,
+    below,
+    only_writer,
+    put_weights,
+    read_checkpoint,
+    write_checkpoint,
+)
+from datagen.train.training.display import TrainingProgress
+from datagen.train.training.loop import Position, Training, run_training
+from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
+from datagen.train.training.options import STAGES, Options
+from datagen.train.training.ranks import Ranks
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """A training as it is asked for. Only `options`, the runs' rows and `init` decide its weights."""
+
+    options: Options
+    runs: tuple[str, ...]
+    val_runs: tuple[str, ...]  # none: a share of the runs' houses is held out
+    out: str
+    augment: Augmentation | None = None
+    init: str | None = None
+    device: str = "cpu"
+    threads: int = 1
+    save_every_s: float = 300.0
+    tensorboard: str | None = None
+    json_lines: bool = False  # as progress
+    allow_incomplete: bool = False  # runs that lack samples of their plan
+
+
+def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
+    """Train in this process, one of `ranks`, from where `job.out` stands. Whether it came to its end.
+
+    InputError for data, checkpoints or options that do not go together, before anything is written.
+    """
+    torch.set_num_threads(job.threads)
+    with ExitStack() as stack:
+        callbacks: list[TrainingCallback] = []
+        if ranks.leads:
+            stack.enter_context(only_writer(job.out))
+            shown = stack.enter_context(Progress(job.json_lines))
+            shown.phase("opening runs")
+            callbacks.append(TrainingProgress(shown, job.out))
+        training, head = prepare_training(job, ranks)
+        at = training.position
+        if ranks.leads and job.tensorboard and not at.finished:
+            callbacks.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
+        callback = CallbackList(callbacks)
+        return run_training(
+            training, lambda: save_checkpoint(job.out, training, head), callback, stopping, job.save_every_s
+        )
+
+
+def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
+    """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say."""
+    options, stage = job.options, STAGES[job.options.stage]
+    began = read_checkpoint(job.init) if job.init is not None else None
+    train, val = _streams(job, ranks)
+    refuse_one_class(train)
+    if began is not None:
+        _refuse_known_houses(job, began.head, val)
+    class_weights = _class_weights(train, stage.weighted)
+    model = _model(job, began)
+    optimiser = make_optimiser(model, options.lr, options.weight_decay)
+    head = _head(job, model, train, val, began.head if began else None)
+    position = Position()
+    if Path(job.out).exists():
+        there = read_checkpoint(job.out)
+        refuse_other_training(job.out, there.head, head)
+        position = _resume_position(job.out, there, model, optimiser)
+    weights = class_weights.to(model.device)
+    return Training(options, model, optimiser, train, val, weights, position, ranks), head
+
+
+def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None:
+    """Write the checkpoint, if this rank leads."""
+    if not training.ranks.leads:
+        return
+    at, last = training.position, training.model.state_dict()
+    resume = {f"model.{k}": v for k, v in last.items()}
+    resume |= {f"optimiser.{k}": v for k, v in optimiser_tensors(training.optimiser).items()}
+    head = replace(
+        head,
+        cost={**head.cost, **at.cost},
+        history=tuple(at.history),
+        step=at.step,
+        epoch=at.epoch,
+        best_epoch=at.best_epoch,
+        finished=at.finished,
+    )
+    # Before the first epoch has ended nothing is better than the last weights.
+    weights = at.best_weights or last
+    write_checkpoint(path, Checkpoint(head, weights, resume, {"batch": at.batch, "sums": at.sums}))
+
+
+def _resume_position(
+    place: str, there: Checkpoint, model: Model, optimiser: torch.optim.Optimizer
+) -> Position:
+    resume = there.resume
+    put_weights(model, below("model.", resume), place)
+    put_optimiser_tensors(optimiser, below("optimiser.", resume), place)
+    batch, sums = there.loop.get("batch"), there.loop.get("sums")
+    best = there.head.best_epoch
+    if type(batch) is not int or batch < 0 or not isinstance(sums, list) or len(sums) != 4:
+        raise InputError(place, "loop", "no position to go on from", "Train it again to another file")
+    if best is not None and not 1 <= best <= len(there.head.history):
+        raise InputError(place, "best_epoch", "beyond the history", "Train it again to another file")
+    return Position(
+        epoch=there.head.epoch,
+        batch=batch,
+        step=there.head.step,
+        sums=[float(value) for value in sums],
+        history=list(there.head.history),
+        best_epoch=best,
+        best_weights={k: v.to(model.device) for k, v in there.weights.items()} if best else {},
+        finished=there.head.finished,
+        cost={k: v for k, v in there.head.cost.items() if k != "label_cpu_s"},
+    )
+
+
+def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
+    options = job.options
+    if options.batch_scenes % ranks.world:
+        problem = f"{options.batch_scenes} scenes cannot be shared out evenly among {ranks.world} processes"
+        raise InputError("datagen train", "--batch-scenes", problem, f"Give a multiple of {ranks.world}")
+    sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
+    sizes["allow_incomplete"] = job.allow_incomplete
+    drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
+    if job.val_runs:
+        train, val = (
+            SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share)),
+            SampleStream(job.val_runs, **sizes, shuffle=False),
+        )
+    else:
+        train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
+    for stream in (train, val):
+        _refuse_other_labels(options.stage, stream)
+    refuse_shared_houses(train, val)
+    if ranks.world == 1:
+        return train, val
+    sides = (None, None) if job.val_runs else (HouseSide(held_out=False), HouseSide(held_out=True))
+    ours = HouseShare(options.house_share, sides[0])
+    shared: dict[str, Any] = {"rank": ranks.rank, "world": ranks.world, **sizes}
+    train = SampleStream(job.runs, houses=ours, **shared, **drawn)
+    # Of fewer scenes than processes each process judges all; `validate` counts a sample once.
+    if val.n_scenes >= ranks.world:
+        val = SampleStream(job.val_runs or job.runs, houses=sides[1], **shared, shuffle=False)
+    return train, val
+
+
+def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
+    wanted = STAGES[stage].label_sources
+    for summary in stream.parts:
+        source = summary.part.schema
+        if source not in wanted:
+            fitting = " or ".join(name for name, other in STAGES.items() if source in other.label_sources)
+            problem = f"{source} labels, and {stage} learns from those of {' or '.join(wanted)}"
+            raise InputError(summary.part.place, "label_source", problem, f"Train {fitting} on it")
+
+
+def _refuse_known_houses(job: TrainingJob, began: CheckpointHead, val: SampleStream) -> None:
+    known = sorted(val.house_ids() & set(began.house_ids))
+    if known:
+        problem = f"{known[0]!r} was trained on by --init, and would be judged on ({len(known)} such houses)"
+        raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
+
+
+def _class_weights(train: SampleStream, weighted: bool) -> Tensor:
+    """(2,) float32: so that both classes weigh alike and a sample 1 in the mean; or ones."""
+    counts = np.array(train.class_counts(), np.float64)
+    weights = counts.sum() / (2 * counts) if weighted else np.ones(2)
+    return torch.from_numpy(weights.astype(np.float32))
+
+
+def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
+    """With the parameters of the checkpoint to begin from, or drawn from the seed."""
+    options = job.options
+    torch.manual_seed(options.seed)
+    model = build_model(options.model, options.model_config)
+    if began is not None:
+        other = began.head.model, began.head.model_config
+        if other != (model.name, model.config):
+            problem = f"{other[0]} {other[1]}, where {model.name} {model.config} is asked for"
+            raise InputError(str(job.init), "model", problem, "Leave --model and --model-config out")
+        put_weights(model, began.weights, str(job.init))
+    return model.to(job.device)
+
+
+def _head(
+    job: TrainingJob, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
+) -> CheckpointHead:
+    data = tuple(train.origin())
+    house_ids = _all(train.house_ids(), began.house_ids if began else ())
+    # Also those by which --init was chosen: what came of it knows them too.
+    val_house_ids = val.house_ids().union(began.val_house_ids if began else ())
+    return CheckpointHead(
+        model=model.name,
+        model_config=model.config,
+        stage=job.options.stage,
+        options=job.options.document(),
+        data=data,
+        val_data=tuple(val.origin()),
+        house_ids=house_ids,
+        object_digests=_all(train.object_digests(), began.object_digests if began else ()),
+        val_house_ids=tuple(sorted(val_house_ids.difference(house_ids))),
+        cost={"label_cpu_s": sum(float((origin.get("cost") or {}).get("cpu_s", 0.0)) for origin in data)},
+        versions={"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        history=(),
+        init={"digest": began.digest, "stage": began.stage, "cost": began.cost} if began else None,
+    )
+
+
+def _all(ours: Iterable[str], theirs: Iterable[str]) -> tuple[str, ...]:
+    return tuple(sorted({*ours, *theirs}))
+
+
+def refuse_other_training(place: str, there: CheckpointHead, here: CheckpointHead) -> None:
+    """InputError that names the fields in which a checkpoint was made otherwise than it would be now."""
+    theirs, ours = _decisive(there), _decisive(here)
+    names = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
+    if names:
+        shown = [f"{name} ({theirs.get(name)}, now {ours.get(name)})" for name in names[:4]]
+        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        problem = f"another training is kept here: {', '.join(shown)}{more} differ"
+        raise InputError(
+            place, names[0], problem, "Give the options that it was begun with, or another --out"
+        )
+
+
+def _decisive(head: CheckpointHead) -> dict[str, str]:
+    fields = {"stage": head.stage, "model": head.model}
+    fields |= {f"model_config.{k}": v for k, v in head.model_config.items()}
+    fields |= dict(head.options)
+    fields |= {
+        "data": [run["samples_sha256"] for run in head.data],
+        "val_data": [r["samples_sha256"] for r in head.val_data],
+    }
+    fields |= {"init": head.init["digest"] if head.init else None}
+    return {name: f"{value!s:.60}" for name, value in fields.items()}

@@ -1,0 +1,105 @@
+"""Sizes and types of the assets that house files name by id."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.untrusted_files import read_regular
+from datagen.workers.json_document import JsonNode, parse_json
+
+TABLE_NAMES = ("asset_sizes.json", "asset-database.json")
+_LARGEST_TABLE_BYTES = 64 << 20
+_MAX_ASSETS = 200_000
+_MAX_SIZE_M = 20.0
+_THINNEST_M = 1e-4
+
+
+@dataclass(frozen=True)
+class Asset:
+    """One asset in its own frame: x right, y front, z up, base at z = 0, metres.
+
+    `rest_height_m` is the height above the base on which things stand, None where nothing does or
+    nothing is known; `levels_m` are further heights on which things were seen to stand.
+    """
+
+    asset_id: str
+    object_type: str
+    size_m: tuple[float, float, float]  # width, depth, height
+    rest_height_m: float | None = None
+    levels_m: tuple[float, ...] = ()
+
+    @property
+    def halves_m(self) -> tuple[float, float, float]:
+        """Half the width, half the depth, and the height."""
+        return self.size_m[0] / 2, self.size_m[1] / 2, self.size_m[2]
+
+
+def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
+    """The folder's size table by asset id, and its bytes (for the digest).
+
+    Reads `asset_sizes.json` ({assetId: {objectType, size}}), or else AI2-THOR's own
+    `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list).
+    """
+    path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
+    mend = "Put asset_sizes.json beside the houses; `datagen assets fetch` brings both."
+    if path is None:
+        raise InputError(folder, "", f"no size table ({' or '.join(TABLE_NAMES)})", mend)
+    text = read_regular(path, _LARGEST_TABLE_BYTES, mend)
+    root = parse_json(text, str(path))
+    assets = [_own_entry(node) if own else _thor_entry(node) for node, own in _entries(root)]
+    if not assets:
+        raise InputError(path, "", "the size table is empty", mend)
+    return {asset.asset_id: asset for asset in assets}, text
+
+
+def _entries(root: JsonNode) -> Iterator[tuple[JsonNode, bool]]:
+    if isinstance(root.value, list):
+        for node in root.items(_MAX_ASSETS):
+            yield node, False
+        return
+    members: Mapping[str, object] = root.value if isinstance(root.value, dict) else {}
+    if not members:
+        raise root.error("neither an object of assets nor a list of them")
+    if len(members) > _MAX_ASSETS:
+        raise root.error(f"more than {_MAX_ASSETS} entries")
+    for key, value in members.items():
+        node = JsonNode(root.place, f"$.{key[:100]}", value)
+        if isinstance(value, list):
+            for item in node.items(_MAX_ASSETS):
+                yield item, False
+        else:
+            yield JsonNode(root.place, node.path, (key, value)), True
+
+
+def _own_entry(node: JsonNode) -> Asset:
+    key, value = node.value
+    asset_id = JsonNode(node.place, node.path, key).text()
+    entry = JsonNode(node.place, node.path, value)
+    sides = [_side(s) for s in entry.get("size").items(3)]
+    if len(sides) != 3:
+        raise entry.get("size").error(f"{len(sides)} numbers where 3 belong")
+    width, height, depth = sides
+    rest = entry.find("surface_height_m")
+    basis = entry.find("surface_basis")
+    rest_height_m = None if rest is None else rest.number(0.0, 2 * _MAX_SIZE_M)
+    if basis is not None and basis.text() == "observed_lifted_5cm_over_bbox_top":
+        rest_height_m = height  # everything seen on it hung in the air
+    found = entry.find("observed_support_levels")
+    nodes = [] if found is None else list(found.items(100))
+    levels = sorted(n.get("height_m").number(0.0, 2 * _MAX_SIZE_M) for n in nodes)
+    size_m = (width, depth, height)
+    return Asset(asset_id, entry.get("objectType").text(), size_m, rest_height_m, tuple(levels))
+
+
+def _thor_entry(node: JsonNode) -> Asset:
+    box = node.get("boundingBox")
+    width, height, depth = (_side(box.get(axis)) for axis in "xyz")
+    return Asset(node.get("assetId").text(), node.get("objectType").text(), (width, depth, height))
+
+
+def _side(node: JsonNode) -> float:
+    # Cards and papers have no thickness in the table; a solid needs some.
+    return max(node.number(0.0, _MAX_SIZE_M), _THINNEST_M)

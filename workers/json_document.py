@@ -1,0 +1,116 @@
+"""Values of a parsed JSON document, each with its path, so that a bad one can be named."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+from datagen.schemas.errors import InputError, printable
+
+# No house is larger; a larger coordinate is a unit error or garbage.
+EXTENT_M = 1000.0
+_LONGEST_TEXT = 500
+# An empty object takes 3 bytes of text and 70 of memory.
+_MOST_PARTS = 4_000_000
+
+
+@dataclass(frozen=True)
+class JsonNode:
+    """A JSON value; `place` is the file (and line), `path` where in the document it stands."""
+
+    place: str
+    path: str
+    value: Any
+
+    def error(self, problem: str, mend: str = "Correct or remove this entry.") -> InputError:
+        """The error that names this value."""
+        return InputError(self.place, self.path, problem, mend)
+
+    def get(self, key: str) -> JsonNode:
+        """The member of an object; it must be there."""
+        members = self._members()
+        if key not in members:
+            raise self.error(f"key {key!r} is missing")
+        return JsonNode(self.place, f"{self.path}.{key}", members[key])
+
+    def find(self, key: str) -> JsonNode | None:
+        """The member of an object, or None where it is absent or null."""
+        value = self._members().get(key)
+        return None if value is None else JsonNode(self.place, f"{self.path}.{key}", value)
+
+    def items(self, limit: int) -> Iterator[JsonNode]:
+        """The elements of a list of at most `limit`."""
+        if not isinstance(self.value, list):
+            raise self.error(f"{_kind(self.value)} where a list belongs")
+        values = cast(list[Any], self.value)
+        if len(values) > limit:
+            raise self.error(f"{len(values)} entries, more than the {limit} allowed")
+        for i, value in enumerate(values):
+            yield JsonNode(self.place, f"{self.path}[{i}]", value)
+
+    def number(self, low: float, high: float) -> float:
+        """A finite number within [low, high]."""
+        value = self.value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(f"{_kind(value)} where a number belongs")
+        if not low <= value <= high:  # also false for NaN; an int of any size compares exactly
+            shown = f"{value:g}" if isinstance(value, float) or abs(value) < 1e15 else "a huge number"
+            raise self.error(f"{shown} is not within [{low:g}, {high:g}]")
+        return float(value)
+
+    def text(self) -> str:
+        """A string of at most 500 printable characters: records and arrays of a run repeat it."""
+        if not isinstance(self.value, str):
+            raise self.error(f"{_kind(self.value)} where a text belongs")
+        if len(self.value) > _LONGEST_TEXT:
+            raise self.error(f"a text of {len(self.value)} characters, more than {_LONGEST_TEXT}")
+        if not self.value.isprintable():
+            bad = printable(next(c for c in self.value if not c.isprintable()))
+            raise self.error(f"a text with the unprintable character {bad}")
+        return self.value
+
+    def point(self) -> tuple[float, float, float]:
+        """`{x, y, z}` as it stands, each finite and within 1000 m."""
+        return (
+            self.get("x").number(-EXTENT_M, EXTENT_M),
+            self.get("y").number(-EXTENT_M, EXTENT_M),
+            self.get("z").number(-EXTENT_M, EXTENT_M),
+        )
+
+    def _members(self) -> dict[str, Any]:
+        if not isinstance(self.value, dict):
+            raise self.error(f"{_kind(self.value)} where an object belongs")
+        return cast(dict[str, Any], self.value)
+
+
+def parse_json(text: bytes, place: str) -> JsonNode:
+    """The document, or an InputError for text that is not JSON or is nested too deeply."""
+    mend = "Restore the file from its source."
+    if text.count(b"{") + text.count(b"[") > _MOST_PARTS:
+        raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", mend)
+    try:
+        return JsonNode(place, "$", json.loads(text))
+    except RecursionError:
+        raise InputError(place, "$", "lists or objects nested too deeply", mend) from None
+    except UnicodeDecodeError as error:
+        raise InputError(place, "$", f"not UTF-8 at byte {error.start}", mend) from None
+    except json.JSONDecodeError as error:
+        raise InputError(place, f"character {error.pos}", f"not JSON ({error.msg})", mend) from None
+    except ValueError:  # an integer of thousands of digits
+        raise InputError(place, "$", "a number with too many digits", mend) from None
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    names: dict[type, str] = {
+        dict: "an object",
+        list: "a list",
+        str: "a text",
+        bool: "a truth value",
+        int: "a number",
+    }
+    return "null" if value is None else names.get(type(value), "a number")

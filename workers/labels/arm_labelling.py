@@ -1,0 +1,281 @@
+"""What the label sources `plan` and `sim` share: candidate by candidate, to the stage that decides.
+
+base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
+-> executed in physics, up to `max_attempts` grasps, or `repeats` times where a robot arrived nearby   (`sim`)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import Stream, generator
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import ArmParams, DisturbanceParams, Specification
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.bases.clearance import base_clearance_m
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
+from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.grasp_cache import grasps_of
+from datagen.workers.motion.collision import Bools
+from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
+from datagen.workers.motion.plan_candidate import plan_candidate
+from datagen.workers.motion.planning_scene import PlanningScene, pose_of_base, prepare
+from datagen.workers.robots import open_robot
+from datagen.workers.robots.robot import Robot
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.execute import run_trial
+from datagen.workers.trials.trial import Disturbance, TrialResult
+from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
+
+_PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; success is first
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateTrial:
+    """All that was found out about one candidate."""
+
+    outcome: str
+    report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
+    plan: MotionPlan | None = None  # the last one that was made
+    results: tuple[TrialResult, ...] = ()  # of the executions
+    T_world_base: tuple[F64, ...] = ()  # (4, 4) each, where the mount stood in them
+    successes: int = 0
+    trials: int = 0  # what the label is a rate of: 1, or the disturbed repeats; 0 where nothing was planned
+
+
+@dataclass(eq=False)
+class ArmInScene:
+    """One robot in one scene; what planning and physics need is prepared when first asked for."""
+
+    scene: SettledScene
+    robot: Robot
+    grasps: GraspSet
+    arm: ArmParams
+    base_radius_m: float
+    clock: StageClock = field(default_factory=StageClock)
+
+    @cached_property
+    def planning(self) -> PlanningScene:
+        with self.clock.stage("grasps"):
+            return prepare(
+                self.scene,
+                self.robot,
+                self.grasps,
+                self.arm.motion,
+                self.arm.grasps.per_scene,
+                self.base_radius_m,
+            )
+
+    @cached_property
+    def trials(self) -> TrialScene:
+        assert self.arm.trial is not None
+        with self.clock.stage("execute"):
+            return prepare_trials(self.scene, self.robot, self.arm.trial, self.base_radius_m)
+
+    @cached_property
+    def tcp_positions_m(self) -> F64:
+        """World positions (G, 3) of the TCP at all grasps of the target."""
+        T = self.scene.T_world_object[0]
+        return self.grasps.T_object_tcp[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+
+    def base_pose(self, candidates: SceneCandidates, row: int) -> F64:
+        """World pose (4, 4) of the mount at candidate `row`, facing the target."""
+        xy = candidates.base_xy_m[row].astype(np.float64)
+        return pose_of_base(xy, self.robot.base_height_m, self.scene.target_center_m)
+
+    def is_within_reach(self, T_world_base: F64) -> bool:
+        """Whether the arm is long enough for any grasp of the target, in a straight line."""
+        shoulder_m = T_world_base[:3, :3] @ self.robot.shoulder_m + T_world_base[:3, 3]
+        gaps_m = np.linalg.norm(self.tcp_positions_m - shoulder_m, axis=1)
+        return bool((gaps_m <= self.robot.reach_m).any())
+
+
+def arm_in_scene(
+    scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification, clock: StageClock
+) -> ArmInScene:
+    """The robot of candidate `row` in a scene. Raises InputError for an unknown robot or a wrong reach."""
+    arm = arm_of(spec)
+    with clock.stage("grasps"):
+        reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
+        robot = open_robot(arm.robot, reach_m, height_m)
+        grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps)
+    return ArmInScene(scene, robot, grasps, arm, spec.candidates.base_radius_m, clock)
+
+
+def arm_of(spec: Specification) -> ArmParams:
+    """The specification's arm section. Raises InputError where it has none."""
+    if spec.arm is None:
+        mend = "Submit plan or sim, which have an arm"
+        raise InputError("specification", "arm", f"none for label source {spec.label_source}", mend)
+    return spec.arm
+
+
+def try_candidate(
+    at: ArmInScene, candidates: SceneCandidates, row: int, spec: Specification, record: bool = False
+) -> CandidateTrial:
+    """Plan, and where the specification asks for trials execute, one candidate.
+
+    Depends on the scene, the candidate and the specification alone, not on what was tried before.
+    """
+    if candidates.clearance_m[row] < 0:
+        return CandidateTrial("base_collision")
+    if len(at.grasps) == 0:
+        return CandidateTrial("no_grasp")
+    T_world_base = at.base_pose(candidates, row)
+    if not at.is_within_reach(T_world_base):
+        return CandidateTrial("out_of_reach")
+    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, row)
+    planning, clock = at.planning, at.clock
+    with clock.stage("plan"):
+        report = plan_candidate(planning, T_world_base, rng)
+    if report.plan is None or at.arm.trial is None:
+        return CandidateTrial(report.outcome, report, report.plan)
+    disturbances = disturbances_of(at, row, spec)
+    if disturbances:
+        fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
+        return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
+    return _attempt(at, T_world_base, report, report.plan, rng, record)
+
+
+def _attempt(
+    at: ArmInScene,
+    T_world_base: F64,
+    report: PlanReport,
+    plan: MotionPlan,
+    rng: np.random.Generator,
+    record: bool,
+) -> CandidateTrial:
+    """Grasp after grasp, each in a fresh scene, until one lifts the target or they run out."""
+    trial = at.arm.trial
+    assert trial is not None
+    results: list[TrialResult] = []
+    failed: set[int] = set()
+    planning, trials, clock = at.planning, at.trials, at.clock
+    undisturbed = Disturbance.none(trial.object_friction)
+
+    def bases() -> tuple[F64, ...]:
+        return (T_world_base,) * len(results)
+
+    while True:
+        with clock.stage("execute"):
+            results.append(run_trial(trials, T_world_base, plan, undisturbed, record))
+        failed.add(plan.grasp)
+        if results[-1].outcome == "success":
+            return CandidateTrial("success", report, plan, tuple(results), bases(), 1, 1)
+        if len(results) == trial.max_attempts:
+            break
+        with clock.stage("plan"):
+            next_plan = plan_candidate(planning, T_world_base, rng, frozenset(failed)).plan
+        if next_plan is None:
+            break
+        plan = next_plan
+    outcome = max((r.outcome for r in results), key=_PROGRESS.index)
+    return CandidateTrial(outcome, report, plan, tuple(results), bases(), 0, 1)
+
+
+def _repeat(
+    at: ArmInScene,
+    T_world_base: F64,
+    report: PlanReport,
+    disturbances: list[Disturbance],
+    fits: Bools,
+    rng: np.random.Generator,
+    record: bool,
+) -> CandidateTrial:
+    """Arrive near the candidate once for each disturbance; good where at least half of them lift.
+
+    The robot knows where it has arrived, since it sees the target from there, and plans anew. Where
+    `fits` (K,) is false its body does not fit; what else differs it does not know.
+    """
+    planning, trials, clock = at.planning, at.trials, at.clock
+    results: list[TrialResult] = []
+    bases: list[F64] = []
+    ends: list[str] = []
+    for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
+        T_arrived = T_world_base @ disturbance.T_base_moved
+        if not does_fit:
+            ends.append("base_collision")
+            continue
+        with clock.stage("plan"):
+            found = plan_candidate(planning, T_arrived, rng)
+        if found.plan is None:
+            ends.append(found.outcome)
+            continue
+        with clock.stage("execute"):
+            unknown = replace(disturbance, T_base_moved=np.eye(4))
+            results.append(run_trial(trials, T_arrived, found.plan, unknown, record))
+        bases.append(T_arrived)
+        ends.append(results[-1].outcome)
+    successes = ends.count("success")
+    if 2 * successes >= len(ends):
+        outcome = "success"
+    else:
+        counts = Counter(end for end in ends if end != "success")
+        outcome = max(counts, key=lambda name: (counts[name], _PROGRESS.index(name)))
+    return CandidateTrial(outcome, report, report.plan, tuple(results), tuple(bases), successes, len(ends))
+
+
+def _fits(
+    at: ArmInScene,
+    T_world_base: F64,
+    disturbances: list[Disturbance],
+    candidates: SceneCandidates,
+    row: int,
+    spec: Specification,
+) -> Bools:
+    """Whether the robot's body fits (K,) where each disturbance lets it arrive."""
+    xy = np.array([(T_world_base @ d.T_base_moved)[:2, 3] for d in disturbances], np.float32)
+    height_m, camera_m = (
+        np.repeat(column[row], len(xy)) for column in (candidates.base_height_m, candidates.camera_height_m)
+    )
+    return base_clearance_m(xy, height_m, camera_m, at.scene.house.obstacles, spec.candidates) >= 0
+
+
+def disturbances_of(at: ArmInScene, row: int, spec: Specification) -> list[Disturbance]:
+    """The worlds that candidate `row` is tried in; none where it is the planned one."""
+    if at.arm.disturbance is None:
+        return []
+    rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, row)
+    return draw_disturbances(at.arm.disturbance, at.scene.T_world_object[0], rng)
+
+
+def draw_disturbances(
+    params: DisturbanceParams, T_world_target: F64, rng: np.random.Generator
+) -> list[Disturbance]:
+    """`repeats` worlds that differ from the planned one; target and base slide and turn on their planes."""
+    centre = translation(*T_world_target[:3, 3])
+    drawn: list[Disturbance] = []
+    for _ in range(params.repeats):
+        target, base = rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.0, 3)
+        friction = rng.uniform(params.object_friction.low, params.object_friction.high)
+        mass_scale = rng.uniform(params.mass_scale.low, params.mass_scale.high)
+        # The target may lie on its side: it turns about the world's vertical, not about its own z.
+        turned = _planar(target, params.target_position_std_m, params.target_yaw_std_rad)
+        T_world_moved = centre @ turned @ inverse(centre) @ T_world_target
+        drawn.append(
+            Disturbance(
+                inverse(T_world_target) @ T_world_moved,
+                _planar(base, params.base_position_std_m, params.base_yaw_std_rad),
+                float(friction),
+                float(mass_scale),
+            )
+        )
+    return drawn
+
+
+def _planar(normal: F64, position_std_m: float, yaw_std_rad: float) -> F64:
+    x_m, y_m = normal[:2] * position_std_m
+    return yaw_pose(float(x_m), float(y_m), 0.0, float(normal[2] * yaw_std_rad))
+
+
+def target_tcp(at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> F64:
+    """Pose (4, 4) of the TCP in the target's frame at the grasp that was planned."""
+    T_world_tcp = T_world_base @ at.robot.T_base_tcp(plan.q_approach_rad[-1])
+    return inverse(at.scene.T_world_object[0]) @ T_world_tcp

@@ -1,0 +1,96 @@
+"""Label source `plan`: a candidate is good where the arm has a whole plan to a grasp and the lift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.schemas.cost import StageClock
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.labels import heuristic_source
+from datagen.workers.labels.arm_labelling import (
+    ArmInScene,
+    CandidateTrial,
+    arm_in_scene,
+    target_tcp,
+    try_candidate,
+)
+from datagen.workers.labels.source import Columns, LabelSource
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.scenes.scene import SettledScene
+
+VERSION = 1
+_CODES = {name: code for code, name in enumerate(OUTCOMES)}
+
+
+def label(
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
+) -> Columns:
+    """The columns of the heuristic, and what planning found out; `rows` chooses candidates."""
+    return label_with_trials(scene, candidates, spec, clock, rows)[0]
+
+
+def label_with_trials(
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
+) -> tuple[Columns, list[CandidateTrial]]:
+    """The columns of `plan`, and the trials they were read from, one a candidate of `rows` (default: all)."""
+    columns = heuristic_source.label(scene, candidates, spec, clock)
+    if rows is None:
+        rows = range(len(candidates))
+    else:
+        columns = {name: values[list(rows)] for name, values in columns.items()}
+    columns["heuristic_label"] = columns["label"]
+    n = len(rows)
+    columns |= {
+        "outcome": np.zeros(n, np.uint8),
+        "grasps_free": np.zeros(n, np.int16),
+        "grasps_tried": np.zeros(n, np.int16),
+        "T_target_tcp": np.tile(np.eye(4, dtype=np.float32), (n, 1, 1)),
+        "grasp_score": np.zeros(n, np.float32),
+        "q_grasp_rad": np.zeros((n, 7), np.float32),
+        "path_length_rad": np.zeros(n, np.float32),
+        "path_clearance_m": np.zeros(n, np.float32),
+    }
+    arms: dict[tuple[float, float], ArmInScene] = {}
+    trials: list[CandidateTrial] = []
+    for k, row in enumerate(rows):
+        key = (float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row]))
+        if key not in arms:
+            arms[key] = arm_in_scene(scene, candidates, row, spec, clock)
+        trial = try_candidate(arms[key], candidates, row, spec)
+        trials.append(trial)
+        _write(columns, k, trial)
+        if trial.plan is not None:
+            _write_plan(columns, k, arms[key], arms[key].base_pose(candidates, row), trial.plan)
+    columns["label"] = (columns["outcome"] == _CODES["success"]).astype(np.uint8)
+    return columns, trials
+
+
+def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:
+    columns["outcome"][k] = _CODES[trial.outcome]
+    if trial.report is not None:
+        columns["grasps_free"][k] = trial.report.grasps_free
+        columns["grasps_tried"][k] = trial.report.grasps_tried
+
+
+def _write_plan(columns: Columns, k: int, at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> None:
+    columns["T_target_tcp"][k] = target_tcp(at, T_world_base, plan)
+    columns["grasp_score"][k] = at.grasps.score[plan.grasp]
+    columns["q_grasp_rad"][k] = plan.q_approach_rad[-1]
+    columns["path_length_rad"][k] = plan.length_rad
+    columns["path_clearance_m"][k] = plan.clearance_m
+
+
+PLAN = LabelSource("plan", VERSION, "plan", label, label)

@@ -1,0 +1,44 @@
+"""Label source `sim`: a candidate is good where the planned grasp, executed in physics, lifts and holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Specification
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.labels import plan_source
+from datagen.workers.labels.source import Columns, LabelSource
+from datagen.workers.scenes.scene import SettledScene
+
+VERSION = 1
+
+
+def label(
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    spec: Specification,
+    clock: StageClock,
+    rows: Sequence[int] | None = None,
+) -> Columns:
+    """The columns of `plan`, decided by execution, and what trials measured; `rows` chooses candidates."""
+    columns, trials = plan_source.label_with_trials(scene, candidates, spec, clock, rows)
+
+    def column(dtype: str, values: list[float]) -> np.ndarray:
+        return np.array(values, dtype)
+
+    columns |= {
+        "attempts": column("int16", [len(t.results) for t in trials]),
+        "trials": column("int16", [t.trials for t in trials]),
+        "successes": column("int16", [t.successes for t in trials]),
+        "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),
+        "slip_m": column("float32", [t.results[-1].slip_m if t.results else 0.0 for t in trials]),
+        "disturbed_m": column("float32", [t.results[-1].disturbed_m if t.results else 0.0 for t in trials]),
+        "simulated_s": column("float32", [sum(r.simulated_s for r in t.results) for t in trials]),
+    }
+    return columns
+
+
+SIM = LabelSource("sim", VERSION, "sim", label, label)

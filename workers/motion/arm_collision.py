@@ -1,0 +1,109 @@
+"""An arm at one base pose among what is near it: which joint vectors collide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, joined, place, smallest_gap_m
+from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
+
+_FAR_M = 1.0  # clearances are not looked for beyond this
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """One base pose of a planning scene. Links that no joint moves are not in `arm`."""
+
+    scene: PlanningScene
+    T_world_base: F64  # (4, 4)
+    near: Placed
+    is_target: Bools  # of the near parts
+    arm: Hulls
+    arm_may_touch: Bools  # (arm's parts, near parts)
+    hand_may_touch: Bools  # (hand's parts, near parts)
+    is_base_stuck: bool  # a link that no joint moves cuts something
+    _homes: dict[float, Bools] = field(default_factory=dict)
+
+    def first_blocked(self, q_rad: F64, opening_m: float) -> int:
+        """The first of M joint vectors (M, A) at which the arm or the hand collides, or M."""
+        T = self._frames(q_rad)
+        margin_m = self.scene.params.margin_m
+        end = _first(hits(self.arm, T, self.near, margin_m, self.arm_may_touch, True))
+        hand = self.scene.moving.hand
+        T_hand = hand.poses(T[:end, -1], np.full(end, opening_m))
+        end = _first(hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch, True))
+        return self._first_folded(q_rad[:end])
+
+    def first_arm_blocked(self, q_rad: F64, is_target_held: bool) -> int:
+        """The same for the arm without the hand, on lines that the hand alone was seen to be free on."""
+        may_touch = self.arm_may_touch | self.is_target if is_target_held else self.arm_may_touch
+        T = self._frames(q_rad)
+        end = _first(hits(self.arm, T, self.near, self.scene.params.margin_m, may_touch, True))
+        return self._first_folded(q_rad[:end])
+
+    def free_homes(self, opening_m: float) -> Bools:
+        """Which of the robot's tucked poses (H,) are free here."""
+        if opening_m not in self._homes:
+            homes = self.scene.robot.homes_rad
+            T, hand, margin_m = self._frames(homes), self.scene.moving.hand, self.scene.params.margin_m
+            T_hand = hand.poses(T[:, -1], np.full(len(T), opening_m))
+            blocked = hits(self.arm, T, self.near, margin_m, self.arm_may_touch)
+            blocked |= hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch)
+            self._homes[opening_m] = ~blocked
+        return self._homes[opening_m]
+
+    def clearance_m(self, q_rad: F64, opening_m: float) -> float:
+        """The smallest distance of arm and hand to anything, over joint vectors (M, A); at most 1 m."""
+        T = self._frames(q_rad)
+        hand = self.scene.moving.hand
+        T_hand = hand.poses(T[:, -1], np.full(len(T), opening_m))
+        gap_m = smallest_gap_m(hand.hulls, T_hand, self.near, _FAR_M, self.hand_may_touch)
+        return smallest_gap_m(self.arm, T, self.near, gap_m, self.arm_may_touch)
+
+    def _frames(self, q_rad: F64) -> F64:
+        return np.matmul(self.T_world_base, self.scene.moving.kinematics.poses(q_rad))
+
+    def _first_folded(self, q_rad: F64) -> int:
+        """The first joint vector at which the arm touches itself."""
+        for k, q in enumerate(q_rad):
+            if self.scene.robot.collides_itself(q):
+                return k
+        return len(q_rad)
+
+
+def surroundings(scene: PlanningScene, T_world_base: F64) -> Surroundings:
+    """What is within the arm's reach at a base pose (4, 4)."""
+    robot, moving = scene.robot, scene.moving
+    reach_m = robot.reach_m + ROOM_AROUND_M
+    center_m = T_world_base[:3, :3] @ robot.shoulder_m + T_world_base[:3, 3]
+    low_m, high_m = center_m - reach_m, center_m + reach_m
+    static = scene.static.within(low_m, high_m)
+    objects = scene.objects.within(low_m, high_m)
+    groups = [scene.static.rows(static), scene.objects.rows(objects)]
+    floor = np.concatenate([scene.floor[static], np.zeros(len(objects), np.bool_)])
+    is_target = np.concatenate([np.zeros(len(static), np.bool_), objects < scene.target_parts])
+    depth = moving.kinematics.depth[moving.arm.owner]
+    immobile = moving.arm.rows(np.flatnonzero(depth == 0))
+    arm = moving.arm.rows(np.flatnonzero(depth > 0))
+    T_base = np.matmul(T_world_base, moving.kinematics.T_base_frame)[None]
+    standing = joined(groups)
+    may_stand = np.broadcast_to(floor, (len(immobile), len(floor)))
+    is_base_stuck = bool(hits(immobile, T_base, standing, 0.0, may_stand).any())
+    arm_may_touch = np.zeros((len(arm), len(standing)), np.bool_)
+    if scene.pedestal_m is not None:
+        pedestal = place([scene.pedestal_m @ T_world_base[:3, :3].T + T_world_base[:3, 3]])
+        standing = joined([standing, pedestal])
+        is_target = np.append(is_target, False)
+        # What the first joint alone moves turns on the pedestal.
+        arm_may_touch = np.column_stack([arm_may_touch, depth[depth > 0] == 1])
+    hand_may_touch = np.zeros((len(moving.hand.hulls), len(standing)), np.bool_)
+    return Surroundings(
+        scene, T_world_base, standing, is_target, arm, arm_may_touch, hand_may_touch, is_base_stuck
+    )
+
+
+def _first(found: Bools) -> int:
+    return int(np.argmax(found)) if found.any() else len(found)

@@ -1,0 +1,207 @@
+"""Fewer convex parts for physics: neighbours are joined into their hull where that adds least.
+
+A scanned bowl comes with 80 parts, and the time of a physics step grows with their number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from scipy.ndimage import map_coordinates
+
+from datagen.workers.content_cache import Arrays, CacheFolder
+from datagen.workers.geometry.mesh import F32
+from datagen.workers.objects.hulls import (
+    Hull,
+    bounds_m,
+    distances_m,
+    extent_m,
+    few_vertices,
+    hull_of,
+    surface_points_m,
+)
+
+# Part of every cache key: raise it when the same parts may be merged differently.
+MERGER_VERSION = 2
+# Of a joined hull. PhysX takes 255, a GPU no more than 64, and contacts of 64 cost half as much.
+MAX_VERTICES = 64
+# Pairs that a part is looked at in: those whose bounding boxes are nearest.
+_NEIGHBOURS = 12
+# Grid cells and surface samples along the object's longest side.
+_CELLS_ACROSS, _SAMPLES_ACROSS = 32, 128
+# Hulls whose errors differ by less are compared by the volume they add.
+_ERROR_STEP_M = 2e-4
+_CACHE = CacheFolder(
+    "hulls",
+    {
+        "vertices": (np.float32, ("corners", 3)),
+        "cuts": (np.int64, ("cuts",)),
+        "n_before": (np.int64, ()),
+        "figures": (np.float64, (3,)),
+    },
+    most_files=4096,  # of some 20 KB each
+    most_bytes=32 * 2**20,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MergedParts:
+    """At most `limit` convex parts that fill what the original parts fill, and how much more.
+
+    Every original vertex lies in one of the merged parts, or at most `shrink_m` outside.
+    """
+
+    parts_m: tuple[F32, ...]  # each (V, 3)
+    n_before: int
+    # Largest distance from a point of the merged surfaces to the union of the original parts. Both
+    # are sampled 1/128 of the longest side apart: it may be 0.8 of that too large or too small.
+    error_m: float
+    shrink_m: float  # what MAX_VERTICES cut off: how far an original vertex lies outside its merged part
+    added_volume_share: float  # sum over the merged parts by that over the original ones, less 1
+
+
+_known: dict[str, MergedParts] = {}
+
+
+def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
+    """Joins convex parts, each (V, 3) with volume, until at most `limit` are left.
+
+    Greedy: at each step the pair is joined whose hull reaches least far out of the union of all
+    original parts, and of equal ones that which adds least volume. So a wall becomes a few even
+    sectors, and an opening, which reaches far, is closed last. By volume alone thin slivers come
+    first, whatever they reach across: the corner between a wall and its floor.
+
+    Where there are `limit` parts or fewer they are returned as they are. Else the result depends
+    neither on the order of the parts nor on that of their vertices; it is kept in memory and in the
+    cache folder, because it takes about a second. Raises ValueError where `limit` is not positive.
+    """
+    if limit < 1:
+        raise ValueError(f"limit {limit}: at least one part must be left")
+    if len(parts_m) <= limit:
+        return MergedParts(tuple(parts_m), len(parts_m), 0.0, 0.0, 0.0)
+    key = _key(parts_m, limit)
+    if key not in _known:
+        stored = _CACHE.load(key)
+        merged = _restored(stored) if stored is not None else _merge(parts_m, limit)
+        if stored is None:
+            _CACHE.store(key, _stored(merged))
+        _known[key] = merged
+    return _known[key]
+
+
+def _merge(parts_m: Sequence[F32], limit: int) -> MergedParts:
+    originals = sorted((hull_of(part) for part in parts_m), key=lambda hull: hull.vertices_m.tobytes())
+    step_m = extent_m(originals) / _SAMPLES_ACROSS
+    groups = _groups(originals, limit)
+    merged: list[Hull] = []
+    shrink_m = 0.0
+    for group in groups:
+        whole = hull_of(np.concatenate([originals[k].vertices_m for k in group]))
+        few = hull_of(few_vertices(whole.vertices_m, MAX_VERTICES)) if len(group) > 1 else whole
+        if few is not whole:
+            shrink_m = max(shrink_m, float(distances_m([few], whole.vertices_m, step_m).max()))
+        merged.append(few)
+    joined = [hull for hull, group in zip(merged, groups, strict=True) if len(group) > 1]
+    points = np.concatenate([surface_points_m(hull, step_m) for hull in joined])
+    before, after = (sum(hull.volume_m3 for hull in hulls) for hulls in (originals, merged))
+    return MergedParts(
+        parts_m=tuple(hull.vertices_m.astype(np.float32) for hull in merged),
+        n_before=len(originals),
+        error_m=float(distances_m(originals, points, step_m).max()),
+        shrink_m=shrink_m,
+        added_volume_share=after / before - 1,
+    )
+
+
+def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:
+    """`limit` groups of rows of `originals` to be joined, sorted."""
+    field = _DistanceField(originals)
+    alive = dict(enumerate(originals))
+    groups = {k: [k] for k in alive}
+    queue: list[tuple[int, float, int, int]] = []
+    hulls: dict[tuple[int, int], Hull] = {}
+
+    def look_at(k: int) -> None:
+        for other in _nearest(alive, k):
+            a, b = min(k, other), max(k, other)
+            if (a, b) not in hulls:
+                hull = hull_of(np.concatenate([alive[a].vertices_m, alive[b].vertices_m]))
+                hulls[a, b] = hull
+                added_m3 = hull.volume_m3 - alive[a].volume_m3 - alive[b].volume_m3
+                heapq.heappush(queue, (round(field.reach_m(hull) / _ERROR_STEP_M), added_m3, a, b))
+
+    for k in range(len(originals)):
+        look_at(k)
+    while len(alive) > limit:
+        if not queue:  # every pair looked at has lost one of its parts
+            for k in sorted(alive):
+                look_at(k)
+        _, _, a, b = heapq.heappop(queue)
+        hull = hulls.pop((a, b))
+        if a not in alive or b not in alive:
+            continue
+        new = 2 * len(originals) - len(alive)  # one more at each step
+        del alive[a], alive[b]
+        alive[new] = hull
+        groups[new] = sorted(groups.pop(a) + groups.pop(b))
+        look_at(new)
+    return sorted(groups.values())
+
+
+def _nearest(alive: dict[int, Hull], k: int) -> list[int]:
+    """The parts nearest to part `k`: by the gap between bounding boxes, then between their middles."""
+    others = [other for other in alive if other != k]
+    if not others:
+        return []
+    low = np.array([alive[other].low_m for other in others])
+    high = np.array([alive[other].high_m for other in others])
+    gap = np.linalg.norm(np.maximum(0, np.maximum(low - alive[k].high_m, alive[k].low_m - high)), axis=1)
+    apart = np.linalg.norm((low + high) / 2 - (alive[k].low_m + alive[k].high_m) / 2, axis=1)
+    return [others[row] for row in np.lexsort((others, apart, gap))[:_NEIGHBOURS]]
+
+
+class _DistanceField:
+    """Distance from the union of hulls, on a grid over their bounding box."""
+
+    def __init__(self, hulls: Sequence[Hull]) -> None:
+        self._cell_m = extent_m(hulls) / _CELLS_ACROSS
+        self._low_m, high_m = bounds_m(hulls)
+        shape = np.ceil((high_m - self._low_m) / self._cell_m).astype(int) + 1
+        points = self._low_m + self._cell_m * np.indices(tuple(shape)).reshape(3, -1).T
+        # In the middle of a cup all walls are equally near, which makes the search slow for nothing.
+        farthest_m = extent_m(hulls) / 6
+        self._distance_m = distances_m(hulls, points, self._cell_m, farthest_m).reshape(shape)
+
+    def reach_m(self, hull: Hull) -> float:
+        """How far a hull within the bounding box reaches out of the union."""
+        at = (surface_points_m(hull, self._cell_m) - self._low_m) / self._cell_m
+        return float(map_coordinates(self._distance_m, at.T, order=1, mode="nearest").max())
+
+
+def _key(parts_m: Sequence[F32], limit: int) -> str:
+    # The parts in the order of their bytes: another order is the same question.
+    blobs = sorted(np.unique(np.asarray(part, np.float32), axis=0).tobytes() for part in parts_m)
+    digest = hashlib.sha256(f"{MERGER_VERSION} {scipy.__version__} {limit}".encode())
+    for blob in blobs:
+        digest.update(hashlib.sha256(blob).digest())
+    return digest.hexdigest()
+
+
+def _stored(merged: MergedParts) -> Arrays:
+    return {
+        "vertices": np.concatenate(merged.parts_m),
+        "cuts": np.cumsum([len(part) for part in merged.parts_m])[:-1],
+        "n_before": np.array(merged.n_before, np.int64),
+        "figures": np.array([merged.error_m, merged.shrink_m, merged.added_volume_share]),
+    }
+
+
+def _restored(stored: Arrays) -> MergedParts:
+    error_m, shrink_m, share = (float(figure) for figure in stored["figures"])
+    parts = tuple(np.split(stored["vertices"], stored["cuts"]))
+    return MergedParts(parts, int(stored["n_before"]), error_m, shrink_m, share)

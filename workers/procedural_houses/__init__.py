@@ -1,0 +1,1 @@
+"""Procedural generation of houses: floor plan, rooms, furniture, written as ProcTHOR house documents."""

@@ -1,0 +1,176 @@
+"""The embedded houses: drawn by number, written as house documents, read by the same loader."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import canonical_json, digest_of
+from datagen.workers.furniture.colours import hash_bytes
+from datagen.workers.furniture.support_tops import CARRYING_TYPES, top_height_m, top_rectangles
+from datagen.workers.houses.house import House
+from datagen.workers.houses.loader import build_house
+from datagen.workers.json_document import JsonNode
+from datagen.workers.procedural_houses.floorplan import (
+    WALL_HEIGHT_M,
+    FloorPlan,
+    Opening,
+    Stretch,
+    draw_floor_plan,
+)
+from datagen.workers.procedural_houses.furniture_placement import ROOM_FURNISHERS, Furnisher
+from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS
+from datagen.workers.procedural_houses.room_layout import layout_of
+
+# Part of the digest: raise it whenever the same number would give another house.
+GENERATOR_VERSION = 1
+_DEFAULT_COUNT = 400
+_MOST = 100_000
+# A first word of the seed of its own, so that no other use of small numbers draws the same stream.
+_SEED = 0x486F757365
+_FLOORS = ("OakWood", "DarkWoodParquet", "GreyConcrete", "BeigeTile", "WalnutWood", "Carpet")
+_WALLS = ("Eggshell", "WhitePlaster", "BlueDrywall", "GreenDrywall", "TanPlaster", "GreyDrywall")
+
+
+@dataclass(frozen=True)
+class BuiltinHouses:
+    """`count` generated homes, `builtin-0000` and on. A longer collection begins with a shorter one."""
+
+    count: int
+    digest: str
+    kind: str = "builtin"
+
+    def house_ids(self) -> list[str]:
+        """Ids by number."""
+        return [_house_id(k) for k in range(self.count)]
+
+    def load(self, house_id: str) -> House:
+        """Draw and build the house."""
+        number = house_id.removeprefix("builtin-")
+        if not number.isdecimal() or int(number) >= self.count or _house_id(int(number)) != house_id:
+            mend = f"Choose one of builtin-0000 to {_house_id(self.count - 1)}."
+            raise InputError("builtin", "", f"no house {house_id!r}", mend)
+        document = house_document(int(number))
+        digest = hash_bytes(canonical_json(document)).hex()
+        return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
+
+
+def open_builtin(text: str) -> BuiltinHouses:
+    """The built-in houses; the text is how many, 400 if empty."""
+    if text and not (text.isdecimal() and len(text) < 7 and 1 <= int(text) <= _MOST):
+        raise InputError("builtin", "", f"{text!r} is not a count", f"Name 1 to {_MOST}, as builtin:400.")
+    count = int(text) if text else _DEFAULT_COUNT
+    sizes = {a.asset_id: [a.object_type, *a.size_m] for a in BUILTIN_ASSETS.values()}
+    return BuiltinHouses(count, digest_of(["builtin-houses", GENERATOR_VERSION, count, sizes]))
+
+
+def house_document(number: int) -> dict[str, Any]:
+    """The house of that number as a ProcTHOR document, the same on every machine.
+
+    Drawn again until it has a top of at least 0.5 x 0.4 m, 0.3 to 1.2 m high.
+    """
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([_SEED, number])))
+    while True:
+        plan = draw_floor_plan(rng)
+        objects = _furniture(plan, rng)
+        if any(_is_usable(o["assetId"]) for o in objects):
+            return _document(plan, objects, rng)
+
+
+def _house_id(number: int) -> str:
+    return f"builtin-{number:04d}"
+
+
+def _furniture(plan: FloorPlan, rng: np.random.Generator) -> list[dict[str, Any]]:
+    objects: list[dict[str, Any]] = []
+    for index, room in enumerate(plan.rooms):
+        furnisher = Furnisher(layout_of(plan, index), rng)
+        ROOM_FURNISHERS[room.room_type](furnisher)
+        furnisher.decorate()
+        objects.extend(furnisher.objects)
+    return objects
+
+
+def _is_usable(asset_id: str) -> bool:
+    asset = BUILTIN_ASSETS[asset_id]
+    sides = sorted(top_rectangles(asset)[0].size_m)
+    low_enough = 0.3 <= top_height_m(asset) <= 1.2
+    return asset.object_type in CARRYING_TYPES and low_enough and sides[0] >= 0.4 and sides[1] >= 0.5
+
+
+def _document(plan: FloorPlan, objects: list[dict[str, Any]], rng: np.random.Generator) -> dict[str, Any]:
+    floors = [_FLOORS[rng.integers(len(_FLOORS))] for _ in plan.rooms]
+    paints = [_WALLS[rng.integers(len(_WALLS))] for _ in plan.rooms]
+    rooms: list[dict[str, Any]] = []
+    for room, floor in zip(plan.rooms, floors, strict=True):
+        x0, y0, x1, y1 = room.rect
+        ring = [(x0, y0), (x0, y1), (x1, y1), (x1, y0)]
+        polygon = [{"x": x, "y": 0.0, "z": y} for x, y in ring]
+        rooms.append(
+            {
+                "id": room.room_id,
+                "roomType": room.room_type,
+                "floorPolygon": polygon,
+                "floorMaterial": {"name": floor},
+            }
+        )
+    walls: list[dict[str, Any]] = []
+    for stretch in plan.stretches:
+        walls.append(_wall(_wall_id(plan, stretch), stretch, paints[stretch.room]))
+        if stretch.neighbour is None:
+            walls.append(_wall(_other_side_id(plan, stretch), _reverse(stretch), "Eggshell"))
+    return {
+        "metadata": {"schema": "1.0.0", "generator": GENERATOR_VERSION},
+        "rooms": rooms,
+        "walls": walls,
+        "doors": [_opening(plan, o, k) for k, o in enumerate(plan.openings) if o.is_door],
+        "windows": [_opening(plan, o, k) for k, o in enumerate(plan.openings) if not o.is_door],
+        "objects": objects,
+    }
+
+
+def _wall_id(plan: FloorPlan, s: Stretch) -> str:
+    return f"wall|{s.room}|" + "|".join(f"{v:.2f}" for v in (*s.start_m, *s.end_m))
+
+
+def _other_side_id(plan: FloorPlan, s: Stretch) -> str:
+    if s.neighbour is None:
+        return "wall|exterior|" + "|".join(f"{v:.2f}" for v in (*s.end_m, *s.start_m))
+    twin = next(
+        t for t in plan.stretches if t.room == s.neighbour and t.start_m == s.end_m and t.end_m == s.start_m
+    )
+    return _wall_id(plan, twin)
+
+
+def _reverse(s: Stretch) -> Stretch:
+    return Stretch(s.room, s.end_m, s.start_m, s.neighbour)
+
+
+def _wall(wall_id: str, s: Stretch, paint: str) -> dict[str, Any]:
+    low = [{"x": p[0], "y": 0.0, "z": p[1]} for p in (s.start_m, s.end_m)]
+    high = [{**p, "y": WALL_HEIGHT_M} for p in low]
+    return {
+        "id": wall_id,
+        "roomId": f"room|{s.room}" if "exterior" not in wall_id else "exterior",
+        "polygon": [*low, *high],
+        "material": {"name": paint},
+    }
+
+
+def _opening(plan: FloorPlan, o: Opening, number: int) -> dict[str, Any]:
+    s = o.stretch
+    room1 = s.room if s.neighbour is None else s.neighbour
+    return {
+        "id": f"{'door' if o.is_door else 'window'}|{number}",
+        "room0": f"room|{s.room}",
+        "room1": f"room|{room1}",
+        "wall0": _wall_id(plan, s),
+        "wall1": _other_side_id(plan, s),
+        "holePolygon": [
+            {"x": o.along_m[0], "y": o.height_m[0], "z": 0.0},
+            {"x": o.along_m[1], "y": o.height_m[1], "z": 0.0},
+        ],
+    }

@@ -1,0 +1,16 @@
+"""Why a try at a scene was given up."""
+
+from __future__ import annotations
+
+from datagen.schemas.outcomes import REDRAW_CAUSES
+
+
+class SceneRejected(Exception):
+    """This try gives no scene; `cause` is one of REDRAW_CAUSES, `detail` says more where there is more."""
+
+    def __init__(self, cause: str, detail: str = "") -> None:
+        if cause not in REDRAW_CAUSES:
+            raise KeyError(f"unknown redraw cause {cause!r}; causes are {', '.join(REDRAW_CAUSES)}")
+        super().__init__(cause)
+        self.cause = cause
+        self.detail = detail

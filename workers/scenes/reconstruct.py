@@ -1,0 +1,137 @@
+"""A stored scene made whole again from its record: the same geometry, without drawing or physics.
+
+The store checks that bytes are those that were written; here is checked that they make sense, so that no
+label is worked out for poses that no body can have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from datagen.schemas.errors import InputError
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import is_pose
+from datagen.workers.objects.model import ObjectModel
+from datagen.workers.rendering.frame import Camera, SceneGeometry
+from datagen.workers.rendering.rays import RayScene
+from datagen.workers.world import PreparedHouse, World
+
+Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
+
+_PLACE = "stored scenes"
+_MEND = "Make the run that stores them again"
+# Of rotations, which engines give as float32.
+_ROUNDING = 1e-5
+_EXTENT_M = 1000.0  # no house is larger
+# Farther from the target's centre than this no base is of use, and a record cannot say its distance.
+_NEAR_M = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructedScene:
+    """What a scene's record stands for: a `SettledScene`, with the camera it was observed by."""
+
+    index: int
+    retry: int
+    house: PreparedHouse
+    models: tuple[ObjectModel, ...]
+    T_world_object: F64  # (K, 4, 4)
+    rays: RayScene
+    camera: Camera
+
+    @property
+    def target_center_m(self) -> F64:
+        """World position (3,) of the target's frame: the centre of its bounding box."""
+        return self.T_world_object[0, :3, 3]
+
+    @property
+    def geometry(self) -> SceneGeometry:
+        return SceneGeometry(self.house.house, self.models, self.T_world_object)
+
+
+def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
+    """Rebuild the geometry of a record from the sources it names.
+
+    Raises InputError where a house or an object is not there any more or has other content, and for
+    poses that no body can have.
+    """
+    index, retry = int(record["scene_index"]), int(record["retry"])
+    T_world_object = np.asarray(record["T_world_object"], np.float64)
+    T_world_camera = np.asarray(record["T_world_camera"], np.float64)
+    fx, fy, cx, cy = (float(v) for v in record["intrinsics_px"])
+    width, height = (int(v) for v in record["image_size_px"])
+    centre_m = np.asarray(record["target_center_m"], np.float64)
+    for name, sound in (
+        ("scene_index", index >= 0),
+        ("retry", retry >= 0),
+        ("T_world_object", all(map(_is_placed, T_world_object))),
+        ("T_world_camera", _is_placed(T_world_camera)),
+        ("intrinsics_px", bool(np.isfinite([cx, cy]).all()) and 0 < fx < 1e6 and 0 < fy < 1e6),
+        ("image_size_px", 0 < width <= 4096 and 0 < height <= 4096),
+        ("target_center_m", np.allclose(centre_m, T_world_object[0, :3, 3], rtol=0, atol=_ROUNDING)),
+    ):
+        if not sound:
+            raise _senseless(index, name)
+    house = world.house(str(record["house_id"]))
+    _same(house.house.house_id, house.house.digest, str(record["house_digest"]))
+    names = [str(name) for name in record["object_name"]]
+    models = tuple(world.object(name).model for name in names)
+    for model, digest in zip(models, record["object_digest"], strict=True):
+        _same(model.name, model.digest, str(digest))
+    camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
+    rays = world.ray_scene(house, names, T_world_object)
+    return ReconstructedScene(index, retry, house, models, T_world_object, rays, camera)
+
+
+def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneCandidates:
+    """The candidates of a scene from their stored columns, by field name.
+
+    Raises InputError for numbers that are not finite, or that no robot around the target can have.
+    """
+    apart_m = np.hypot(*(columns["base_xy_m"] - scene.target_center_m[:2]).T)
+    for name, sound in (
+        ("base_xy_m", apart_m < _NEAR_M),
+        ("robot_index", columns["robot_index"] >= 0),
+        ("camera_height_m", _within(columns["camera_height_m"], 0.0, _NEAR_M)),
+        ("base_height_m", _within(columns["base_height_m"], 0.0, _NEAR_M)),
+        ("arm_reach_m", _within(columns["arm_reach_m"], 0.0, _NEAR_M)),
+        ("base_clearance_m", _within(columns["base_clearance_m"], -_NEAR_M, _NEAR_M)),
+    ):
+        if not sound.all():
+            raise _senseless(scene.index, name)
+    return SceneCandidates(
+        base_xy_m=columns["base_xy_m"],
+        robot_index=columns["robot_index"],
+        camera_height_m=columns["camera_height_m"],
+        base_height_m=columns["base_height_m"],
+        arm_reach_m=columns["arm_reach_m"],
+        clearance_m=columns["base_clearance_m"],
+    )
+
+
+def _is_placed(T: F64) -> bool:
+    """Whether a matrix (4, 4) turns and moves, within the size of a house, and does nothing else."""
+    return is_pose(T, _ROUNDING) and bool(np.abs(T[:3, 3]).max() <= _EXTENT_M)
+
+
+def _within(values: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
+    return (values >= low) & (values <= high)  # neither, where it is NaN
+
+
+def _senseless(index: int, name: str) -> InputError:
+    return InputError(_PLACE, f"scene {index}, {name}", "holds values that no scene can have", _MEND)
+
+
+def _same(name: str, found: str, stored: str) -> None:
+    if found != stored:
+        raise InputError(
+            name,
+            "digest",
+            f"its content is {found[:12]}, but the scene was made with {stored[:12]}",
+            "Give the houses and objects that the run was made with",
+        )
