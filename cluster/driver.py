@@ -25,9 +25,9 @@ from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import (
     Durations,
-    at_once,
     RetryPolicy,
     ShardFailures,
+    at_once,
     deadline_s,
     decide,
     ends_early,
@@ -79,7 +79,7 @@ class Events(Protocol):
         ...
 
     def tick(self, totals: JobTotals) -> None:
-        """Called often; the totals is the driver's own and changes."""
+        """Called often; the totals are the driver's own and change."""
         ...
 
     def stopping(self, reason: str) -> None:

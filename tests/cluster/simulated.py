@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from datagen.cluster.policy import Policy, Trouble
 from datagen.cluster.driver import AttemptOrder
 from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.policy import Policy
 from datagen.cluster.retry_policy import ShardFailures
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry

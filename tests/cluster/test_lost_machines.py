@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.job_totals import JobSummary
+from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
-from tests.cluster.simulated import LENIENT, FakeClock, Fate, Heard, PaperRecorder, SimulatedExecutor, report_of
+from tests.cluster.simulated import (
+    LENIENT,
+    FakeClock,
+    Fate,
+    Heard,
+    PaperRecorder,
+    SimulatedExecutor,
+    report_of,
+)
 
 
 @pytest.fixture(autouse=True)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from datagen.cluster.retry_policy import (
     Durations,
-    at_once,
     RetryPolicy,
     ShardFailures,
+    at_once,
     deadline_s,
     decide,
     ends_early,
