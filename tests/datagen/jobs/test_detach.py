@@ -51,7 +51,7 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
             [sys.executable, "-m", "datagen.cli", *submit_arguments(run, N, workers=1), "--detach"],
             cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
-        out, err = shell.communicate(timeout=140)
+        out, err = shell.communicate(timeout=600)
         if shell.returncode != 2 or "does not start" not in err:
             break
     assert shell.returncode == 0, err

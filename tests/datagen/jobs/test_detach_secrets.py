@@ -57,7 +57,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, first_key: str) -> Iterator[Pa
         patch.setenv("DATAGEN_STATE", str(folder / "state"))
         patch.setenv(SECRET, first_key)
         words = [*submit_arguments(folder / "run", PER_SCENE, workers=2), "--detach"]
-        subprocess.run([sys.executable, "-m", "datagen.cli", *words], cwd=REPOSITORY, check=True, timeout=290)
+        subprocess.run([sys.executable, "-m", "datagen.cli", *words], cwd=REPOSITORY, check=True, timeout=600)
         try:
             head, _ = head_and_jobs()
             while list(Path(head.folder).glob("*.json")):  # removed as the job's last act
