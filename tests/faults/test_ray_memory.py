@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -15,63 +14,38 @@ from datagen.cluster.policy import Policy
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
 from datagen.cluster.stop import StopRequest
-from datagen.cluster.tally import JobSummary
 from tests.cluster.simulated import Heard, PaperBooks
 from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 
 
-@dataclass
-class Filled:
-    """A job whose first attempt filled the memory, and how far other programs' memory moved meanwhile."""
-
-    summary: JobSummary
-    books: PaperBooks
-    moved_bytes: int
-
-
-def used_bytes() -> int:
-    """Memory that is in use, as Ray counts it: by the limits of a container, or else as the system does."""
+def test_who_fills_the_memory_is_ended_and_tried_once_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from ray._private.utils import get_system_memory, get_used_memory
 
-    return max(get_used_memory(), get_system_memory() - psutil.virtual_memory().available)
-
-
-def fill_the_memory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Filled:
-    from ray._private.utils import get_system_memory
-
-    before, total = used_bytes(), get_system_memory()
-    if total - before < 2 * FILL_BYTES:
+    total = get_system_memory()
+    # Ray counts by the limits of a container where there are some, or else as the system does.
+    used = max(get_used_memory(), total - psutil.virtual_memory().available)
+    if total - used < 2 * FILL_BYTES:
         pytest.skip("too little free memory to fill some of it")
     # As if the machine ended at half of what will be filled.
-    threshold = (before + FILL_BYTES / 2) / total
+    threshold = (used + FILL_BYTES / 2) / total
     monkeypatch.setenv("RAY_memory_usage_threshold", f"{threshold:.4f}")
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
-    (folder / "tries").mkdir(parents=True)
+    (tmp_path / "tries").mkdir()
     settings, books = RaySettings(workers=1), PaperBooks()
     with notes_of_a_job() as notes, ray_cluster(settings) as ray:
 
         def make_task(order: Order) -> ScriptedTask:
-            tries = str(folder / "tries")
+            tries = str(tmp_path / "tries")
             return ScriptedTask(0, order.attempt, 200, notes, ("fill_memory",), tries)
 
         policy = Policy(max_quarantined_share=1.0, backoff_s=0.05)
         summary = drive(
             [0], make_task, RayExecutor(perform, settings, ray), books, policy, Heard(), StopRequest()
         )
-    return Filled(summary, books, abs(used_bytes() - before))
-
-
-def test_who_fills_the_memory_is_ended_and_tried_once_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(4):  # another program that grows or ends meanwhile moves the threshold
-        filled = fill_the_memory(tmp_path / str(number), monkeypatch)
-        if filled.moved_bytes < FILL_BYTES / 4:
-            break
-    else:
-        pytest.skip("the memory of other programs does not stand still")
-    assert filled.summary.tally.committed == 1 and filled.summary.tally.retries == 1
-    ended, committed = filled.books.entries
+    assert summary.tally.committed == 1 and summary.tally.retries == 1
+    ended, committed = books.entries
     assert (ended.outcome, committed.outcome) == ("out_of_memory", "committed")
     assert "memory" in ended.cause and ended.host is not None and ended.host.pid != os.getpid()
     assert ended.cost is not None and ended.cost.wall_s > 0
