@@ -52,7 +52,7 @@ def test_a_cluster_of_others_that_dies_ends_the_job_and_leaves_its_shards_open(
             time.sleep(0.05)
         (server,) = [p for p in machine.children(recursive=True) if p.name() == kind]
         server.kill()
-        out, err = job.communicate(timeout=300)
+        out, err = job.communicate(timeout=800)
     finally:
         tree = machine.children(recursive=True)
         kill_machine(machine)
