@@ -22,7 +22,7 @@ def as_another_user(code: str, *arguments: object, user: int = NOBODY) -> str:
     environment = {"PATH": os.environ["PATH"], "RAY_AUTH_MODE": "disabled"}
     done = subprocess.run(
         [sys.executable, "-c", imports + become + code, *map(str, arguments)],
-        check=False, env=environment, cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
+        check=False, env=environment, cwd=REPOSITORY, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -50,7 +50,7 @@ def moto_server(log: Path) -> Generator[int]:
 def make_bucket(port: int, bucket: str) -> None:
     """Make a bucket on a server."""
     request = urllib.request.Request(f"http://127.0.0.1:{port}/{bucket}", method="PUT")
-    urllib.request.urlopen(request, timeout=20).close()
+    urllib.request.urlopen(request, timeout=120).close()
 
 
 def environment(port: int) -> dict[str, str]:

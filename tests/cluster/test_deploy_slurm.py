@@ -105,7 +105,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
         assert len(folders) == 2 and {stat.S_IMODE(f.parent.stat().st_mode) for f in folders} == {0o700}
         assert sum(process.name() == "raylet" for process in machines) == 2
         job.send_signal(signal.SIGTERM)
-        code = job.wait(timeout=300)
+        code = job.wait(timeout=600)
     finally:
         for process in [*job.children(recursive=True), job] if job.is_running() else []:
             process.kill()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+import psutil
 import pytest
 
+from datagen import cli
 from datagen.cluster import ray_head
 from datagen.cluster.cluster_folders import new_folder
 from datagen.cluster.ray_head import ensure_head, running_head, stop_head
@@ -36,9 +39,21 @@ def test_a_head_that_ray_gives_up_is_started_again(
         head = ensure_head(1)
         assert running_head() == head and [f.exists() for f in folders] == [False, True]
         assert "Ray did not start and is started again: " in capsys.readouterr().err
+        assert cli.run(["cancel", "--head"]) == 0
+        assert running_head() is None
+        assert not [p for p in psutil.process_iter() if group_of(p) == head.group]
+        assert cli.run(["cancel", "--head"]) == 0
+        assert "none runs" in capsys.readouterr().out
     finally:
         stop_head()
     assert not folders[1].exists()
+
+
+def group_of(process: psutil.Process) -> int:
+    try:
+        return os.getpgid(process.pid)
+    except ProcessLookupError:
+        return 0
 
 
 def test_a_head_that_never_starts_is_one_line_and_leaves_nothing(

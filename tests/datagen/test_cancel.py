@@ -58,7 +58,7 @@ def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
     told = capsys.readouterr()
     assert "ended interrupted, exit code 130" in told.out and f"datagen resume {run}" in told.out
     assert "asked to stop" in told.err  # the wait shows what it waits for
-    assert work.process.wait(300) == 130
+    assert work.process.wait(800) == 130
     job = work.job()
     assert job.health() == "ended" and job.state is not None and job.state.in_flight == 0
     (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
@@ -75,7 +75,7 @@ def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> No
     work = Work(tmp_path / "run")
     work.wait_until_it_makes_shards()
     assert cli.run(["cancel", str(tmp_path / "run"), "--now"]) == 0
-    assert work.process.wait(300) == 130
+    assert work.process.wait(800) == 130
     job = work.job()
     assert (
         job.order is not None and job.order.now and job.state is not None and job.state.end == "interrupted"
@@ -89,7 +89,7 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     work = Work(run)
     job = work.wait_until_it_makes_shards()
     work.process.kill()
-    assert work.process.wait(300) == -signal.SIGKILL
+    assert work.process.wait(800) == -signal.SIGKILL
     # A minute passes.
     assert job.state is not None
     before = (datetime.now(UTC) - timedelta(minutes=2)).isoformat()
@@ -124,7 +124,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         assert f"datagen resume {run}" in line and "go on with" not in told.out
     finally:
         work.process.send_signal(signal.SIGCONT)
-    assert work.process.wait(300) == 130  # the request stands
+    assert work.process.wait(800) == 130  # the request stands
 
 
 def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(

@@ -82,7 +82,7 @@ def test_a_job_on_s3_heeds_a_request_that_is_left_there(
             assert process.poll() is None, process.communicate()
             time.sleep(0.1)
         assert cli.run(["cancel", run, "--now"]) == 0
-        assert process.wait(100) == 130
+        assert process.wait(600) == 130
     assert "ended interrupted, exit code 130" in capsys.readouterr().out
 
 

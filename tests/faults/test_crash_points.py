@@ -16,7 +16,7 @@ from tests.faults.crash_points_campaign import run_campaign, start
 from tests.faults.crash_points_operations import OPERATIONS
 from tests.faults.crash_points_shim import Call, build, read_log
 
-SAMPLE = 1
+SAMPLE = 0  # of each kind of end only the first and the last call
 # Calls that leave files as they are. Any other one that touches a run must be known to the shim.
 READING = {
     "access", "close", "faccessat", "faccessat2", "fadvise64", "fcntl", "flock", "fstat", "fstatfs", "getcwd",
@@ -40,7 +40,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(str(e))
 
 
-@pytest.mark.timeout(900)  # some hundred processes
 def test_every_unit_is_absent_or_there_wherever_it_ends(library: Path) -> None:
     findings = run_campaign([], SAMPLE, library)
     assert [found.operation for found in findings] == [operation.name for operation in OPERATIONS]

@@ -25,8 +25,6 @@ SECRET = "the-canary-sings-at-noon"
 # Above what a verb needs for a run of three shards, and far below what the hostile ones ask for.
 MEMORY_BYTES = 1 << 30
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @pytest.fixture(scope="module", autouse=True)
 def fewer_arrays() -> Generator[None]:

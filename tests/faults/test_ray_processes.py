@@ -134,7 +134,7 @@ def test_a_job_outlives_a_machine_whose_power_goes(cluster: Cluster, tmp_path: P
         assert job.poll() is None, job.communicate()
         time.sleep(0.05)
     kill_machine(cluster.second)
-    out, err = job.communicate(timeout=300)
+    out, err = job.communicate(timeout=800)
     assert job.returncode == 0 and "Traceback" not in err, err
     said = json.loads(out)
     assert said["end"] == "complete" and said["closed"] == 0 and said["outcomes"]["committed"] == SHARDS

@@ -50,7 +50,7 @@ class Job:
         os.killpg(self.process.pid, signal.SIGINT)
 
     def end(self) -> tuple[int, dict[str, Any]]:
-        out, err = self.process.communicate(timeout=300)
+        out, err = self.process.communicate(timeout=800)
         assert "Traceback" not in err
         return self.process.returncode, json.loads(out) if out else {}
 

@@ -1,6 +1,7 @@
 """Any history of commits, crashes, resumes, merges and mends leaves what a plain dictionary says.
 
-After every step each place says what the model (state_model.py) says.
+After every step each place says what the model (state_model.py) says. Here a sample of histories;
+`python -m benchmarks.faults.histories` tries many more.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from tests.properties.state_model import (
 
 SHARDS_AT_MOST = 5
 PLACES_AT_MOST = 5
-EXAMPLES, STEPS = 200, 50
+EXAMPLES, STEPS = 30, 40
 
 
 def findings(place: Place) -> list[Any]:
@@ -330,12 +331,17 @@ class AnyHistory(RuleBasedStateMachine):
         return found
 
 
-TestAnyHistory = pytest.mark.timeout(900)(AnyHistory.TestCase)
-TestAnyHistory.settings = settings(
-    max_examples=EXAMPLES,
-    stateful_step_count=STEPS,
-    deadline=None,
-    # Tracing every line of a failure takes longer than finding it.
-    phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
-)
+def many_histories(examples: int, steps: int) -> settings:
+    """Settings for that many histories of at most that many steps."""
+    return settings(
+        max_examples=examples,
+        stateful_step_count=steps,
+        deadline=None,
+        # Tracing every line of a failure takes longer than finding it.
+        phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+    )
+
+
+TestAnyHistory = AnyHistory.TestCase
+TestAnyHistory.settings = many_histories(EXAMPLES, STEPS)

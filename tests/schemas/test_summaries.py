@@ -269,7 +269,7 @@ def test_an_index_of_the_former_format_is_replaced(tmp_path: Path) -> None:
 
 def test_drivers_that_write_the_index_at_once_leave_a_whole_one(tmp_path: Path) -> None:
     run = bare_run(tmp_path)
-    together = threading.Barrier(4, timeout=60)  # where one fails, the others do not wait for it
+    together = threading.Barrier(4, timeout=600)  # where one fails, the others do not wait for it
 
     def drive(seed: int) -> None:
         own, history = Run.open(run.storage), History(run, seed)

@@ -181,7 +181,7 @@ def test_pruning_keeps_what_was_used_last(folder: Path) -> None:
         os.utime(folder / f"k{k}.npz", (k, k))
         if k == 2:
             assert SHELF.load("k0") is not None  # used again
-            assert (folder / "k0.npz").stat().st_mtime > time.time() - 60
+            assert (folder / "k0.npz").stat().st_mtime > time.time() - 3600
     assert sorted(path.name for path in folder.iterdir()) == ["k0.npz", "k4.npz", "k5.npz"]
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.request import Request, urlopen
 
@@ -21,12 +19,11 @@ from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.jobs.detach import hand_over
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import open_storage
+from tests.datagen.jobs.conftest import SECRET, Detached
 from tests.other_user import as_another_user, needs_root, traces_of
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, submit_arguments
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-SECRET = "AWS_SECRET_ACCESS_KEY"
 # A job: says which credentials its driver and a worker have, and ends when it is let go.
 PROGRAM = f"""
 import hashlib, json, os, sys, time
@@ -43,29 +40,21 @@ with job_environment(), ray_cluster(RaySettings(address="auto")) as ray:
 """
 
 
-@pytest.fixture(scope="module")
-def first_key() -> str:
-    """The key of the shell that starts the head."""
-    return secrets.token_hex(16)
+@pytest.fixture
+def run(detached: Detached) -> Path:
+    """A run made by a detached job of a shell with a key, which has ended."""
+    while not (jobs := Jobs(open_storage(detached.run)).all()) or jobs[0].health() != "ended":
+        time.sleep(0.2)
+    head, _ = head_and_jobs()
+    while Path(head.folder, f"{jobs[0].record.submission}.json").exists():  # removed as the job's last act
+        time.sleep(0.2)
+    return detached.run
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, first_key: str) -> Iterator[Path]:
-    """A run made by a detached job of a shell with a key; its head stays until the tests are done."""
-    folder = tmp_path_factory.mktemp("detached")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DATAGEN_STATE", str(folder / "state"))
-        patch.setenv(SECRET, first_key)
-        words = [*submit_arguments(folder / "run", PER_SCENE, workers=2), "--detach"]
-        subprocess.run([sys.executable, "-m", "datagen.cli", *words], cwd=REPOSITORY, check=True, timeout=290)
-        try:
-            head, _ = head_and_jobs()
-            while list(Path(head.folder).glob("*.json")):  # removed as the job's last act
-                time.sleep(0.2)
-            assert Jobs(open_storage(folder / "run")).all()[0].health() == "ended"
-            yield folder / "run"
-        finally:
-            stop_head()
+@pytest.fixture
+def first_key(detached: Detached) -> str:
+    """The key of the shell that started the head."""
+    return detached.key
 
 
 def head_and_jobs() -> tuple[Head, RayJobs]:
