@@ -37,7 +37,7 @@ def deep_findings(run: Run, k: int, origin: Origin, rng: np.random.Generator) ->
 
     The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
     Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
-    tolerances, and of scenes what is drawn before any physics (docs/determinism.md). Scenes of another
+    tolerances, and of scenes what is drawn before any physics (docs/explanation/determinism.md). Scenes of another
     run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys of the
     findings are those below the run's own place.
     """

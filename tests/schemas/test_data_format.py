@@ -7,11 +7,11 @@ from pathlib import Path
 from datagen.schemas.data_format import page
 from datagen.schemas.fields import SCHEMAS
 
-PAGE = Path(__file__).parents[2] / "docs" / "data-format.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "data-format.md"
 
 
 def test_the_page_is_up_to_date():
-    assert PAGE.read_text() == page(), "run: python -m schemas.data_format > docs/data-format.md"
+    assert PAGE.read_text() == page(), "run: make docs"
 
 
 def test_every_field_has_a_unit_or_is_a_name_and_says_what_it_means():

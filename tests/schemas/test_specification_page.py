@@ -20,7 +20,9 @@ SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="
 
 
 def test_the_page_is_up_to_date() -> None:
-    assert (REPOSITORY / "docs" / "specification.md").read_text("utf-8") == page(), "run `make docs`"
+    assert (REPOSITORY / "docs" / "reference" / "specification.md").read_text("utf-8") == page(), (
+        "run `make docs`"
+    )
 
 
 def test_its_example_is_the_defaults() -> None:
