@@ -68,9 +68,9 @@ xarray.open_zarr("RUN/data.zarr")
 
 ## Versions
 
-Schema version {SCHEMA_VERSION}. A run keeps the version it was begun with, also under newer programs. A new array
-raises the version (`Field.since`); no stored array is renamed, retyped or removed. The versions of the code that
-makes scenes and labels are in the specification's `engines`, and so in its hash
+Schema version {SCHEMA_VERSION}. A run keeps the version it was begun with, also under newer programs. A new
+array raises the version (`Field.since`); no stored array is renamed, retyped or removed. The versions of
+the code that makes scenes and labels are in the specification's `engines`, and so in its hash
 ([rules for changes](../development/index.md#versions-of-stored-data)).
 """
 

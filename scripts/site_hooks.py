@@ -1,4 +1,4 @@
-"""What the site shows besides the documents: the help of every verb, and the files that examples belong to."""
+"""What the site adds to the documents: the help of every verb, and the file that an example belongs to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ COMMANDS = "reference/command-line.md"
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """A document's text for the site (mkdocs calls this)."""
     if page.file.src_uri == COMMANDS:
-        markdown = markdown.replace("On the site this page also lists all of them.", "They follow below.")
         markdown += "\n## All options\n\n" + command_help()
     return re.sub(r"^```python (?:file|line)=(\S+)$", r'```python title="\1"', markdown, flags=re.MULTILINE)
 
