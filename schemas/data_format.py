@@ -37,7 +37,7 @@ RUN/
 Merged runs of several specifications ([merge](../guides/merge.md)):
 
 ```
-PLACE/
+RUN/
   merged.json                    the specification hashes of its parts, ascending: the order of their rows
   parts/<hash>/                  each part a whole run as above, named by 16 digits of its hash
   data.zarr/                     one store over all parts, which its `parts` attribute lists
