@@ -19,17 +19,17 @@ Run format {FORMAT_VERSION}. A run is a folder (or an object-store prefix):
 
 ```
 RUN/
-  manifest.json                  specification, its hash, schema version, layout, versions; written once
+  manifest.json                  specification, hash, schema version, layout; written once
   plans/<k>.json                 samples wanted; the highest k counts, a run only grows
   shards/<shard>/<attempt>/      an immutable, flat Zarr v3 group with the rows of one shard
-  commits/<shard>.json           written last, create-only: the attempt, every file's size and sha256, cost
-  copies/...                     second copies of the root's records; a commit's is in its attempt's folder
+  commits/<shard>.json           written last, create-only: attempt, digests of files, cost
+  copies/...                     second copies of records; a commit's is in its attempt's folder
   ledger/<attempt>.start.json    an attempt began
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
   quarantine/<shard>.json        a quarantined shard: seeds, causes, stacks
   quarantine/<shard>.lifted-<k>.json  a former quarantine record of a shard that was tried again
-  jobs/<job>.json                a driver that began; .state.json is its state, .stop.json a stop request
-  index/<digest>.json.gz         summaries of settled records: a cache, which may be removed at any time
+  jobs/<job>.json                a driver; .state.json is its state, .stop.json a stop request
+  index/<digest>.json.gz         summaries of settled records: a cache, may be removed
   lineage.json                   of a merged run: the runs that made its shards
   data.zarr/                     after sealing: one flat Zarr v3 store over all committed shards
 ```
@@ -38,7 +38,7 @@ Merged runs of several specifications ([merge](../guides/merge.md)):
 
 ```
 RUN/
-  merged.json                    the specification hashes of its parts, ascending: the order of their rows
+  merged.json                    specification hashes of its parts, in the order of their rows
   parts/<hash>/                  each part a whole run as above, named by 16 digits of its hash
   data.zarr/                     one store over all parts, which its `parts` attribute lists
 ```
