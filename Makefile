@@ -69,9 +69,9 @@ format: venv
 
 docs: venv
 	@mkdir -p build
-	$(BIN)/python -m datagen.schemas.data_format > build/data-format.md
+	$(BIN)/python -m scripts.data_format_page > build/data-format.md
 	mv build/data-format.md docs/reference/data-format.md
-	$(BIN)/python -m datagen.schemas.specification_page > build/specification.md
+	$(BIN)/python -m scripts.specification_page > build/specification.md
 	mv build/specification.md docs/reference/specification.md
 
 # Fails at dead links and at names that are not there. NO_MKDOCS_2_WARNING: an announcement of the theme's authors.

@@ -1,4 +1,4 @@
-"""The data-format page, written from the schemas: `python -m schemas.data_format`."""
+"""Writes docs/reference/data-format.md from the schemas (`make docs`)."""
 
 from __future__ import annotations
 

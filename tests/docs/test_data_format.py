@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datagen.schemas.data_format import page
 from datagen.schemas.fields import SCHEMAS
+from scripts.data_format_page import page
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "data-format.md"
 
