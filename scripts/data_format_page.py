@@ -7,7 +7,7 @@ import sys
 from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
 from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.run_records import FORMAT_VERSION
-from datagen.schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
+from datagen.schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL
 
 _HEAD = f"""# Data format
 
@@ -104,12 +104,12 @@ def page() -> str:
 def _section(schema: RecordSchema, seen: list[RecordSchema]) -> str:
     """A schema's tables; what an earlier one has just so is named and not repeated."""
     sizes = ", ".join(f"{name} {size}" for name, size in schema.sizes.items())
+    axes = [f"Axis lengths (points and objects follow the specification): {sizes}.", ""]
     return "\n".join(
         [
             f"## Schema `{schema.name}`, version {schema.version}",
             "",
-            f"Axis lengths (points and objects follow the specification): {sizes}.",
-            "",
+            *([] if any(other.sizes == schema.sizes for other in seen) else axes),
             *_table("scene", schema.scene_fields, [(other.name, other.scene_fields) for other in seen]),
             "",
             *_table("sample", schema.sample_fields, [(other.name, other.sample_fields) for other in seen]),
@@ -129,22 +129,19 @@ def _table(title: str, fields: Fields, earlier: list[tuple[str, Fields]]) -> lis
     if shared:
         head += [f"The arrays of `{like}`, and:", ""]
     head += [
-        "| array | type | dimensions | unit | frame | range | fill | meaning |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        f"| array | type | dimensions after `{title}` | unit | frame | range | meaning |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     return head + [
-        f"| `{f.name}` | {f.dtype} | {', '.join((title, *f.dims))} | {f.unit} | {f.frame} "
-        f"| {_range(f)} | {fill_value(f)!r} | {f.doc} |"
+        f"| `{f.name}` | {f.dtype} | {', '.join(f.dims)} | {f.unit} | {f.frame} | {_range(f)} | {f.doc} |"
         for f in fields[shared:]
     ]
 
 
 def _range(field: Field) -> str:
-    if field.low is None and field.high is None:
-        return ""
-    low = "" if field.low is None else f"{field.low:g}"
-    high = "" if field.high is None else f"{field.high:g}"
-    return f"{low} .. {high}"
+    if field.low is None:
+        return "" if field.high is None else f"≤{field.high:g}"
+    return f"≥{field.low:g}" if field.high is None else f"{field.low:g}..{field.high:g}"
 
 
 if __name__ == "__main__":
