@@ -1,4 +1,4 @@
-"""What the site adds to the documents: the help of every verb, and the file that an example belongs to."""
+"""What the site adds to the documents: the help of every verb, files of examples, links to whole pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """A document's text for the site (mkdocs calls this)."""
     if page.file.src_uri == COMMANDS:
         markdown += "\n## All options\n\n" + command_help()
-    return re.sub(r"^```python (?:file|line)=(\S+)$", r'```python title="\1"', markdown, flags=re.MULTILINE)
+    markdown = re.sub(
+        r"^```python (?:file|line)=(\S+)$", r'```python title="\1"', markdown, flags=re.MULTILINE
+    )
+    return re.sub(r"^(!\[.*\]\((.*\.png)\))$", r"[\1](\2)", markdown, flags=re.MULTILINE)
 
 
 def command_help() -> str:
