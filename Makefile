@@ -8,7 +8,7 @@ BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
 DEMO := build/demo
 
-.PHONY: help demo paper-small paper test faults lint style types format docs venv clean
+.PHONY: help demo paper-small paper test faults lint style types format docs site venv clean
 .DEFAULT_GOAL := help
 
 help:
@@ -19,7 +19,8 @@ help:
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
-	@echo "make docs    rewrite docs/data-format.md and docs/specification.md from the schemas"
+	@echo "make docs    rewrite the pages of docs/reference that follow from the schemas"
+	@echo "make site    the documents as a site with search (in build/site); dead links fail"
 	@echo "make venv    only the environment (.venv); PYTHON=python3.12 chooses another interpreter"
 	@echo "make clean   remove everything that make made"
 
@@ -78,10 +79,15 @@ format: venv
 
 docs: venv
 	@mkdir -p build
-	$(BIN)/python -m datagen.schemas.data_format > build/data-format.md
-	mv build/data-format.md docs/data-format.md
-	$(BIN)/python -m datagen.schemas.specification_page > build/specification.md
-	mv build/specification.md docs/specification.md
+	$(BIN)/python -m scripts.data_format_page > build/data-format.md
+	mv build/data-format.md docs/reference/data-format.md
+	$(BIN)/python -m scripts.specification_page > build/specification.md
+	mv build/specification.md docs/reference/specification.md
+
+# Fails at dead links and at names that are not there. NO_MKDOCS_2_WARNING: an announcement of the theme's authors.
+site: venv
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "the site is in build/site; to read it with its search: $(BIN)/python -m http.server --bind 127.0.0.1 -d build/site"
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache *.egg-info

@@ -36,7 +36,7 @@ from tests.train.stream_runs import make_stream_run
 REPEATS = 5
 FIELDS = (*SCENES, *SAMPLES, "sample_scene_index")
 STREAMED = (*FIELDS, "scene_index")
-TRAINED_A_SECOND = 4000  # docs/training-data.md
+TRAINED_A_SECOND = 4000  # docs/guides/read-data.md
 ALL = Augmentation(SensorNoise(), DepthHoles(), PointDropout(), ColourJitter(), Rotation())
 
 

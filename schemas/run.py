@@ -1,4 +1,4 @@
-"""A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs/data-format.md).
+"""A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs/reference/data-format.md).
 
 Readers, resume, seal and audit trust commit records alone: a commit is written last and
 create-only, so that of two racing attempts one wins and the other is waste.

@@ -1,6 +1,6 @@
 """The commands of a document, run in order: to fill in what they print, and to test that they do.
 
-    python scripts/console_page.py docs/runs.md --folder build/runs --set ASSETS=../shared/assets --write
+    python scripts/console_page.py docs/tutorials/make-labels.md --folder build/runs --set ASSETS=DIR --write
 
 A block fenced as `console` holds commands after `$ `, their further lines after `> `, and what they print.
 A last line `[exit 1]` tells an exit code other than 0. Progress, which goes to standard error, is left out.

@@ -67,7 +67,7 @@ def main() -> int:
     print("making .venv with pinned libraries; the first time takes some minutes", flush=True)
     pip = create()
     install = ["install", "-qq", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
-    filled = subprocess.run([*pip, *install, "-e", f"{ROOT}[sim,train,detect,dev]"], check=False)
+    filled = subprocess.run([*pip, *install, "-e", f"{ROOT}[sim,train,detect,docs,dev]"], check=False)
     if filled.returncode:
         print("error: pip could not install the pinned libraries; see its message above", file=sys.stderr)
         return 1

@@ -1,4 +1,4 @@
-"""The code on docs/extending.md is real: its modules, its lines and its tests are executed."""
+"""The code on docs/development/extending.md is real: its modules, its lines and its tests are executed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 from datagen import cli
 from tests.small_runs import arrays_of, json_of, make_small_run
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+PAGE = Path(__file__).parents[1] / "docs" / "development" / "extending.md"
 _BLOCK = re.compile(r"^```python (file|line)=(\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _ROOM = {"room_m": [4.5, 4.0], "table_m": [1.2, 0.8], "height_m": 0.75}
 
@@ -65,8 +65,8 @@ def test_each_example_is_one_file_one_line_and_one_test() -> None:
     assert PAGE.read_text().count("```python") == len(shape)  # no block escapes this test
     for kind, place, _ in blocks():
         if kind == "file":  # it would be a new file, beside the others of its kind
-            assert not (PAGE.parents[1] / place).exists()
-            assert (PAGE.parents[1] / place).parent.is_dir()
+            assert not (PAGE.parents[2] / place).exists()
+            assert (PAGE.parents[2] / place).parent.is_dir()
 
 
 def page_tests() -> list[tuple[str, str, str]]:

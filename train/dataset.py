@@ -66,7 +66,7 @@ class SampleStream:
     gives batches of its own, equally many, that together are the epoch. With `shuffle`, scenes are
     shuffled within `buffer_shards` shards; without, they keep their stored order. Two such buffers are
     in memory at most. Runs that lack planned samples are read with `allow_incomplete` alone.
-    docs/training-data.md says what stays the same when what changes.
+    docs/guides/read-data.md says what stays the same when what changes.
 
     InputError names what is missing, foreign or damaged, in the constructor or while reading.
     """

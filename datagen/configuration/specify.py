@@ -120,7 +120,7 @@ def first_of(error: ValidationError, place: str, *section: str) -> InputError:
     first = error.errors()[0]
     field = ".".join((*section, *map(str, first["loc"])))
     mend = (
-        "Take the key out, or correct it: docs/specification.md lists all"
+        "Take the key out, or correct it: docs/reference/specification.md lists all"
         if (first["type"] == "extra_forbidden")
         else "Correct the value"
     )
@@ -161,7 +161,9 @@ def scene_engines(spec: Specification) -> dict[str, str]:
     return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 
 
-def read_toml(path: Path, mend: str = "Give a TOML file as docs/specification.md shows it") -> dict[str, Any]:
+def read_toml(
+    path: Path, mend: str = "Give a TOML file as docs/reference/specification.md shows it"
+) -> dict[str, Any]:
     """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
     data = read_regular(path, _MAX_CONFIG_BYTES, mend)
     try:

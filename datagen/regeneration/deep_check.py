@@ -37,9 +37,9 @@ def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Genera
 
     The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
     Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
-    tolerances, and of scenes what is drawn before any physics (docs/determinism.md). Scenes of another
-    run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys of the
-    findings are those below the run's own place.
+    tolerances, and of scenes what is drawn before any physics (docs/explanation/determinism.md). Scenes of
+    another run that is not there any more are not drawn again. Reads at most 2 k shards, one at a time. Keys
+    of the findings are those below the run's own place.
     """
     shards = sorted(run.committed())
     if not shards or k < 1:

@@ -47,7 +47,7 @@ DRAWN = ("draw", "settle", "observe", "candidates")
 # What is worked out again from stored poses.
 RECOMPUTED = ("candidates", "visibility", "grasps", "plan", "execute", "labels")
 
-# What rows of another platform or version may differ by (docs/determinism.md).
+# What rows of another platform or version may differ by (docs/explanation/determinism.md).
 PX_TOLERANCE = 3
 DISTANCE_TOLERANCE_M = 2e-6
 SCORE_TOLERANCE = 2e-5

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError, choices
 if TYPE_CHECKING:
     from datagen.train.augment import Augmentation
 
-_MEND = "Give a TOML file as docs/training.md shows it"
+_MEND = "Give a TOML file as docs/guides/train.md shows it"
 
 
 def model_sizes(words: Sequence[str]) -> dict[str, Any]:

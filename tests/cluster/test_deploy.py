@@ -21,7 +21,7 @@ from tests.cluster.rayjob_schema import RAY_JOB
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEPLOY = REPOSITORY / "cluster" / "deploy"
-PAGES = REPOSITORY / "docs" / "clusters"
+PAGES = REPOSITORY / "docs" / "guides" / "clusters"
 DOCKERFILE = DEPLOY / "kubernetes" / "Dockerfile"
 SLURM = DEPLOY / "slurm" / "datagen.sbatch"
 LAUNCHERS = ("aws", "on-premise")

@@ -126,7 +126,7 @@ def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.Cap
 
 CONFIGS: list[tuple[str, list[str]]] = [
     ("n_clutter = 3", ["n_clutter", "Take the key out"]),
-    ("[scene]\nclutter = 3", ["scene.clutter", "docs/specification.md"]),
+    ("[scene]\nclutter = 3", ["scene.clutter", "docs/reference/specification.md"]),
     ("[scene]\nn_clutter = -1", ["scene.n_clutter", "-1"]),
     ("[scene]\nn_clutter = 31", ["scene.n_clutter", "30"]),
     ("[scene]\nn_clutter = 'six'", ["scene.n_clutter", "six", "integer"]),

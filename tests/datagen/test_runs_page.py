@@ -1,4 +1,4 @@
-"""The commands of docs/runs.md do what the page shows, at small size."""
+"""The commands of docs/tutorials/make-labels.md do what the page shows, at small size."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_page_of_runs(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RUNS", runs)
     script = _script()
-    commands = script.commands_of((REPOSITORY / "docs" / "runs.md").read_text())
+    commands = script.commands_of((REPOSITORY / "docs" / "tutorials" / "make-labels.md").read_text())
     assert len(commands) >= 10
     environment = {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",

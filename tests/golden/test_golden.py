@@ -125,7 +125,7 @@ def test_verbs_that_read_take_it(
 def test_its_rows_still_follow_from_its_specification(golden: Golden) -> None:
     """Bit for bit where machine and engines are those that made it, else within the tolerances."""
     if not golden.has_its_world:
-        pytest.skip("the built-in world is another one since: docs/relabel-and-replay.md")
+        pytest.skip("the built-in world is another one since: docs/explanation/determinism.md")
     for run in open_runs(golden.merged):
         origin = open_sources(run, needs_scenes=False)
         assert list(deep_findings(run, 6, origin, np.random.default_rng(0))) == []

@@ -1,4 +1,4 @@
-"""Plain methods that a model has to beat: docs/baselines.md says what each is."""
+"""Plain methods that a model has to beat: docs/explanation/baselines.md says what each is."""
 
 from __future__ import annotations
 

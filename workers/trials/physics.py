@@ -34,7 +34,7 @@ with warnings.catch_warnings():
 THING, STILL, PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
 ARM, SHOULDER, CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
-# With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep (docs/sim.md).
+# With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep (docs/explanation/trials.md).
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 40, 8
 # PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
 CONTACT_OFFSET_M = 0.005

@@ -25,7 +25,7 @@ from tests.train.prediction.seen_scenes import Seen, draw_seen, sensor_frame, wr
 
 ROBOT = RobotSize(camera_height_m=1.2, base_height_m=0.7, arm_reach_m=0.9)
 GRID = 9
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "predict.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "guides" / "predict.md"
 
 
 def of(scorer: Scorer, *frames: object, **more: object) -> Prediction:

@@ -1,0 +1,26 @@
+"""What the site adds to the documents: the help of every verb, files of examples, links to whole pictures."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from datagen.cli import build_app
+
+COMMANDS = "reference/command-line.md"
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """A document's text for the site (mkdocs calls this)."""
+    if page.file.src_uri == COMMANDS:
+        markdown += "\n## All options\n\n" + command_help()
+    markdown = re.sub(
+        r"^```python (?:file|line)=(\S+)$", r'```python title="\1"', markdown, flags=re.MULTILINE
+    )
+    return re.sub(r"^(!\[.*\]\((.*\.png)\))$", r"[\1](\2)", markdown, flags=re.MULTILINE)
+
+
+def command_help() -> str:
+    """A section for every verb, from the command line's own help."""
+    text = build_app().generate_docs(heading_level=2)
+    return text[text.index("### datagen ") :]
