@@ -20,16 +20,17 @@ from datagen.drawing.floor_plan import (
     draw_scores,
 )
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
-from datagen.drawing.panels import draw_frame, new_sheet, save_sheet, scene_facts, write_facts
-from datagen.drawing.scene_picture import best_clear
+from datagen.drawing.scene_picture import best_clear, scene_facts
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.recall import RecalledScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")
+_PICKS = ("highest H", "best")
 _ROBOTS = 4  # more circles and lines would hide each other
 
 
@@ -47,15 +48,14 @@ def draw_arm_picture(
     figure = new_sheet(title, 9.2)
     upper, lower, numbers = np.asarray(figure.subfigures(3, 1, height_ratios=(3.6, 3.7, 1.75))).tolist()
     frame_ax, outcome_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.05, 1, 1))
-    draw_frame(frame_ax, frame)
+    draw_frame(frame_ax, frame.rgb, frame.body == 1)
     handles, picks = _draw_maps(upper, outcome_ax, score_ax, recalled, samples, robots, tau)
     views, legend = np.asarray(lower.subfigures(1, 2, width_ratios=(1.75, 1))).tolist()
     _draw_grasps(views, recalled, record, samples, robots[0])
     draw_legend(legend.subplots(), handles, "base poses: filled where the base fits", picks)
-    facts = scene_facts(recalled, record)
-    write_facts(
-        numbers.subplots(1, 2), (facts + _robots(samples, robots), _candidates(samples) + _picks(samples))
-    )
+    columns = numbers.subplots(1, 2)
+    write_facts(columns[0], scene_facts(recalled, record) + _robots(samples, robots))
+    write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
 
 
@@ -158,12 +158,6 @@ def _candidates(samples: Columns) -> list[tuple[str, str]]:
             f"calls {int(called.sum())} good, {int((called & label).sum())} are; misses {missed} of {good}",
         ),
     ]
-
-
-def _picks(samples: Columns) -> list[tuple[str, str]]:
-    """What became of the best success and of the highest score."""
-    by_score, best = (row for row, _ in _picked(samples))
-    return [("best", _described(samples, best)), ("highest H", _described(samples, by_score))]
 
 
 def _described(samples: Columns, row: int | None) -> str:

@@ -17,11 +17,11 @@ from datagen.drawing.floor_plan import (
     half_width_m,
     object_outlines,
 )
-from datagen.drawing.panels import draw_frame, new_sheet, save_sheet
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
 from datagen.schemas.styles import LABEL_STYLES, SAMPLE
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
 from datagen.workers.scenes.draw import render_frame
 from datagen.workers.scenes.recall import RecalledScene
 
@@ -40,7 +40,7 @@ def draw_replay(
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
         frame = render_frame(spec.observation, recalled.stage, recalled.camera, rng)
-        draw_frame(panels[0, column], frame, f"{name}: RGB frame")
+        draw_frame(panels[0, column], frame.rgb, frame.body == 1, f"{name}: RGB frame")
         handles = _draw_candidates(panels[1, column], recalled, rows, row)
         panels[1, column].set_title(f"{name}: candidates by label")
     _draw_over(panels[0, 2], stored[0], made[0])

@@ -18,9 +18,9 @@ from datagen.drawing.floor_plan import (
     draw_scores,
     half_width_m,
 )
-from datagen.drawing.panels import draw_frame, new_sheet, save_sheet, scene_facts, write_facts
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.styles import BEST_BY_SCORE, TARGET
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.scenes.recall import RecalledScene
 
@@ -40,7 +40,7 @@ def draw_scene_picture(
     figure = new_sheet(title, 8.0)
     upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(6.4, 1.6))).tolist()
     panels = upper.subplots(2, 3, width_ratios=(1.1, 1, 1))
-    draw_frame(panels[0, 0], frame)
+    draw_frame(panels[0, 0], frame.rgb, frame.body == 1)
     _draw_depth(upper, panels[1, 0], frame)
 
     xy = np.asarray(samples["base_xy_m"], np.float64)
@@ -59,7 +59,9 @@ def draw_scene_picture(
     panels[1, 1].remove()
     _draw_cloud(upper.add_subplot(2, 3, 5, projection="3d"), record)
     draw_legend(panels[1, 2], legend, "base poses", [BEST_BY_SCORE] if best is not None else [])
-    write_facts(lower.subplots(1, 2), (_scene(recalled, record), _candidates(samples)))
+    columns = lower.subplots(1, 2)
+    write_facts(columns[0], _scene(recalled, record))
+    write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
 
 
@@ -67,6 +69,19 @@ def best_clear(score: Any, clear: Any) -> int | None:
     """Row of the highest score among clear candidates, or None when none is clear."""
     rows = np.flatnonzero(clear)
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
+
+
+def scene_facts(recalled: RecalledScene, record: Columns) -> list[tuple[str, str]]:
+    """House, room, support and objects of a scene."""
+    height_m = float(np.asarray(record["T_world_support"])[2, 3])
+    target = recalled.models[0]
+    return [
+        ("house", str(record["house_id"])),
+        ("room", f"{record['room_type']} ({record['room_id']})"),
+        ("support", f"{record['support_type']}, {height_m:.3f} m high"),
+        ("target", f"{target.name}, {1000 * target.mass_kg:.0f} g"),
+        ("clutter", ", ".join(m.name for m in recalled.models[1:]) or "none"),
+    ]
 
 
 def _draw_depth(figure: Any, axes: Axes, frame: Frame) -> None:

@@ -159,7 +159,7 @@ def breakdown_tables(report: Report, told: Report, most_methods: int | None = No
             for row in told["breakdown"]
             if row["by"] == heading
         ]
-        title = f"accuracy (%) by {heading} ({told['candidates']})"
+        title = f"accuracy by {heading} ({told['candidates']}), in %"
         yield Shown(title, (heading, "count", "good (%)", *names), rows)
 
 

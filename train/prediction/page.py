@@ -34,7 +34,7 @@ def page_of(prediction: Prediction) -> str:
         paper_bgcolor="#ffffff",
         scene={
             "aspectmode": "data",
-            "camera": {"eye": {"x": 1.4, "y": -1.4, "z": 1.1}},
+            "camera": {"eye": {"x": 1.45, "y": -1.45, "z": 1.15}, "center": {"x": 0, "y": 0, "z": -0.12}},
             **{f"{axis}axis": {"title": f"{axis} [m]", "nticks": 5} for axis in "xyz"},
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},

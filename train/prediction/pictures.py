@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import io
-import textwrap
 from typing import IO, Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from PIL import Image
 
 from datagen.schemas.specification import CandidateParams
 from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
@@ -25,31 +20,27 @@ from datagen.train.prediction.answer import told
 from datagen.train.prediction.candidates import BLOCKED, CLEAR, STATES, UNSEEN
 from datagen.train.prediction.predict import Prediction
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
 _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}
 _ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9}
 _SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3}  # of a cell's side
 _BASE_RADIUS_M = CandidateParams().base_radius_m
 _MOST_POINTS = 10_000
-_FACT_CHARACTERS, _HEAD_CHARACTERS = 66, 8
 
 
 def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     """Write the picture as PNG: frame and plan above, numbers and perspective view below."""
-    figure = Figure(figsize=(11, 8.8), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"Base poses scored by {prediction.scorer}: {prediction.sure}", fontsize=13)
+    figure = new_sheet(f"Base poses scored by {prediction.scorer}: {prediction.sure}", 8.8)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.1))
     _draw_frame(frame, prediction)
-    _write_facts(facts, prediction)
+    write_facts(facts, told(prediction), head_characters=8)
     upper, lower = np.asarray(right.subfigures(2, 1, height_ratios=(1.45, 1))).tolist()
     plan = upper.subplots()
     upper.colorbar(_draw_plan(plan, prediction), ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
     _draw_perspective(lower.add_subplot(projection="3d"), prediction)
-    with io.BytesIO() as drawn:
-        figure.savefig(drawn, format="png")
-        Image.open(drawn).convert("RGB").save(out, format="png", optimize=True)
+    save_sheet(figure, out)
 
 
 def shown_rows(prediction: Prediction, most: int, around_m: float) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -67,10 +58,7 @@ def _draw_frame(axes: Axes, prediction: Prediction) -> None:
     if frame is None or frame.image is None or frame.image.mask is None:
         axes.text(0.5, 0.5, "a cloud without a picture", ha="center", transform=axes.transAxes)
         return
-    axes.imshow(frame.image.rgb)
-    for colour, width in ((TARGET.edge, 3.2), (TARGET.colour, 1.5)):
-        axes.contour(frame.image.mask, levels=[0.5], colors=[colour], linewidths=width)
-    axes.set_title("RGB frame, target outlined")
+    draw_frame(axes, frame.image.rgb, frame.image.mask)
 
 
 def _half_m(prediction: Prediction) -> float:
@@ -182,13 +170,3 @@ def _side_m(prediction: Prediction) -> float:
 def _square(xy: F64, side: float) -> F64:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2 + xy
     return np.column_stack([corners, np.full(4, 0.005)])
-
-
-def _write_facts(axes: Axes, prediction: Prediction) -> None:
-    axes.set_axis_off()
-    indent = " " * _HEAD_CHARACTERS
-    lines = [
-        textwrap.fill(f"{head:<{_HEAD_CHARACTERS}}{text}", _FACT_CHARACTERS, subsequent_indent=indent)
-        for head, text in told(prediction)
-    ]
-    axes.text(0, 1, "\n".join(lines), va="top", family="monospace", fontsize=9, transform=axes.transAxes)
