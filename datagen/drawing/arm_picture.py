@@ -1,4 +1,4 @@
-"""One picture of a scene labelled by an arm: frame, outcome map beside score map, grasps, numbers."""
+"""One picture of a scene labelled by an arm: frame, maps of outcomes and of scores, grasps, numbers."""
 
 from __future__ import annotations
 
@@ -8,24 +8,30 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from datagen.drawing.floor_plan import draw_camera, draw_house, draw_objects, draw_scores, frame_axes
+from datagen.drawing.floor_plan import (
+    Handle,
+    draw_legend,
+    draw_outcomes,
+    draw_pick,
+    draw_plan,
+    draw_reach,
+    draw_scores,
+)
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
-from datagen.drawing.outcome_colours import LOOKS
-from datagen.drawing.outcome_map import draw_outcome_legend, draw_outcomes, draw_pick, draw_reach
-from datagen.drawing.scene_picture import best_clear, draw_frame, object_outlines, wrapped
+from datagen.drawing.scene_picture import best_clear, scene_facts
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")
+_PICKS = ("highest H", "best")
 _ROBOTS = 4  # more circles and lines would hide each other
-_BEST_COLOUR, _H_COLOUR = "gold", "#49c0f0"
 
 
 def draw_arm_picture(
@@ -35,38 +41,22 @@ def draw_arm_picture(
     record: Columns,
     samples: Columns,
     robots: Sequence[Robot],
+    tau: float,
     out: Path,
 ) -> None:
     """Write the picture of a scene of `plan` or `sim`; `robots` are the first of its candidates'."""
-    figure = Figure(figsize=(20, 12.4), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=14)
-    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1.12, 1))).tolist()
-    frame_ax, outcome_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.0, 1, 1.12))
-    draw_frame(frame_ax, frame)
-    _draw_maps(upper, outcome_ax, score_ax, recalled, record, samples, robots)
-
-    parts = np.asarray(lower.subfigures(1, 3, width_ratios=(1.75, 1.15, 1.25)))
-    grasps, legend, numbers = parts.tolist()
-    views = grasps.subplots(1, 2)
-    used = used_grasps(samples["T_target_tcp"][samples["outcome"] == _SUCCESS])
-    sheet = support_sheet(np.asarray(record["T_world_support"]), np.asarray(record["support_size_m"]))
-    scale = draw_grasps((views[0], views[1]), recalled, sheet, robots[0].gripper, used)
-    if scale is None:
-        views[0].set_xlabel("none succeeded")
-    else:
-        views[0].set_xlabel(f"{len(used.count)} different grasps in {int(used.count.sum())} successes")
-        grasps.colorbar(
-            scale,
-            ax=views,
-            location="bottom",
-            shrink=0.5,
-            label="successes with this grasp",
-            ticks=MaxNLocator(integer=True),
-        )
-    draw_outcome_legend(legend.subplots(), samples["outcome"])
-    _write_numbers(numbers.subplots(), recalled, record, samples, robots)
-    figure.savefig(out)
+    figure = new_sheet(title, 9.2)
+    upper, lower, numbers = np.asarray(figure.subfigures(3, 1, height_ratios=(3.6, 3.7, 1.75))).tolist()
+    frame_ax, outcome_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.05, 1, 1))
+    draw_frame(frame_ax, frame.rgb, frame.body == 1)
+    handles, picks = _draw_maps(upper, outcome_ax, score_ax, recalled, samples, robots, tau)
+    views, legend = np.asarray(lower.subfigures(1, 2, width_ratios=(1.75, 1))).tolist()
+    _draw_grasps(views, recalled, record, samples, robots[0])
+    draw_legend(legend.subplots(), handles, "base poses: filled where the base fits", picks)
+    columns = numbers.subplots(1, 2)
+    write_facts(columns[0], scene_facts(recalled, record) + _robots(samples, robots))
+    write_facts(columns[1], _candidates(samples))
+    save_sheet(figure, out)
 
 
 def best_success(samples: Columns) -> int | None:
@@ -93,88 +83,97 @@ def _draw_maps(
     outcome_ax: Axes,
     score_ax: Axes,
     recalled: ReconstructedScene,
-    record: Columns,
     samples: Columns,
     robots: Sequence[Robot],
-) -> None:
-    centre = np.asarray(record["target_center_m"], np.float64)
+    tau: float,
+) -> tuple[list[Handle], list[Style]]:
+    """Draw candidates by outcome and by score; returns the legend of both, and the picks."""
+    centre = recalled.target_center_m
     xy = np.asarray(samples["base_xy_m"], np.float64)
-    outlines = object_outlines(recalled)
-    half = float(np.abs(xy - centre[:2]).max()) + 0.12
-    for axes in (outcome_ax, score_ax):
-        draw_house(axes, recalled.house.house)
-        draw_objects(axes, outlines)
-        draw_camera(axes, recalled.camera)
-        frame_axes(axes, centre, half)
-        axes.set_anchor("N")
-    draw_outcomes(outcome_ax, xy, samples["outcome"], samples["base_is_clear"])
-    scale = draw_scores(score_ax, xy, samples["heuristic_score"], None)
-    best, by_h = best_success(samples), best_clear(samples["heuristic_score"], samples["base_is_clear"])
-    for axes in (outcome_ax, score_ax):
-        for robot in robots:
-            draw_reach(axes, centre[:2], reach_radius_m(robot, float(centre[2])))
-        if by_h is not None:
-            draw_pick(axes, xy[by_h], _H_COLOUR, "highest H that is clear")
-        if best is not None:
-            draw_pick(axes, xy[best], _BEST_COLOUR, "best success")
-        axes.plot([], [], ls=(0, (5, 3)), color="#1b3a6b", label="reach")
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=4, fontsize=9, frameon=False)
-    outcome_ax.set_title("candidates by outcome")
-    score_ax.set_title("the same candidates by the heuristic's score H")
-    figure.colorbar(scale, ax=score_ax, shrink=0.7, label="H")
-
-
-def _write_numbers(
-    axes: Axes, recalled: ReconstructedScene, record: Columns, samples: Columns, robots: Sequence[Robot]
-) -> None:
-    axes.set_axis_off()
-    label, by_h = np.asarray(samples["label"]), np.asarray(samples["heuristic_label"])
-    clear = np.asarray(samples["base_is_clear"])
-    others = len(np.unique(samples["robot_index"])) - len(robots)
-    called = by_h.astype(bool) & clear
-    positive = int(label.sum())
-    inside = samples["outcome"] != tuple(OUTCOMES).index("out_of_reach")
-    near = clear & inside
-    target, height_m = recalled.models[0], float(np.asarray(record["T_world_support"])[2, 3])
-    lines = [
-        f"house      {record['house_id']}",
-        f"room       {record['room_type']} ({record['room_id']})",
-        f"support    {record['support_type']}, {height_m:.3f} m high",
-        f"target     {target.name}, {1000 * target.mass_kg:.0f} g",
-        *wrapped("clutter    ", ", ".join(m.name for m in recalled.models[1:]), 56),
-        *(f"robot      {r.name}, reach {r.reach_m:.2f} m, mount {r.base_height_m:.2f} m" for r in robots[:4]),
-        *([f"           and {others} more"] if others else []),
-        "",
-        f"candidates {len(label)}, of them {int(clear.sum())} clear, {int(near.sum())} clear and in reach",
-        f"positive   {positive} ({100 * label.mean():.1f}%)",
-        f"           {100 * label[near].mean() if near.any() else 0:.0f}% of those clear and in reach",
-        f"H calls    {int(called.sum())} clear ones good, right in {int((called & label).sum())}",
-        f"           misses {int((label & ~called).sum())} of the {positive} positive",
-        "",
-        *_picked("best       ", best_success(samples), samples),
-        *_picked("highest H  ", best_clear(samples["heuristic_score"], clear), samples),
+    half_m = float(np.abs(xy - centre[:2]).max()) + 0.12
+    draw_plan(outcome_ax, recalled, half_m, faded=True)
+    draw_plan(score_ax, recalled, half_m)
+    handles = draw_outcomes(outcome_ax, xy, samples["outcome"], samples["base_is_clear"])
+    scale = draw_scores(score_ax, xy, samples["heuristic_score"], tau)
+    figure.colorbar(scale, ax=[outcome_ax, score_ax], shrink=0.8, label=f"H (good from {tau:.2g} on)")
+    reach = [
+        (f"{robot.name} {k}" if len(robots) > 1 else robot.name, reach_radius_m(robot, float(centre[2])))
+        for k, robot in enumerate(robots)
     ]
-    axes.text(0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=10, transform=axes.transAxes)
+    marked = [(row, style) for row, style in _picked(samples) if row is not None]
+    for axes in (outcome_ax, score_ax):
+        circles = draw_reach(axes, centre[:2], reach)
+        for row, style in marked:
+            draw_pick(axes, xy[row], style)
+    outcome_ax.set_title("candidates by outcome")
+    score_ax.set_title("candidates by score H")
+    return handles + circles, [style for _, style in marked]
 
 
-def _picked(head: str, row: int | None, samples: Columns) -> list[str]:
-    """What became of one candidate."""
+def _draw_grasps(
+    figure: Any, recalled: RecalledScene, record: Columns, samples: Columns, robot: Robot
+) -> None:
+    views = figure.subplots(1, 2)
+    used = used_grasps(samples["T_target_tcp"][samples["outcome"] == _SUCCESS])
+    sheet = support_sheet(np.asarray(record["T_world_support"]), np.asarray(record["support_size_m"]))
+    scale = draw_grasps((views[0], views[1]), recalled, sheet, robot.gripper, used)
+    if scale is None:
+        views[0].set_xlabel("none succeeded")
+        return
+    words = (
+        f"candidates that succeed with a grasp ({len(used.count)} grasps, {int(used.count.sum())} successes)"
+    )
+    ticks = MaxNLocator(integer=True)
+    figure.colorbar(scale, ax=views, location="bottom", shrink=0.6, aspect=35, label=words, ticks=ticks)
+
+
+def _picked(samples: Columns) -> list[tuple[int | None, Style]]:
+    by_score = best_clear(samples["heuristic_score"], samples["base_is_clear"])
+    return [(by_score, BEST_BY_SCORE), (best_success(samples), BEST)]
+
+
+def _robots(samples: Columns, robots: Sequence[Robot]) -> list[tuple[str, str]]:
+    facts = [
+        (f"robot {k}", f"{robot.name}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high")
+        for k, robot in enumerate(robots)
+    ]
+    others = len(np.unique(samples["robot_index"])) - len(robots)
+    return facts + ([("", f"and {others} more robots")] if others else [])
+
+
+def _candidates(samples: Columns) -> list[tuple[str, str]]:
+    label, clear = np.asarray(samples["label"]), np.asarray(samples["base_is_clear"])
+    called = np.asarray(samples["heuristic_label"]).astype(bool) & clear
+    near = clear & (samples["outcome"] != tuple(OUTCOMES).index("out_of_reach"))
+    good, share = int(label.sum()), 100 * label[near].mean() if near.any() else 0.0
+    missed = int((label & ~called).sum())
+    return [
+        (
+            "candidates",
+            f"{len(label)}, {int(clear.sum())} where the base fits, {int(near.sum())} also in reach",
+        ),
+        ("successes", f"{good} ({100 * label.mean():.1f}%; {share:.0f}% where the base fits, in reach)"),
+        (
+            "H",
+            f"calls {int(called.sum())} good, {int((called & label).sum())} are; misses {missed} of {good}",
+        ),
+    ]
+
+
+def _described(samples: Columns, row: int | None) -> str:
     if row is None:
-        return [f"{head}none"]
+        return "none"
     x, y = samples["base_xy_m"][row]
     name = tuple(OUTCOMES)[int(samples["outcome"][row])]
-    lines = [f"{head}candidate {row} at ({x:.2f}, {y:.2f}) m, H {samples['heuristic_score'][row]:.2f}"]
-    lines.append(f"           {name}: {LOOKS[name].words}")
+    text = f"candidate {row} at ({x:.2f}, {y:.2f}) m, H {samples['heuristic_score'][row]:.2f}: {name}"
     path_rad, clear_cm = samples["path_length_rad"][row], 100 * samples["path_clearance_m"][row]
-    facts = [f"path {path_rad:.1f} rad long, {clear_cm:.1f} cm clear"]
-    if "trials" in samples and samples["trials"][row]:
-        facts.append(f"lifted {int(samples['successes'][row])} of {int(samples['trials'][row])} times")
-        facts.append(
-            f"lift {100 * samples['lift_m'][row]:.1f} cm, slip {100 * samples['slip_m'][row]:.1f} cm"
-        )
     if path_rad > 0:
-        lines += [f"           {fact}" for fact in facts]
-    return lines
+        text += f"; path {path_rad:.1f} rad long, {clear_cm:.1f} cm clear"
+        if "trials" in samples and samples["trials"][row]:
+            lift_cm, slip_cm = (100 * samples[key][row] for key in ("lift_m", "slip_m"))
+            text += f"; lifted {int(samples['successes'][row])} of {int(samples['trials'][row])} times, "
+            text += f"lift {lift_cm:.1f} cm, slip {slip_cm:.1f} cm"
+    return text
 
 
 def robots_of(samples: Columns) -> list[tuple[float, float]]:

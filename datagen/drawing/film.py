@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from PIL import ImageColor
 
 from datagen.drawing.film_camera import Shot, Subject, choose_shot, nothing, scaled_camera
 from datagen.drawing.posed_robot import RobotBodies
+from datagen.schemas.styles import TARGET
 from datagen.workers.geometry.mesh import F64, U8
 from datagen.workers.rendering.embree_renderer import cast_pixels
 from datagen.workers.rendering.frame import Camera
@@ -24,7 +26,7 @@ Told = tuple[tuple[int, str], ...]  # rows of a recording, and what they are
 _WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the middle of what it shows
 _LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
 _FOLLOWED_M = 1.0  # a target that fell farther is not kept in the picture
-OUTLINE_RGB = (255, 45, 111)  # the target's, as in the frame of every scene's picture
+OUTLINE_RGB = ImageColor.getrgb(TARGET.colour)
 
 # Moments that tell a trial: phase, share of it, words.
 _MOMENTS = (

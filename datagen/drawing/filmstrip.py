@@ -11,6 +11,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from datagen.drawing.film import OUTLINE_RGB, Film, pictures
 from datagen.drawing.film_camera import Shot
+from datagen.schemas.styles import PHASE_COLOURS
 from datagen.workers.geometry.mesh import U8
 
 # Sizes of the far and the near view, (width, height), that suit a sheet and a film.
@@ -18,16 +19,11 @@ SHEET_WIDE_PX, SHEET_NEAR_PX = (460, 345), (460, 276)
 MOTION_WIDE_PX, MOTION_NEAR_PX = (520, 400), (340, 400)
 
 _COLUMNS, _SHARPNESS = 4, 2
-_GAP_PX, _CAPTION_PX, _TITLE_PX, _LINE_PX = 10, 28, 44, 26
+_GAP_PX = 10
 _FRAMES_PER_S, _MOST_FRAMES, _HOLD_MS = 10.0, 90, 1500
-_PAPER, _INK, _PALE = (255, 255, 255), (20, 20, 20), (105, 105, 105)
-_PHASE_RGB = {
-    "reach": (120, 144, 190),
-    "approach": (240, 170, 60),
-    "close": (225, 95, 60),
-    "lift": (60, 160, 95),
-    "hold": (20, 105, 60),
-}
+_PAPER, _INK, _PALE = "#ffffff", "#141414", "#555555"
+# Heights of letters, in pixels. Pages show a sheet at less than half its width.
+_SHEET_TEXT_PX, _MOTION_TEXT_PX = 27, 15
 
 
 @dataclass(frozen=True)
@@ -41,25 +37,27 @@ class Title:
 
 def write_sheet(film: Film, title: Title, out: Path) -> None:
     """Moments in rows of four: the far view, below it the near one."""
-    told = film.told
+    told, text_px = film.told, _SHEET_TEXT_PX
     (w, h), (_, near_h) = _size(film.wide), _size(film.near)
-    top = _TITLE_PX + _LINE_PX * len(title.lines) + _GAP_PX
-    band = _CAPTION_PX + h + near_h + 2 * _GAP_PX
+    top, caption_px = _title_px(title, text_px), 2 * round(1.3 * text_px) + _GAP_PX
+    band = caption_px + h + near_h + 2 * _GAP_PX
     columns = max(2, min(_COLUMNS, len(told)))  # two have room for the title
     width = _GAP_PX + columns * (w + _GAP_PX)
     sheet = Image.new("RGB", (width, top + band * -(-len(told) // _COLUMNS)), _PAPER)
     draw = ImageDraw.Draw(sheet)
-    _write_title(draw, title, _GAP_PX)
+    _write_title(draw, title, text_px)
     views = pictures(film, [moment for moment, _ in told], _SHARPNESS)
     for k, ((moment, words), (wide, near)) in enumerate(zip(told, views, strict=True)):
         x = _GAP_PX + (k % _COLUMNS) * (w + _GAP_PX)
         y = top + (k // _COLUMNS) * band
-        draw.rectangle((x, y, x + w - 1, y + 5), fill=_PHASE_RGB.get(film.recording.phase[moment], _PALE))
-        draw.text((x, y + 8), f"{k + 1}  {words}", _INK, _font(16, bold=True))
-        draw.text((x + w, y + 10), _state(film, moment), _PALE, _font(13), anchor="ra")
-        sheet.paste(Image.fromarray(wide), (x, y + _CAPTION_PX + 4))
-        sheet.paste(Image.fromarray(near), (x, y + _CAPTION_PX + 7 + h))
-    sheet.save(out)
+        draw.rectangle((x, y, x + w - 1, y + 7), fill=_phase_colour(film, moment))
+        draw.text((x, y + 9), f"{k + 1}  {words}", _INK, _font(text_px, bold=True))
+        time, state = _state(film, moment)
+        draw.text((x + w, y + 9), time, _PALE, _font(text_px - 2), anchor="ra")
+        draw.text((x, y + 9 + round(1.25 * text_px)), state, _PALE, _font(text_px - 2))
+        sheet.paste(Image.fromarray(wide), (x, y + caption_px))
+        sheet.paste(Image.fromarray(near), (x, y + caption_px + 3 + h))
+    sheet.save(out, optimize=True)
 
 
 def write_motion(film: Film, title: Title, out: Path) -> None:
@@ -89,59 +87,64 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
 
 def _swatches(title: Title, width: int) -> U8:
     """Areas of the colours that mean something, so large that a palette keeps them."""
-    kept = [
-        ImageColor.getrgb(title.colour),
-        OUTLINE_RGB,
-        *_PHASE_RGB.values(),
-        *map(_paled, _PHASE_RGB.values()),
-    ]
+    colours = [ImageColor.getrgb(colour)[:3] for colour in (title.colour, *PHASE_COLOURS.values())]
+    kept = [*colours, OUTLINE_RGB, *map(_pale, PHASE_COLOURS.values())]
     return np.repeat(np.array(kept, np.uint8)[:, None, :], 60 * width, axis=1).reshape(-1, width, 3)
 
 
-def _paled(rgb: tuple[int, int, int]) -> tuple[int, int, int]:
-    r, g, b = ((c + 3 * 255) // 4 for c in rgb)
+def _pale(colour: str) -> tuple[int, int, int]:
+    r, g, b = ((c + 3 * 255) // 4 for c in ImageColor.getrgb(colour)[:3])
     return r, g, b
 
 
 def _motion_frame(film: Film, title: Title, moment: int, wide: U8, near: U8) -> Image.Image:
     (w, h), (near_w, _) = _size(film.wide), _size(film.near)
-    top = _TITLE_PX + _LINE_PX * len(title.lines) + _GAP_PX
-    frame = Image.new("RGB", (w + near_w + 3 * _GAP_PX, top + h + _CAPTION_PX + 2 * _GAP_PX), _PAPER)
+    text_px = _MOTION_TEXT_PX
+    top, full = _title_px(title, text_px), w + near_w + _GAP_PX
+    frame = Image.new("RGB", (full + 2 * _GAP_PX, top + h + 2 * text_px + 2 * _GAP_PX), _PAPER)
     draw = ImageDraw.Draw(frame)
-    _write_title(draw, title, _GAP_PX)
+    _write_title(draw, title, text_px)
     frame.paste(Image.fromarray(wide), (_GAP_PX, top))
     frame.paste(Image.fromarray(near), (w + 2 * _GAP_PX, top))
-    y, full = top + h + _GAP_PX, w + near_w + _GAP_PX
-    phases = film.recording.phase
-    for k, phase in enumerate(phases):
+    y, phases = top + h + _GAP_PX, film.recording.phase
+    for k in range(len(phases)):
         x0, x1 = (_GAP_PX + full * j / len(phases) for j in (k, k + 1))
-        colour = _PHASE_RGB.get(phase, _PALE)
-        draw.rectangle((x0, y, x1, y + 5), fill=colour if k <= moment else _paled(colour))
-    draw.text((_GAP_PX, y + 9), film.words(moment), _INK, _font(16, bold=True))
-    draw.text((_GAP_PX + full, y + 10), _state(film, moment), _PALE, _font(13), anchor="ra")
+        colour = _phase_colour(film, k)
+        draw.rectangle((x0, y, x1, y + 5), fill=colour if k <= moment else _pale(colour))
+    draw.text((_GAP_PX, y + 9), film.words(moment), _INK, _font(text_px, bold=True))
+    state = "   ".join(_state(film, moment))
+    draw.text((_GAP_PX + full, y + 9), state, _PALE, _font(text_px - 2), anchor="ra")
     return frame
 
 
-def _write_title(draw: ImageDraw.ImageDraw, title: Title, x: int) -> None:
-    draw.rectangle((x, 14, x + 22, 36), fill=title.colour)
-    draw.text((x + 32, 11), title.head, _INK, _font(22, bold=True))
+def _phase_colour(film: Film, moment: int) -> str:
+    return PHASE_COLOURS.get(film.recording.phase[moment], _PALE)
+
+
+def _title_px(title: Title, text_px: int) -> int:
+    return round((1.9 + 1.4 * len(title.lines)) * text_px) + 2 * _GAP_PX
+
+
+def _write_title(draw: ImageDraw.ImageDraw, title: Title, text_px: int) -> None:
+    chip_px = round(1.3 * text_px)
+    draw.rectangle((_GAP_PX, 14, _GAP_PX + chip_px, 14 + chip_px), fill=title.colour)
+    draw.text((2 * _GAP_PX + chip_px, 11), title.head, _INK, _font(round(1.3 * text_px), bold=True))
     for k, line in enumerate(title.lines):
-        draw.text((x, _TITLE_PX + 4 + k * _LINE_PX), line, _PALE, _font(15))
+        draw.text((_GAP_PX, (1.9 + 1.4 * k) * text_px + _GAP_PX), line, _PALE, _font(text_px))
 
 
 def _size(shot: Shot) -> tuple[int, int]:
     return shot.camera.width_px, shot.camera.height_px
 
 
-def _state(film: Film, moment: int) -> str:
+def _state(film: Film, moment: int) -> tuple[str, str]:
+    """Time, and what hand and target do; empty for poses that are no motion."""
     recording = film.recording
-    if recording.time_s[-1] == recording.time_s[0]:  # poses, not a motion
-        return ""
+    if recording.time_s[-1] == recording.time_s[0]:
+        return "", ""
     rise_cm = round(100 * film.rise_m(moment), 1) + 0.0  # no -0.0
-    return (
-        f"{recording.time_s[moment] - recording.time_s[0]:.1f} s   "
-        f"fingers {100 * recording.opening_m[moment]:.1f} cm   target {rise_cm:+.1f} cm"
-    )
+    seconds = recording.time_s[moment] - recording.time_s[0]
+    return f"{seconds:.1f} s", f"opening {100 * recording.opening_m[moment]:.1f} cm   lift {rise_cm:.1f} cm"
 
 
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:

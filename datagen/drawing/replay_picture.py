@@ -1,4 +1,4 @@
-"""A stored scene beside the same scene drawn again: frames, floor plans with the candidates, what differs."""
+"""A stored scene beside the same scene replayed: frames, floor plans with the candidates, what differs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from datagen.drawing.floor_plan import draw_camera, draw_house, draw_labels, draw_objects, frame_axes
-from datagen.drawing.scene_picture import draw_frame, object_outlines
+from datagen.drawing.floor_plan import (
+    Handle,
+    draw_labels,
+    draw_legend,
+    draw_pick,
+    draw_plan,
+    half_width_m,
+    object_outlines,
+)
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
+from datagen.schemas.styles import LABEL_STYLES, SAMPLE
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
 from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
@@ -24,59 +31,52 @@ Side = tuple[ReconstructedScene, SceneRows]
 def draw_replay(
     report: dict[str, Any], spec: Specification, stored: Side, made: Side, row: int | None, out: Path
 ) -> None:
-    """Write the picture. `report` is that of `datagen replay`; `row` is the candidate that is marked."""
-    figure = Figure(figsize=(19, 11), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 3, width_ratios=(1, 1, 0.9))
-    verdict = "equal, bit for bit" if report["equal"] else "different"
-    figure.suptitle(f"{report['run']}, scene {report['scene']}: {verdict}", fontsize=14)
-    centre = np.asarray(stored[1].record["target_center_m"], np.float64)
-    for column, (name, side) in enumerate((("stored", stored), ("drawn again", made))):
+    """Write the picture. `report` is that of `datagen replay`; `row` is the candidate to mark."""
+    verdict = "equal bit for bit" if report["equal"] else "different"
+    figure = new_sheet(f"Scene {report['scene']} of {report['run']} replayed: {verdict}", 8.2)
+    panels = figure.subplots(2, 3, width_ratios=(1, 1, 1))
+    handles: list[Handle] = []
+    for column, (name, side) in enumerate((("stored", stored), ("replayed", made))):
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
-        draw_frame(axes[0, column], render_frame(spec.observation, recalled.geometry, recalled.camera, rng))
-        axes[0, column].set_title(f"{name}: RGB frame, target outlined")
-        _draw_plan(axes[1, column], recalled, rows, centre, row)
-        axes[1, column].set_title(f"{name}: candidates by label")
-    _draw_over(axes[0, 2], stored[0], made[0], centre)
-    axes[1, 2].set_axis_off()
-    axes[1, 2].text(
-        0.0, 1.0, "\n".join(_lines(report)), va="top", family="monospace", fontsize=10,
-        transform=axes[1, 2].transAxes,
+        frame = render_frame(spec.observation, recalled.geometry, recalled.camera, rng)
+        draw_frame(panels[0, column], frame.rgb, frame.body == 1, f"{name}: RGB frame")
+        handles = _draw_candidates(panels[1, column], recalled, rows, row)
+        panels[1, column].set_title(f"{name}: candidates by label")
+    _draw_over(panels[0, 2], stored[0], made[0])
+    draw_legend(panels[1, 2], handles, "base poses", [] if row is None else [SAMPLE])
+    panels[1, 2].text(
+        0, 0, "\n".join(_lines(report)), va="bottom", family="monospace", fontsize=9,
+        transform=panels[1, 2].transAxes,
     )  # fmt: skip
-    figure.savefig(out)
+    save_sheet(figure, out)
 
 
-def _draw_plan(
-    axes: Axes, recalled: ReconstructedScene, rows: SceneRows, centre: Any, row: int | None
-) -> None:
+def _draw_candidates(
+    axes: Axes, recalled: ReconstructedScene, rows: SceneRows, row: int | None
+) -> list[Handle]:
     xy = np.asarray(rows.samples["base_xy_m"], np.float64)
-    draw_house(axes, recalled.house.house)
-    draw_objects(axes, object_outlines(recalled))
-    draw_camera(axes, recalled.camera)
-    draw_labels(axes, xy, np.asarray(rows.samples["label"]), np.asarray(rows.samples["base_is_clear"]))
+    draw_plan(axes, recalled, half_width_m(recalled))
+    label, clear = (np.asarray(rows.samples[key]) for key in ("label", "base_is_clear"))
+    handles = draw_labels(axes, xy, label, clear)
     if row is not None:
-        axes.plot(*xy[row], marker="*", ms=22, color="gold", mec="black", zorder=10, label="this sample")
-    gap = np.abs(recalled.camera.T_world_camera[:2, 3] - centre[:2]).max()
-    frame_axes(axes, centre, max(1.35, float(gap) + 0.3))
-    axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=8, frameon=False, markerscale=0.7
-    )
+        draw_pick(axes, xy[row], SAMPLE)
+    return handles
 
 
-def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene, centre: Any) -> None:
-    """Both on one plan: where they are equal, no blue is to be seen under the dashes."""
-    for recalled, style, colour, name in (
-        (stored, "-", "#2f6fdd", "stored"),
-        (made, "--", "#d6204e", "drawn again"),
-    ):
+def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene) -> None:
+    """Both on one plan: where they are equal, dashes cover the solid line."""
+    for recalled, style, name in ((stored, "-", "stored"), (made, "--", "replayed")):
         for k, outline in enumerate(object_outlines(recalled)):
             closed = np.vstack([outline, outline[:1]])
             label = name if k == 0 else None
-            axes.plot(*closed.T, ls=style, color=colour, lw=1.8 if style == "-" else 1.4, label=label)
-    frame_axes(axes, centre, 0.45)
-    axes.set_title("objects from above: stored, and drawn again over it")
-    axes.legend(loc="upper right", fontsize=8)
+            colour = LABEL_STYLES[style == "-"].colour
+            axes.plot(*closed.T, ls=style, color=colour, lw=2.4 if style == "-" else 1.4, label=label)
+    x, y = stored.target_center_m[:2]
+    axes.set(xlim=(x - 0.45, x + 0.45), ylim=(y - 0.45, y + 0.45), xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal")
+    axes.set_title("objects from above")
+    axes.legend(loc="upper right")
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
@@ -90,11 +90,11 @@ def _lines(report: dict[str, Any]) -> list[str]:
             f"label {sample['label']}, H = {sample['heuristic_score']:.4f}",
             "",
         ]
-    for title, key in (("drawn again from seeds", "stages"), ("from stored poses", "recomputed")):
+    for title, key in (("replayed from seeds", "stages"), ("recomputed from poses", "recomputed")):
         lines.append(title)
         for stage in report[key]:
             names = ", ".join(d["field"] for d in stage["differences"])
             lines.append(f"  {stage['stage']:<12}{'equal' if stage['equal'] else f'differs: {names}'[:50]}")
         if not report[key]:
-            lines.append("  not here: the run that drew it is not there")
+            lines.append("  not checked: the source run is missing")
     return lines

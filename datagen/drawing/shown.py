@@ -29,7 +29,7 @@ class Shown:
 
     @property
     def title(self) -> str:
-        return f"{self.run}, scene {self.recalled.index}"
+        return f"Scene {self.recalled.index} of {self.run}: {self.target}"
 
     @property
     def frame(self) -> Frame:
@@ -51,7 +51,8 @@ class Shown:
 def draw_heuristic(shown: Shown, out: Path) -> Lines:
     """Frame, depth, floor plans by label and by score, cloud, numbers."""
     record, samples = shown.rows.record, shown.rows.samples
-    draw_scene_picture(shown.title, shown.recalled, shown.frame, record, samples, out)
+    tau = shown.spec.heuristic.tau
+    draw_scene_picture(shown.title, shown.recalled, shown.frame, record, samples, tau, out)
     score, label = samples["heuristic_score"], samples["label"]
     best = best_clear(score, samples["base_is_clear"])
     return [
@@ -64,12 +65,13 @@ def draw_heuristic(shown: Shown, out: Path) -> Lines:
 
 
 def draw_arm(shown: Shown, out: Path) -> Lines:
-    """Frame, outcome map beside score map, grasps, numbers."""
+    """Frame, maps of outcomes and of scores, grasps, numbers."""
     record, samples = shown.rows.record, shown.rows.samples
     assert shown.spec.arm is not None
     name = shown.spec.arm.robot
     robots = [open_robot(name, reach_m, height_m) for reach_m, height_m in robots_of(samples)]
-    draw_arm_picture(shown.title, shown.recalled, shown.frame, record, samples, robots, out)
+    tau = shown.spec.heuristic.tau
+    draw_arm_picture(shown.title, shown.recalled, shown.frame, record, samples, robots, tau, out)
     label, best = samples["label"], best_success(samples)
     return [
         ("positive", f"{int(label.sum())} of {len(label)} candidates"),

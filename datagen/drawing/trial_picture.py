@@ -15,12 +15,12 @@ from datagen.drawing.filmstrip import (
     write_motion,
     write_sheet,
 )
-from datagen.drawing.outcome_colours import LOOKS
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.drawing.retrial import Retrial, try_again
 from datagen.drawing.shown import Lines, Shown
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.styles import OUTCOME_STYLES
 from datagen.workers.labels.arm_labelling import arm_of
 from datagen.workers.scenes.reconstruct import reconstruct_candidates
 
@@ -42,10 +42,10 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
         raise InputError(out, "--out", problem, "Give a name that ends in .png")
     stored = tuple(OUTCOMES)[int(shown.rows.samples["outcome"][row])]
     title = Title(
-        LOOKS[outcome].colour,
+        OUTCOME_STYLES[outcome].colour,
         f"candidate {row}: {outcome} ({_words(retrial)})",
         (
-            f"{shown.title}   target {shown.target}",
+            shown.title,
             f"{arm.robot}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high"
             f"   {_measured(retrial)}" + (f"   stored as {stored}" if stored != outcome else ""),
         ),
@@ -80,7 +80,7 @@ def _candidate(shown: Shown, candidate: int | None) -> int:
 
 def _words(retrial: Retrial) -> str:
     if retrial.trial.outcome != "success":
-        return LOOKS[retrial.trial.outcome].words
+        return OUTCOME_STYLES[retrial.trial.outcome].words
     return "a whole plan" if retrial.result is None else "lifted and held"
 
 

@@ -11,23 +11,30 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 
 from datagen.evaluation_report.svg import new_figure
+from datagen.schemas.styles import BEST, CELL_COLOURS, SCORE_COLOURS, TARGET
 from datagen.train.evaluation.columns import Columns, Example
 from datagen.train.evaluation.grids import picks
 
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
-# Cells by what they are: no room for the base, clear but bad, good.
-_TRUTH = ListedColormap(["#b9b9b9", "#f1d9c9", "#0a9148"])
+_TRUTH = ListedColormap(CELL_COLOURS)
 _REACH_COLOUR = "#1b3a6b"
+GRIDS_CAPTION = (
+    "Scenes drawn at random from those with a good base pose, seen from above; x and y are relative to the "
+    "target. Truth: blue is good, pale orange is bad, grey is where the base collides. Methods: their scores "
+    "where the base fits, from red (lowest) to blue (highest). The pick is a gold star where it is good, a "
+    "white cross where it is bad. The dashed circle is the arm's reach; the target's points are pink."
+)
 F64 = npt.NDArray[np.float64]
 
 
 def draw_examples(
     examples: Sequence[Example], columns: Columns, records: Sequence[Mapping[str, Any]]
 ) -> Figure:
-    """A row a scene: seen from above, the truth, and each method's scores with its pick as a star.
+    """One row per scene: the cloud from above, the truth, and each method's scores with its pick.
 
     Shown are the methods that were trained, and of the baselines the first, up to five in all.
     """
@@ -40,17 +47,20 @@ def draw_examples(
         grid = columns.at(rows)
         seen, truth, *scored = panels[row].tolist()
         _draw_cloud(seen, example, grid)
-        seen.set_ylabel(str(columns.target[example.scene]), fontsize=8)
+        seen.set_ylabel(f"{columns.target[example.scene]}\ny [m]", fontsize=9)
         _draw_truth(truth, grid)
         for ax, name in zip(scored, names, strict=True):
             _draw_scores(ax, grid, grid.scores[name])
         if row == 0:
-            for ax, title in zip(panels[0], ("seen, from above", "truth", *names), strict=True):
+            for ax, title in zip(panels[0], ("cloud", "truth", *names), strict=True):
                 ax.set_title(title, fontsize=10)
+    for ax in panels[-1]:
+        ax.set_xlabel("x [m]", fontsize=9)
     for ax in panels.ravel():
         ax.set_aspect("equal")
-        ax.set_xticks([])
-        ax.set_yticks([])
+        ax.locator_params(nbins=3)
+        ax.tick_params(labelsize=8)
+        ax.label_outer()
     return figure
 
 
@@ -81,7 +91,7 @@ def _draw_cloud(ax: Axes, example: Example, grid: Columns) -> None:
     xyz, rgb = example.points_m[low_first], example.rgb[low_first] / 255
     ax.scatter(xyz[:, 0], xyz[:, 1], s=3, c=rgb, lw=0, rasterized=True)
     target = example.points_m[example.target_mask]
-    ax.scatter(target[:, 0], target[:, 1], s=4, color="#d62728", lw=0, rasterized=True)
+    ax.scatter(target[:, 0], target[:, 1], s=4, color=TARGET.colour, lw=0, rasterized=True)
     _, edges = _cells(grid, np.zeros(len(grid)))
     ax.set_xlim(edges[0], edges[1])
     ax.set_ylim(edges[2], edges[3])
@@ -98,22 +108,24 @@ def _draw_truth(ax: Axes, grid: Columns) -> None:
 def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
     shown = np.where(grid.is_clear & np.isfinite(score), score, np.nan)
     ax.set_facecolor(_TRUTH(0))
-    _draw_image(ax, grid, shown, cmap="RdYlGn")
+    _draw_image(ax, grid, shown, cmap=SCORE_COLOURS)
     _draw_reach(ax, grid)
     ax.plot(0, 0, "+", color="black", ms=8)
     share = picks(score, np.zeros(len(grid), np.int64), grid.is_clear)
     tied = np.flatnonzero(share)
-    # Where no score tells the best apart, the first is shown and their number is said.
+    # Of several best scores the first is shown, with their number.
     pick = tied[0]
     is_good = bool(grid.label[pick])
-    look = {"s": 150, "color": "gold", "edgecolors": "black" if is_good else "#d00000", "lw": 1.1}
-    ax.scatter(*grid.base_xy_m[pick], marker="*", zorder=5, **look)
-    good = float(share[grid.label].sum())
+    colour, marker = (BEST.colour, BEST.marker) if is_good else ("white", "X")
+    ax.scatter(
+        *grid.base_xy_m[pick], marker=str(marker), s=150 if is_good else 90, color=colour, edgecolors="black",
+        lw=1.1, zorder=5,
+    )  # fmt: skip
+    words = "pick is good" if is_good else "pick is bad"
     if len(tied) > 1:
-        words = f"{len(tied)} tied, {100 * good:.0f}% good"
-    else:
-        words = "good" if is_good else "bad"
-    ax.set_xlabel(words, fontsize=8, color="#0a7a3c" if good >= 0.5 else "#c00000")
+        words = f"{len(tied)} tied, {100 * float(share[grid.label].sum()):.0f}% good"
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    ax.text(0.03, 0.03, words, transform=ax.transAxes, fontsize=9, zorder=6, path_effects=halo)
 
 
 def _draw_reach(ax: Axes, grid: Columns) -> None:

@@ -3,70 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from html import escape as html_escape
 
 from datagen.evaluation_report import report_tables as tables
 from datagen.evaluation_report.curves import draw_curves, draw_intervals
-from datagen.evaluation_report.grid_pictures import draw_examples
+from datagen.evaluation_report.grid_pictures import GRIDS_CAPTION, draw_examples
 from datagen.evaluation_report.number_format import Report
 from datagen.evaluation_report.report_tables import TitledTable
 from datagen.evaluation_report.svg import svg_of
-from datagen.schemas.errors import printable
 from datagen.train.evaluation.columns import Gathered
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; margin: 2rem auto; max-width: 76rem;
-  padding: 0 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.25rem; margin-top: 2.4rem; border-bottom: 1px solid #ccc; }
-h3 { font-size: 1.05rem; margin-bottom: .3rem; }
-table { border-collapse: collapse; margin: .4rem 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .15rem .8rem .15rem 0; text-align: right; vertical-align: top; }
-th { font-weight: 600; border-bottom: 1px solid #999; } td { border-bottom: 1px solid #eee; }
-th:first-child, td:first-child, table.text td, table.text th { text-align: left; }
-svg { max-width: 100%; height: auto; } p.note, summary { color: #555; }
-code { font-size: 88%; overflow-wrap: anywhere; }
-"""
+from datagen.train.html_page import escape, html_facts, html_figure, html_page, html_table
 
 
 def page_of(report: Report, gathered: Gathered) -> str:
     """The whole page."""
-    body: list[str] = ["<h1>Evaluation of base placement</h1>", _about(report)]
+    body = [_about(report)]
     for number, part in enumerate(report["parts"]):
         if title := tables.part_title(report, part):
             body.append(f"<h2>{escape(title)}</h2>")
         for name, told in part["sets"].items():
             body += _set(report, told, f"{number}-{name}")
         for name, why in part["left_out"].items():
-            body.append(f"<h2>Table I: {escape(name)} is left out</h2><p>{escape(why)}</p>")
+            body.append(f"<h2>Table I: {escape(name)} left out</h2><p>{escape(why)}</p>")
         body += _grids(report, part)
     if gathered.examples:
         figure = draw_examples(gathered.examples, gathered.columns, report["methods"])
-        body += [
-            "<h2>Example grids</h2>",
-            "<p class=note>Drawn at random from the whole grids with a good candidate. Truth: green is good, "
-            "pale is clear and bad, grey has no room for the base; scores are shown where it is clear, red "
-            "to green. The star is the pick, rimmed red where it is bad; the dashed circle is the arm's "
-            "reach; red points are the target.</p>",
-            svg_of(figure, "examples"),
-        ]
+        body += ["<h2>Example grids</h2>", html_figure(svg_of(figure, "examples"), GRIDS_CAPTION)]
     body += [*_sources(report)]
-    head = f'<meta charset="utf-8"><title>Evaluation of base placement</title><style>{_STYLE}</style>'
-    return (
-        f"<!doctype html>\n<html lang=en><head>{head}</head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body></html>\n"
-    )
-
-
-def escape(text: str) -> str:
-    """The text as HTML that shows it, with nothing in it that a browser acts on."""
-    return html_escape(printable(text))
+    return html_page("Evaluation of base placement", body)
 
 
 def _about(report: Report) -> str:
     places = ", ".join(run["place"] for run in report["runs"])
-    lines = [f"Labels of {places}.", *(f"{name}: {words}." for name, words in tables.notes(report))]
-    return "".join(f"<p class=note>{escape(line)}</p>" for line in lines)
+    return html_facts([("labels", places), *tables.notes(report)])
 
 
 def _set(report: Report, told: Report, name: str) -> list[str]:
@@ -75,13 +43,13 @@ def _set(report: Report, told: Report, name: str) -> list[str]:
         *_shown(
             tables.accuracy_table(report, told),
             "h2",
-            svg_of(draw_intervals(report, told), f"intervals-{name}"),
+            html_figure(svg_of(draw_intervals(report, told), f"intervals-{name}")),
         ),
         *_shown(tables.comparison_table(told["comparisons"], candidates), kind="text"),
         *_order(report, told["differences"], tables.TABLE_I, candidates),
         *_shown(tables.reach_table(report, told)),
         "<h3>Curves</h3>",
-        svg_of(draw_curves(report, told), f"curves-{name}"),
+        html_figure(svg_of(draw_curves(report, told), f"curves-{name}")),
         *_shown(tables.calibration_table(report, told)),
         *(_folded(shown) for shown in tables.breakdown_tables(report, told)),
     ]
@@ -90,7 +58,7 @@ def _set(report: Report, told: Report, name: str) -> list[str]:
 def _grids(report: Report, part: Report) -> list[str]:
     grids = part["grids"]
     if grids is None:
-        return [f"<h2>Table III is left out</h2><p>{escape(part['no_grids'])}</p>"]
+        return [f"<h2>Table III left out</h2><p>{escape(part['no_grids'])}</p>"]
     return [
         *_shown(tables.grids_table(report, grids), "h2"),
         *_shown(tables.comparison_table(grids["comparisons"], "whole grids"), kind="text"),
@@ -103,38 +71,34 @@ def _order(report: Report, differences: Sequence[Report], metrics: Sequence[str]
 
 
 def _sources(report: Report) -> Iterable[str]:
-    yield "<h2>What this was made from</h2>"
+    yield "<h2>Runs and checkpoints</h2>"
     sources = [
         (run["place"], part["label_source"], part["split"], part["candidates"], str(part["per_scene"]),
          part["spec_hash"])
         for run in report["runs"] for part in run["parts"]
     ]  # fmt: skip
-    yield _table(("run", "labels", "split", "candidates", "a scene", "specification"), sources, "text")
+    yield html_table(
+        ("run", "labels", "split", "candidates", "candidates per scene", "specification"), sources, "text"
+    )
     checkpoints = [
         (record["name"], checkpoint["place"], checkpoint["model"], checkpoint["sha256"])
         for record in report["methods"]
         if (checkpoint := record["checkpoint"])
     ]
     if checkpoints:
-        yield _table(("method", "checkpoint", "model", "sha256"), checkpoints, "text")
+        yield html_table(("method", "checkpoint", "model", "sha256"), checkpoints, "text")
     if report["fitted_on"]:
         yield f"<p>Baselines were fitted on {escape(', '.join(report['fitted_on']))}.</p>"
     yield f"<p class=note>datagen {escape(report['datagen'])}</p>"
 
 
 def _shown(shown: TitledTable | None, level: str = "h3", first: str = "", kind: str = "") -> list[str]:
-    """Heading, whatever comes first, and the table; nothing where it has no tables."""
+    """Heading, whatever comes first, and the table; nothing where it has no rows."""
     if shown is None or not shown.rows:
         return []
-    return [f"<{level}>{escape(shown.title)}</{level}>", first, _table(shown.heads, shown.rows, kind)]
+    return [f"<{level}>{escape(shown.title)}</{level}>", first, html_table(shown.heads, shown.rows, kind)]
 
 
 def _folded(shown: TitledTable, kind: str = "") -> str:
-    table = _table(shown.heads, shown.rows, kind)
+    table = html_table(shown.heads, shown.rows, kind)
     return f"<details><summary>{escape(shown.title)}</summary>{table}</details>"
-
-
-def _table(heads: Sequence[str], lines: Iterable[Sequence[str]], kind: str = "") -> str:
-    head = "".join(f"<th>{escape(h)}</th>" for h in heads)
-    body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in line) + "</tr>\n" for line in lines)
-    return f'<table class="{kind}"><tr>{head}</tr>\n{body}</table>'

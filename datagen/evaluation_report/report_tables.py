@@ -46,7 +46,7 @@ def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_
         )
         for record in report["methods"]
     ]
-    heads = ("method", *(METRIC_WORDS[metric] for metric in metrics), "paper, accuracy")
+    heads = ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in metrics), "accuracy in the paper (%)")
     return TitledTable(f"Table I: {candidates_line(told)}", heads, rows)
 
 
@@ -57,7 +57,7 @@ def choice_table(report: Report, told: Report) -> TitledTable:
         for record in report["methods"]
     ]
     title = f"choosing among a robot's candidates ({told['candidates']})"
-    return TitledTable(title, ("method", *(METRIC_WORDS[metric] for metric in CHOICE)), rows)
+    return TitledTable(title, ("method", *(f"{METRIC_WORDS[metric]} (%)" for metric in CHOICE)), rows)
 
 
 def comparison_table(comparisons: Sequence[Report], where: str) -> TitledTable:
@@ -106,7 +106,9 @@ def reach_table(report: Report, told: Report) -> TitledTable | None:
     title = (
         f"Table II: {told['candidates']}, {inside['count']:,} within reach and {outside['count']:,} beyond"
     )
-    return TitledTable(title, ("method", "R_in", "R_out", "paper, all", "paper, R_out"), rows)
+    return TitledTable(
+        title, ("method", "within reach (%)", "beyond (%)", "paper, all (%)", "paper, beyond (%)"), rows
+    )
 
 
 def grids_table(report: Report, grids: Report) -> TitledTable:
@@ -127,8 +129,8 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
         ("paper, two-stage", percent(paper["grid_selection"]), f"{paper['grid_miss_m']:.2f}", "-",
          f"{paper['seconds_per_600']:g}")
     )  # fmt: skip
-    heads = ("method", "best clear one good", "else missed by (m)", METRIC_WORDS["mean_average_precision"],
-             "s per 600")  # fmt: skip
+    heads = ("method", "best clear one good (%)", "else missed by (m)",
+             f"{METRIC_WORDS['mean_average_precision']} (%)", "time per 600 (s)")  # fmt: skip
     return TitledTable(f"Table III: {grids_line(grids)}", heads, rows)
 
 
@@ -157,8 +159,8 @@ def breakdown_tables(report: Report, told: Report, most_methods: int | None = No
             for row in told["breakdown"]
             if row["by"] == heading
         ]
-        title = f"accuracy by {heading} ({told['candidates']})"
-        yield TitledTable(title, (heading, "count", "good", *names), rows)
+        title = f"accuracy by {heading} ({told['candidates']}), in %"
+        yield TitledTable(title, (heading, "count", "good (%)", *names), rows)
 
 
 def notes(report: Report) -> list[tuple[str, str]]:

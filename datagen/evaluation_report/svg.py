@@ -8,9 +8,6 @@ import matplotlib as mpl
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-# Colours that stay apart for colour-blind eyes: strong ones for models, quieter ones for baselines.
-MODEL_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd", "#2ca02c", "#17becf")
-BASELINE_COLOURS = ("#7f7f7f", "#b5a72a", "#7a9fb8", "#8c564b", "#d98cc0", "#5b8c5a", "#4a4a4a", "#b08d57")
 LINES = ("--", "-.", ":")
 
 

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image, ImageColor, ImageSequence
 
 from datagen import cli
-from datagen.drawing.outcome_colours import LOOKS
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.styles import OUTCOME_STYLES
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.world import open_world
 from tests.refusals import refused
@@ -71,11 +71,11 @@ def show(run: Path, out: Path, *more: str) -> np.ndarray:
 @pytest.mark.parametrize("name", ["plan", "sim"])
 def test_a_scene_is_drawn_with_its_outcomes(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
     pixels = show(runs[name], tmp_path / "scene.png")
-    assert pixels.shape == (1240, 2000, 3)
-    outcome_map = pixels[60:560, 650:1200]
+    assert pixels.shape == (1104, 1320, 3)
+    outcome_map = pixels[40:440, 420:800]
     codes, counts = np.unique(arrays_of(runs[name])["outcome"], return_counts=True)
     for code in codes[counts > 2]:  # the stars of two picks may hide two
-        colour = ImageColor.getrgb(LOOKS[NAMES[code]].colour)
+        colour = ImageColor.getrgb(OUTCOME_STYLES[NAMES[code]].colour)
         assert (outcome_map == colour).all(axis=2).sum() > 5, NAMES[code]
 
 
@@ -104,14 +104,14 @@ def test_a_filmstrip(runs: dict[str, Path], tmp_path: Path, capsys: pytest.Captu
     pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
     told = capsys.readouterr().out
     assert pixels.shape[1] == 10 + 4 * 470 and f"candidate  {row} at" in told and "success" in told
-    assert tuple(pixels[20, 15]) == ImageColor.getrgb(LOOKS["success"].colour)
+    assert tuple(pixels[20, 15]) == ImageColor.getrgb(OUTCOME_STYLES["success"].colour)
 
 
 def test_a_failure_shows_how_it_failed(runs: dict[str, Path], tmp_path: Path) -> None:
     row = row_of(runs["sim"], success=False)
     outcome = NAMES[arrays_of(runs["sim"])["outcome"][row]]
     pixels = show(runs["sim"], tmp_path / "trial.png", "--trial", str(row))
-    assert tuple(pixels[20, 15]) == ImageColor.getrgb(LOOKS[outcome].colour)
+    assert tuple(pixels[20, 15]) == ImageColor.getrgb(OUTCOME_STYLES[outcome].colour)
 
 
 def test_a_film_of_the_best_success_moves(

@@ -2,45 +2,61 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import numpy as np
+import numpy.typing as npt
 import plotly.graph_objects as go
 
-from datagen.schemas.errors import printable
 from datagen.schemas.specification import CandidateParams
+from datagen.schemas.styles import BEST, SCORE_COLOURS, TARGET
+from datagen.train.html_page import html_facts, html_figure, html_page
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.pictures import GOLD, shown_rows
+from datagen.train.prediction.pictures import shown_rows
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
 
 _MOST_POINTS = 20_000
 _SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open"}
+_TARGET_RGB = tuple(int(TARGET.colour[k : k + 2], 16) for k in (1, 3, 5))
+_CAPTION = (
+    "The cloud with the target in pink, and the grid of base poses, from red (score 0) to blue (1). Drag "
+    "to turn, scroll or pinch to zoom, point at a square to read its score. Gold is the robot at the best "
+    "pose: its base, the mount with the heading, and the camera's mast."
+)
 
 
 def page_of(prediction: Prediction) -> str:
-    """The cloud, every place with its score under the pointer, and the best pose in gold."""
+    """The page: facts, and the cloud with every base pose, its score under the pointer, the best in gold."""
     half_m = float(np.abs(prediction.places.offset_m).max()) + 0.5
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
     figure = go.Figure(data=[_cloud(prediction, rows), *_places(prediction), *_best(prediction)])
-    lines = "<br>".join(f"<b>{head}</b> {escape(printable(text))}" for head, text in told(prediction))
     figure.update_layout(
-        title={"text": f"<span style='font-size:12px'>{lines}</span>", "y": 0.98, "yanchor": "top"},
-        margin={"l": 0, "r": 0, "b": 0, "t": 40 + 15 * len(told(prediction))},
-        scene={"aspectmode": "data", "xaxis_title": "x [m]", "yaxis_title": "y [m]", "zaxis_title": "z [m]"},
-        legend={"x": 0.0, "y": 0.95},
+        margin={"l": 0, "r": 0, "b": 0, "t": 0},
+        paper_bgcolor="#ffffff",
+        scene={
+            "aspectmode": "data",
+            "camera": {"eye": {"x": 1.45, "y": -1.45, "z": 1.15}, "center": {"x": 0, "y": 0, "z": -0.12}},
+            **{f"{axis}axis": {"title": f"{axis} [m]", "nticks": 5} for axis in "xyz"},
+        },
+        legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
     )
-    return figure.to_html(include_plotlyjs=True, full_html=True, div_id="prediction")
+    view = figure.to_html(
+        include_plotlyjs=True, full_html=False, div_id="prediction", default_height="min(40rem, 120vw)",
+        config={"responsive": True, "displaylogo": False},
+    )  # fmt: skip
+    return html_page(
+        f"Base poses scored by {prediction.scorer}",
+        [html_facts(told(prediction)), html_figure(view, _CAPTION)],
+    )
 
 
-def _cloud(prediction: Prediction, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> go.Scatter3d:
+def _cloud(prediction: Prediction, rows: npt.NDArray[np.int64]) -> go.Scatter3d:
     points, rgb = prediction.seen.points_m[rows], prediction.seen.rgb[rows].copy()
-    rgb[prediction.seen.on_target[rows]] = (214, 32, 78)
+    rgb[prediction.seen.on_target[rows]] = _TARGET_RGB
     colours = [f"rgb({r},{g},{b})" for r, g, b in rgb.tolist()]
     x, y, z = np.round(points.astype(np.float64), 3).T.tolist()
     marker = {"size": 1.8, "color": colours}
     return go.Scatter3d(
-        x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip", name="cloud, target red"
+        x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip", name="cloud, target pink"
     )
 
 
@@ -61,11 +77,11 @@ def _places(prediction: Prediction) -> list[go.Scatter3d]:
             "size": 3 if state == "blocked" else 6,
             "symbol": _SYMBOLS[state],
             "color": scores.tolist(),
-            "colorscale": "RdYlGn",
+            "colorscale": SCORE_COLOURS,
             "cmin": 0,
             "cmax": 1,
             "showscale": not traces,
-            "colorbar": {"title": "score", "len": 0.6},
+            "colorbar": {"title": "score", "orientation": "h", "y": 1, "yanchor": "bottom", "thickness": 12},
         }
         z = [0.01] * len(rows)
         name = f"{len(rows)} {state}"
@@ -99,7 +115,7 @@ def _best(prediction: Prediction) -> list[go.Scatter3d]:
     text = f"best, score {prediction.score[row]:.3f}"
     return [
         go.Scatter3d(
-            x=values[0], y=values[1], z=values[2], mode="lines", line={"color": GOLD, "width": 8},
+            x=values[0], y=values[1], z=values[2], mode="lines", line={"color": BEST.colour, "width": 8},
             name=text, hoverinfo="name", connectgaps=False,
         )
     ]  # fmt: skip

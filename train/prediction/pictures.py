@@ -1,4 +1,4 @@
-"""One picture of a prediction: the frame with the target outlined, the scored grid from above and aslant."""
+"""One picture of a prediction: the frame with its target, the scored grid from above and in perspective."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ from typing import IO, Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from datagen.schemas.specification import CandidateParams
+from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNSEEN
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
-COLOURS, GOLD = "RdYlGn", "#ffc400"
-_EDGE = {CLEAR: "#20502c", UNSEEN: "none", BLOCKED: "none"}
+_EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}
 _ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9}
+_SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3}  # of a cell's side
 _BASE_RADIUS_M = CandidateParams().base_radius_m
-_MOST_POINTS = 15_000
+_MOST_POINTS = 10_000
 
 
 def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
-    """Write the picture as PNG."""
-    figure = Figure(figsize=(19, 8.2), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"base poses scored by {prediction.scorer}: {prediction.sure}", fontsize=14)
-    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 2.3))).tolist()
-    upper, lower = np.asarray(left.subfigures(2, 1, height_ratios=(1.15, 1.0))).tolist()
-    _draw_frame(upper.subplots(), prediction)
-    _write_numbers(lower.subplots(), prediction)
-    above, aslant = right.add_subplot(1, 2, 1), right.add_subplot(1, 2, 2, projection="3d")
-    scale = _draw_above(above, prediction)
-    _draw_aslant(aslant, prediction)
-    right.colorbar(scale, ax=[above, aslant], location="bottom", shrink=0.5, label="score", aspect=40)
-    figure.savefig(out, format="png")
+    """Write the picture as PNG: frame and plan above, numbers and perspective view below."""
+    figure = new_sheet(f"Base poses scored by {prediction.scorer}: {prediction.sure}", 8.8)
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
+    frame, facts = left.subplots(2, 1, height_ratios=(1, 1.1))
+    _draw_frame(frame, prediction)
+    write_facts(facts, told(prediction), head_characters=8)
+    upper, lower = np.asarray(right.subfigures(2, 1, height_ratios=(1.45, 1))).tolist()
+    plan = upper.subplots()
+    upper.colorbar(_draw_plan(plan, prediction), ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
+    _draw_perspective(lower.add_subplot(projection="3d"), prediction)
+    save_sheet(figure, out)
 
 
 def shown_rows(prediction: Prediction, most: int, around_m: float) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -58,58 +58,76 @@ def _draw_frame(axes: Axes, prediction: Prediction) -> None:
     if frame is None or frame.image is None or frame.image.mask is None:
         axes.text(0.5, 0.5, "a cloud without a picture", ha="center", transform=axes.transAxes)
         return
-    axes.imshow(frame.image.rgb)
-    axes.contour(frame.image.mask, levels=[0.5], colors=["#ff2d6f"], linewidths=1.6)
-    axes.set_title("RGB frame, target outlined")
+    draw_frame(axes, frame.image.rgb, frame.image.mask)
 
 
 def _half_m(prediction: Prediction) -> float:
     return float(np.abs(prediction.places.offset_m).max()) + 0.35
 
 
-def _draw_above(axes: Axes, prediction: Prediction) -> ScalarMappable:
-    rows = shown_rows(prediction, 4 * _MOST_POINTS, _half_m(prediction))
+def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
+    rows = shown_rows(prediction, 2 * _MOST_POINTS, _half_m(prediction))
     rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # what is higher hides what is lower
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.scatter(points[:, 0], points[:, 1], c=colours, s=2.5, lw=0, zorder=1)
-    palette, scale = colormaps[COLOURS], ScalarMappable(Normalize(0, 1), COLOURS)
-    side = _side_m(prediction)
+    scale, side = ScalarMappable(Normalize(0, 1), SCORE_COLOURS), _side_m(prediction)
+    legend: list[Any] = []
     for state in STATES:
-        for row in prediction.rows(state):
-            x, y = prediction.base_xy_m[row]
-            size = side * (0.92 if state != BLOCKED else 0.28)
-            colour = (*palette(float(prediction.score[row]))[:3], _ALPHA[state])
+        rows, size = prediction.rows(state), side * _SHARE[state]
+        for (x, y), colour in zip(
+            prediction.base_xy_m[rows],
+            scale.to_rgba(prediction.score[rows], alpha=_ALPHA[state]),
+            strict=True,
+        ):
             corner = (x - size / 2, y - size / 2)
             axes.add_patch(Rectangle(corner, size, size, fc=colour, ec=_EDGE[state], lw=0.9, zorder=3))
+        if len(rows):
+            look: dict[str, Any] = {"ms": 11 * _SHARE[state], "mec": _EDGE[state], "alpha": _ALPHA[state]}
+            label = f"{len(rows)} {state}"
+            legend.append(
+                Line2D([], [], ls="", marker="s", mfc=colormaps[SCORE_COLOURS](0.8), label=label, **look)
+            )
     target = prediction.seen.points_m[prediction.seen.on_target]
-    axes.scatter(target[:, 0], target[:, 1], s=3, c="#d6204e", lw=0, zorder=4)
-    for ground, mark in zip(prediction.grounds, "^" * len(prediction.grounds), strict=True):
-        axes.plot(*ground.T_world_camera[:2, 3], marker=mark, color="#2f6fdd", ms=10, mec="white", zorder=6)
+    axes.scatter(target[:, 0], target[:, 1], s=3, c=TARGET.colour, lw=0, zorder=4)
+    legend.append(Patch(fc=TARGET.colour, label=TARGET.words))
+    camera: dict[str, Any] = {
+        "color": CAMERA.colour,
+        "edgecolors": CAMERA.edge,
+        "s": 150,
+        "lw": 0.8,
+        "zorder": 6,
+    }
+    half, centre = _half_m(prediction), prediction.center_m
+    eyes = np.array([ground.T_world_camera[:2, 3] for ground in prediction.grounds])
+    if (np.abs(eyes - centre[:2]) < half).all(axis=1).any():
+        legend.append(
+            axes.scatter(*eyes.T, marker=Path(np.array(CAMERA.marker)), label=CAMERA.words, **camera)
+        )
     if prediction.best is not None:
         xy, yaw = prediction.base_xy_m[prediction.best], prediction.yaw_rad[prediction.best]
         axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec="black", lw=5, zorder=7))
-        axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec=GOLD, lw=3, zorder=7))
+        axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec=BEST.colour, lw=3, zorder=7))
         tip = xy + 0.38 * np.array([np.cos(yaw), np.sin(yaw)])
-        look = {"arrowstyle": "-|>", "color": GOLD, "lw": 3, "mutation_scale": 22}
-        axes.annotate("", tuple(tip), tuple(xy), arrowprops=look, zorder=8)
-        axes.plot(*xy, "o", color=GOLD, mec="black", ms=9, zorder=9)
-    half, centre = _half_m(prediction), prediction.center_m
-    axes.set_xlim(centre[0] - half, centre[0] + half)
-    axes.set_ylim(centre[1] - half, centre[1] + half)
+        arrow = {"arrowstyle": "-|>", "color": BEST.colour, "lw": 3, "mutation_scale": 22}
+        axes.annotate("", tuple(tip), tuple(xy), arrowprops=arrow, zorder=8)
+        axes.plot(*xy, "o", color=BEST.colour, mec="black", ms=9, zorder=9)
+        legend.append(
+            Line2D([], [], ls="", marker="o", ms=11, mfc="none", mec=BEST.colour, mew=3, label="best")
+        )
+    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
     axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.set_title("from above: edged squares clear, plain unseen, small blocked")
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="from above")
+    axes.legend(handles=legend, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
     return scale
 
 
-def _draw_aslant(axes: Any, prediction: Prediction) -> None:
+def _draw_perspective(axes: Any, prediction: Prediction) -> None:
     half, centre = _half_m(prediction), prediction.center_m
     rows = shown_rows(prediction, _MOST_POINTS, half)
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.computed_zorder = False
     tiles = [_square(xy, 0.92 * _side_m(prediction)) for xy in prediction.base_xy_m]
-    palette = colormaps[COLOURS]
+    palette = colormaps[SCORE_COLOURS]
     drawn = prediction.places.state != STATES.index(BLOCKED)
     faces = [(*palette(float(s))[:3], 0.85) for s in prediction.score[drawn]]
     kept = [tile for tile, keep in zip(tiles, drawn, strict=True) if keep]
@@ -119,16 +137,15 @@ def _draw_aslant(axes: Any, prediction: Prediction) -> None:
         _draw_robot(axes, prediction, prediction.best)
     axes.scatter(*points.T, c=colours, s=2.2, lw=0, depthshade=False, zorder=3)
     target = prediction.seen.points_m[prediction.seen.on_target]
-    axes.scatter(*target.T, c="#d6204e", s=3, lw=0, depthshade=False, zorder=4)
+    axes.scatter(*target.T, c=TARGET.colour, s=3, lw=0, depthshade=False, zorder=4)
     axes.set_xlim(centre[0] - half, centre[0] + half)
     axes.set_ylim(centre[1] - half, centre[1] + half)
     axes.set_zlim(0, 1.6)
     axes.set_box_aspect((2 * half, 2 * half, 1.6), zoom=1.25)
     rel = prediction.grounds[0].T_world_camera[:2, 3] - centre[:2]
     axes.view_init(elev=34, azim=float(np.degrees(np.arctan2(rel[1], rel[0]))) + 25)
-    axes.set_title("aslant, from the camera's side: the best pose in gold")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="perspective view from the camera's side")
+    axes.locator_params(nbins=4)
 
 
 def _draw_robot(axes: Any, prediction: Prediction, row: int) -> None:
@@ -141,7 +158,7 @@ def _draw_robot(axes: Any, prediction: Prediction, row: int) -> None:
     lines.append(np.array([[x, y, mount], [x, y, max(top, mount)]]))
     lines.append(np.array([[x, y, mount], [x + 0.35 * np.cos(yaw), y + 0.35 * np.sin(yaw), mount]]))
     axes.add_collection3d(Line3DCollection(lines, colors="black", linewidths=3.4, zorder=5))
-    axes.add_collection3d(Line3DCollection(lines, colors=GOLD, linewidths=2.2, zorder=6))
+    axes.add_collection3d(Line3DCollection(lines, colors=BEST.colour, linewidths=2.2, zorder=6))
 
 
 def _side_m(prediction: Prediction) -> float:
@@ -153,22 +170,3 @@ def _side_m(prediction: Prediction) -> float:
 def _square(xy: F64, side: float) -> F64:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2 + xy
     return np.column_stack([corners, np.full(4, 0.005)])
-
-
-def _write_numbers(axes: Axes, prediction: Prediction) -> None:
-    axes.set_axis_off()
-    lines: list[str] = []
-    for head, text in told(prediction):
-        lines += _wrapped(f"{head:<11}", text)
-    axes.text(
-        0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=8.5, transform=axes.transAxes
-    )
-
-
-def _wrapped(head: str, text: str, width: int = 76) -> list[str]:
-    lines = [head]
-    for word in text.split(" "):
-        if len(lines[-1]) + len(word) > width:
-            lines.append(" " * len(head))
-        lines[-1] += word + " "
-    return lines

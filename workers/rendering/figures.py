@@ -1,0 +1,55 @@
+"""Sheets of pictures: figures of one width in true colour, frames with outlined targets, lines of facts."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from datagen.schemas.styles import TARGET
+
+_WIDTH_IN = 11.0  # at 800 pixels, as pages show pictures, text of 10 points is then 10 pixels high
+_DPI = 120
+
+
+def new_sheet(title: str, height_in: float) -> Figure:
+    """An empty figure of the common width that lays itself out."""
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=13)
+    return figure
+
+
+def save_sheet(figure: Figure, out: Path | IO[bytes]) -> None:
+    """Write the figure as a true-colour PNG, as small as it gets without loss."""
+    with io.BytesIO() as drawn:
+        figure.savefig(drawn, format="png")
+        Image.open(drawn).convert("RGB").save(out, format="png", optimize=True)
+
+
+def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, target outlined") -> None:
+    """Draw an RGB image (H, W, 3) with the outline of the target's pixels (H, W)."""
+    axes.imshow(rgb)
+    if target.any():
+        for colour, width in ((TARGET.edge, 3.2), (TARGET.colour, 1.5)):
+            axes.contour(target, levels=[0.5], colors=[colour], linewidths=width)
+    axes.set_axis_off()
+    axes.set_title(title)
+
+
+def write_facts(axes: Axes, facts: Sequence[tuple[str, str]], head_characters: int = 12) -> None:
+    """Write (head, text) pairs into a panel of half the sheet's width."""
+    axes.set_axis_off()
+    indent = " " * head_characters
+    lines = [
+        textwrap.fill(f"{head:<{head_characters}}{text}", 66, subsequent_indent=indent)
+        for head, text in facts
+    ]
+    axes.text(0, 1, "\n".join(lines), va="top", family="monospace", fontsize=9, transform=axes.transAxes)
