@@ -111,7 +111,7 @@ def _draw_maps(
 
 
 def _draw_grasps(
-    figure: Any, recalled: RecalledScene, record: Columns, samples: Columns, robot: Robot
+    figure: Any, recalled: ReconstructedScene, record: Columns, samples: Columns, robot: Robot
 ) -> None:
     views = figure.subplots(1, 2)
     used = used_grasps(samples["T_target_tcp"][samples["outcome"] == _SUCCESS])

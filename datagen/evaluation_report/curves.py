@@ -8,9 +8,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from datagen.evaluating.svg import LINES, new_figure
 from datagen.evaluation_report.number_format import METRIC_WORDS, Report, paper_accuracy
-from datagen.evaluation_report.svg import BASELINE_COLOURS, LINES, MODEL_COLOURS, new_figure
+from datagen.evaluation_report.svg import LINES, new_figure
 from datagen.schemas.styles import BASELINE_COLOURS, BASELINE_MARKERS, MODEL_COLOURS, MODEL_MARKERS
 
 _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
