@@ -30,6 +30,7 @@ from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing
+from datagen.reports.specified import made_from
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
@@ -220,6 +221,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
         labels = f"nothing to do: all {n:,} labels are there"
     rows = [
         ("labels", labels),
+        ("made from", made_from(run.manifest for run in runs)),
         ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
         ("time", _time(summary)),
         ("retries", str(tally.retries)),

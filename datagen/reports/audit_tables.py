@@ -18,6 +18,7 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
         f"audit of {report['label_source']} labels",
         [
             ("labels", f"{labels:,} in {report['scenes']:,} scenes"),
+            ("made from", report["made_from"]),
             ("positive", f"{report['positives']:,} ({100 * report['positive_share']:.1f}%)"),
             ("redraws", redraws),
             ("worker time", _worker_time(useful)),

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 from datagen.cluster.policy import Policy
+from datagen.reports.specified import made_from
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged import open_runs
 from datagen.schemas.quarantine import lifted_records
@@ -68,6 +69,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
         "spec_hash": run.manifest.spec_hash,
+        "made_from": made_from([run.manifest]),
         "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
         "n": n,
@@ -125,6 +127,7 @@ def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
         "run": place.url,
         "label_source": parts[0]["label_source"],
         "spec_hash": "",
+        "made_from": "; ".join(dict.fromkeys(part["made_from"] for part in parts)),
         "scenes_from": None,
         "created": min(part["created"] for part in parts),
         "complete": all(part["complete"] for part in parts),
