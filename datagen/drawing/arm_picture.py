@@ -1,4 +1,4 @@
-"""One picture of a scene labelled by an arm: frame, outcome map beside score map, grasps, numbers."""
+"""Picture of a scene with plan or sim labels: frame, outcome map, score map, grasps, numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from datagen.workers.scenes.recall import RecalledScene
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")
-_ROBOTS = 4  # more circles and lines would hide each other
+_ROBOTS = 4  # more would overlap
 _BEST_COLOUR, _H_COLOUR = "gold", "#49c0f0"
 
 
@@ -37,7 +37,7 @@ def draw_arm_picture(
     robots: Sequence[Robot],
     out: Path,
 ) -> None:
-    """Write the picture of a scene of `plan` or `sim`; `robots` are the first of its candidates'."""
+    """Write the picture of a scene with `plan` or `sim` labels; `robots` are the first of the scene."""
     figure = Figure(figsize=(20, 12.4), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=14)
@@ -53,7 +53,7 @@ def draw_arm_picture(
     sheet = support_sheet(np.asarray(record["T_world_support"]), np.asarray(record["support_size_m"]))
     scale = draw_grasps((views[0], views[1]), recalled, sheet, robots[0].gripper, used)
     if scale is None:
-        views[0].set_xlabel("none succeeded")
+        views[0].set_xlabel("no grasp succeeded")
     else:
         views[0].set_xlabel(f"{len(used.count)} different grasps in {int(used.count.sum())} successes")
         grasps.colorbar(
@@ -70,7 +70,7 @@ def draw_arm_picture(
 
 
 def best_success(samples: Columns) -> int | None:
-    """Row of the best success, or None: most often lifted, with fewest grasps, on the widest path."""
+    """Row of the best success, or None: most lifts, then fewest grasps, then the widest clearance."""
     rows = np.flatnonzero(samples["outcome"] == _SUCCESS)
     if not len(rows):
         return None
@@ -82,9 +82,9 @@ def best_success(samples: Columns) -> int | None:
 
 
 def reach_radius_m(robot: Robot, target_height_m: float) -> float:
-    """How far from the target the mount may stand, on the floor, before the arm is too short."""
+    """Largest horizontal distance (m) from mount to target within the arm's reach."""
     rise_m = target_height_m - robot.base_height_m - float(robot.shoulder_m[2])
-    # The robot faces the target, so a shoulder ahead of the mount reaches so much farther.
+    # The robot faces the target, so a shoulder in front of the mount adds to the reach.
     return float(np.sqrt(max(robot.reach_m**2 - rise_m**2, 0.0)) + robot.shoulder_m[0])
 
 
@@ -158,7 +158,7 @@ def _write_numbers(
 
 
 def _picked(head: str, row: int | None, samples: Columns) -> list[str]:
-    """What became of one candidate."""
+    """Lines on the outcome of one candidate."""
     if row is None:
         return [f"{head}none"]
     x, y = samples["base_xy_m"][row]

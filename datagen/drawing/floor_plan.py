@@ -16,12 +16,12 @@ from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.houses.house import Body, House
 from datagen.workers.rendering.frame import Camera
 
-_HEAD_ROOM_M = 1.9  # what hangs higher, such as the wall over a door, hides nothing from above
+_HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
 
 
 def draw_house(axes: Axes, house: House) -> None:
-    """Floors and the footprints of all bodies, low ones first, in their own colours."""
+    """Draw floors and the footprints of all bodies, low ones first, in their own colours."""
     for room in house.rooms:
         axes.add_patch(Polygon(room.polygon_m, closed=True, facecolor="#f4efe6", edgecolor="#c9bfae", lw=0.5))
     solid = [b for b in house.bodies if _height_m(b) > 0.01]
@@ -35,14 +35,14 @@ def draw_house(axes: Axes, house: House) -> None:
 
 
 def draw_objects(axes: Axes, outlines_m: list[F64]) -> None:
-    """Outlines of the placed objects; the first is the target."""
+    """Draw outlines of the placed objects; the first is the target."""
     for k, outline in enumerate(outlines_m):
         colour = "#d6204e" if k == 0 else "#3f7fbf"
         axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor="white", lw=0.4, zorder=5))
 
 
 def draw_camera(axes: Axes, camera: Camera) -> None:
-    """The observation camera and its horizontal field of view."""
+    """Draw the observation camera and its horizontal field of view."""
     eye = camera.T_world_camera[:2, 3]
     half = np.arctan(camera.width_px / 2 / camera.fx_px)
     forward = camera.T_world_camera[:2, 2]
@@ -53,7 +53,7 @@ def draw_camera(axes: Axes, camera: Camera) -> None:
 
 
 def draw_labels(axes: Axes, base_xy_m: F64, label: Any, clear: Any) -> None:
-    """Candidates by label; filled where the robot's body fits, hollow where it does not."""
+    """Draw candidates by label: filled where the base is clear, else hollow."""
     for value, colour, name in ((1, "#1a9850", "good"), (0, "#d73027", "bad")):
         for fits, face in ((True, colour), (False, "none")):
             rows = (label == value) & (clear == fits)
@@ -64,7 +64,7 @@ def draw_labels(axes: Axes, base_xy_m: F64, label: Any, clear: Any) -> None:
 
 
 def draw_scores(axes: Axes, base_xy_m: F64, score: Any, best: int | None) -> ScalarMappable:
-    """Candidates by score, the best clear one as a gold star; returns the colour scale."""
+    """Draw candidates by score, the best clear one as a gold star; return the colour scale."""
     dots = axes.scatter(
         *base_xy_m.T, c=score, cmap="viridis", norm=Normalize(0, 0.8), s=20, zorder=8, edgecolors="none"
     )
@@ -83,7 +83,7 @@ def draw_scores(axes: Axes, base_xy_m: F64, score: Any, best: int | None) -> Sca
 
 
 def frame_axes(axes: Axes, centre_m: F64, half_m: float) -> None:
-    """Equal scales in metres around a point."""
+    """Set equal scales in metres around a point."""
     axes.set_xlim(centre_m[0] - half_m, centre_m[0] + half_m)
     axes.set_ylim(centre_m[1] - half_m, centre_m[1] + half_m)
     axes.set_aspect("equal")

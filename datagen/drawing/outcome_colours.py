@@ -1,7 +1,7 @@
-"""How each outcome of `plan` and `sim` looks and reads: its colour, its marker and its words.
+"""Colour, marker and description of each outcome of `plan` and `sim` labels.
 
-Outcomes are grouped by what decided them. A group has one hue and one marker, and within it colours
-differ in lightness, so that groups and their members stay apart for colour-blind eyes and in print.
+Outcomes are grouped by the stage that decides them. A group has one hue and one marker, and its members
+differ in lightness, so that they can be told apart by colour-blind readers and in print.
 """
 
 from __future__ import annotations

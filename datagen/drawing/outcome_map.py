@@ -1,4 +1,4 @@
-"""Where around the target an arm succeeds, and what stops it elsewhere: the map and its legend."""
+"""Map of the outcomes of candidates around the target, with its legend."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
 
 _DOT, _LEGEND_DOT = 34, 70  # areas in points^2
-_RECEDING = {"out_of_reach": 12, "base_collision": 18}  # what fills most of a grid and says little
+_RECEDING = {"out_of_reach": 12, "base_collision": 18}  # the most frequent and least informative outcomes
 _REACH_COLOUR = "#1b3a6b"
 
 
 def draw_outcomes(axes: Axes, base_xy_m: F64, outcome: Any, clear: Any) -> None:
-    """Candidates (N, 2) by outcome code (N,); filled where the robot's body fits, hollow elsewhere."""
+    """Draw candidates (N, 2) by outcome code (N,): filled where the base is clear, else hollow."""
     _veil(axes)
     for code, name in enumerate(OUTCOMES):
         look = LOOKS[name]
@@ -37,7 +37,7 @@ def draw_outcomes(axes: Axes, base_xy_m: F64, outcome: Any, clear: Any) -> None:
 
 
 def draw_reach(axes: Axes, target_xy_m: F64, radius_m: float) -> None:
-    """The circle outside of which the arm, mounted there, is too short."""
+    """Draw the circle around the target outside of which the arm is too short."""
     for width, colour in ((3.2, "white"), (1.6, _REACH_COLOUR)):
         circle = Circle(
             (float(target_xy_m[0]), float(target_xy_m[1])),
@@ -53,14 +53,14 @@ def draw_reach(axes: Axes, target_xy_m: F64, radius_m: float) -> None:
 
 
 def draw_pick(axes: Axes, base_xy_m: F64, colour: str, label: str) -> None:
-    """A chosen candidate (2,) as a star."""
+    """Draw a chosen candidate (2,) as a star."""
     axes.scatter(
         *base_xy_m, marker="*", s=280, color=colour, edgecolors="black", lw=0.9, zorder=9, label=label
     )
 
 
 def draw_outcome_legend(axes: Axes, outcome: Any) -> None:
-    """Every outcome with its marker, its count among the candidates and its words, by group."""
+    """Draw the legend: outcomes by group, with marker, count and description."""
     axes.set_axis_off()
     counts = np.bincount(np.asarray(outcome, np.int64), minlength=len(OUTCOMES))
     axes.set_xlim(0, 1)
@@ -86,7 +86,7 @@ def draw_outcome_legend(axes: Axes, outcome: Any) -> None:
 
 
 def _veil(axes: Axes) -> None:
-    """Fades the floor plan, so that the colours of candidates are read alone."""
+    """Fade the floor plan, so that the colours of candidates stand out."""
     axes.add_patch(
         Rectangle((0, 0), 1, 1, transform=axes.transAxes, color="white", alpha=0.55, lw=0, zorder=4)
     )

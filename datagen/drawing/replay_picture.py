@@ -1,4 +1,4 @@
-"""A stored scene beside the same scene drawn again: frames, floor plans with the candidates, what differs."""
+"""Picture of a stored and a replayed scene: frames, floor plans with candidates, differences."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Side = tuple[RecalledScene, SceneRows]
 def draw_replay(
     report: dict[str, Any], spec: Specification, stored: Side, made: Side, row: int | None, out: Path
 ) -> None:
-    """Write the picture. `report` is that of `datagen replay`; `row` is the candidate that is marked."""
+    """Write the picture. `report` comes from `datagen replay`; `row` is the marked candidate."""
     figure = Figure(figsize=(19, 11), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3, width_ratios=(1, 1, 0.9))
     verdict = "equal, bit for bit" if report["equal"] else "different"
     figure.suptitle(f"{report['run']}, scene {report['scene']}: {verdict}", fontsize=14)
     centre = np.asarray(stored[1].record["target_center_m"], np.float64)
-    for column, (name, side) in enumerate((("stored", stored), ("drawn again", made))):
+    for column, (name, side) in enumerate((("stored", stored), ("replayed", made))):
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
         draw_frame(axes[0, column], render_frame(spec.observation, recalled.stage, recalled.camera, rng))
@@ -63,17 +63,17 @@ def _draw_plan(axes: Axes, recalled: RecalledScene, rows: SceneRows, centre: Any
 
 
 def _draw_over(axes: Axes, stored: RecalledScene, made: RecalledScene, centre: Any) -> None:
-    """Both on one plan: where they are equal, no blue is to be seen under the dashes."""
+    """Draw both on one plan: where they are equal, the dashes cover the blue."""
     for recalled, style, colour, name in (
         (stored, "-", "#2f6fdd", "stored"),
-        (made, "--", "#d6204e", "drawn again"),
+        (made, "--", "#d6204e", "replayed"),
     ):
         for k, outline in enumerate(object_outlines(recalled)):
             closed = np.vstack([outline, outline[:1]])
             label = name if k == 0 else None
             axes.plot(*closed.T, ls=style, color=colour, lw=1.8 if style == "-" else 1.4, label=label)
     frame_axes(axes, centre, 0.45)
-    axes.set_title("objects from above: stored, and drawn again over it")
+    axes.set_title("objects from above: stored, and replayed over it")
     axes.legend(loc="upper right", fontsize=8)
 
 
@@ -88,11 +88,11 @@ def _lines(report: dict[str, Any]) -> list[str]:
             f"label {sample['label']}, H = {sample['heuristic_score']:.4f}",
             "",
         ]
-    for title, key in (("drawn again from seeds", "stages"), ("from stored poses", "recomputed")):
+    for title, key in (("replayed from seeds", "stages"), ("from stored poses", "recomputed")):
         lines.append(title)
         for stage in report[key]:
             names = ", ".join(d["field"] for d in stage["differences"])
             lines.append(f"  {stage['stage']:<12}{'equal' if stage['equal'] else f'differs: {names}'[:50]}")
         if not report[key]:
-            lines.append("  not here: the run that drew it is not there")
+            lines.append("  not possible: the run of --scenes-from is missing")
     return lines

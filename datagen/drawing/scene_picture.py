@@ -1,4 +1,4 @@
-"""One picture that explains a scene: frame, depth, floor plans, cloud and numbers."""
+"""Picture of a scene: frame, depth, floor plans, point cloud and numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Columns = Mapping[str, Any]
 def draw_scene_picture(
     title: str, recalled: RecalledScene, frame: Frame, record: Columns, samples: Columns, out: Path
 ) -> None:
-    """Write the picture of a scene; `samples` are its candidates, one row each."""
+    """Write the picture of a scene; `samples` has one row per candidate."""
     figure = Figure(figsize=(19, 11), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3, width_ratios=(1.3, 1, 1.12))
@@ -142,7 +142,7 @@ def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples
 
 
 def wrapped(head: str, text: str, width: int = 62) -> list[str]:
-    """Text in lines of about `width` characters behind a head."""
+    """Text wrapped to about `width` characters after a heading."""
     words, lines = text.split(" "), [head]
     for word in words:
         if len(lines[-1]) + len(word) > width:

@@ -1,4 +1,4 @@
-"""What an evaluation looks like: methods with their intervals, ROC, precision and recall, reliability."""
+"""Figures of an evaluation: intervals, ROC, precision and recall, reliability."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 
 
 def looks_of(records: Sequence[Report]) -> dict[str, dict[str, Any]]:
-    """Colour and line of each method: models drawn through, baselines broken."""
+    """Colour and line style of each method: solid for models, dashed for baselines."""
     looks: dict[str, dict[str, Any]] = {}
     models = baselines = 0
     for record in records:
@@ -30,7 +30,7 @@ def looks_of(records: Sequence[Report]) -> dict[str, dict[str, Any]]:
 
 
 def draw_intervals(report: Report, told: Report) -> Figure:
-    """Each method as a dot with its interval, by metric; the paper's accuracy as a diamond."""
+    """Draw each method as a dot with its interval, by metric; the paper's accuracy as a diamond."""
     records = report["methods"]
     figure = new_figure(12, 1.1 + 0.34 * len(records))
     looks = looks_of(records)
@@ -64,7 +64,7 @@ def _draw_estimate(ax: Axes, y: int, estimate: Report, colour: str) -> None:
 
 
 def draw_curves(report: Report, told: Report) -> Figure:
-    """ROC, precision over recall and reliability of every method, side by side."""
+    """Draw ROC, precision-recall and reliability curves of every method side by side."""
     records = report["methods"]
     figure = new_figure(13, 4.9)
     roc, pr, reliability = figure.subplots(1, 3)
@@ -88,9 +88,9 @@ def draw_curves(report: Report, told: Report) -> Figure:
     for ax in (roc, reliability):
         ax.plot([0, 1], [0, 1], color="#999999", lw=0.8, ls=":")
     for ax, title, x, y in (
-        (roc, "ROC (area)", "bad ones called good", "good ones called good"),
-        (pr, "precision and recall (average)", "good ones called good", "of those called good, good"),
-        (reliability, "reliability (Brier score)", "said probability of good", "share that is good"),
+        (roc, "ROC (area)", "false positive rate", "true positive rate"),
+        (pr, "precision and recall (average)", "recall", "precision"),
+        (reliability, "reliability (Brier score)", "mean prediction", "observed rate"),
     ):
         ax.set(title=title, xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
         if ax.get_legend_handles_labels()[0]:

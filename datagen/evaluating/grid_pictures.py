@@ -1,4 +1,4 @@
-"""Whole grids of a few scenes: what is good there, and what each method scores and picks."""
+"""Whole grids of a few scenes: labels, and the scores and the choice of each method."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from datagen.train.evaluation.grids import picks
 
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
-# Cells by what they are: no room for the base, clear but bad, good.
+# Cells: base not clear, clear and negative, positive.
 _TRUTH = ListedColormap(["#b9b9b9", "#f1d9c9", "#0a9148"])
 _REACH_COLOUR = "#1b3a6b"
 F64 = npt.NDArray[np.float64]
@@ -27,9 +27,9 @@ F64 = npt.NDArray[np.float64]
 def draw_examples(
     examples: Sequence[Example], columns: Columns, records: Sequence[Mapping[str, Any]]
 ) -> Figure:
-    """A row a scene: seen from above, the truth, and each method's scores with its pick as a star.
+    """Draw one row per scene: the plan, the labels, and each method's scores with its choice as a star.
 
-    Shown are the methods that were trained, and of the baselines the first, up to five in all.
+    Up to five methods are shown: the models, then the first baselines.
     """
     order = sorted(records, key=lambda record: record["regime"] is None)[:_MOST_METHODS]
     names = [record["name"] for record in order]
@@ -45,7 +45,7 @@ def draw_examples(
         for ax, name in zip(scored, names, strict=True):
             _draw_scores(ax, grid, grid.scores[name])
         if row == 0:
-            for ax, title in zip(panels[0], ("seen, from above", "truth", *names), strict=True):
+            for ax, title in zip(panels[0], ("view from above", "labels", *names), strict=True):
                 ax.set_title(title, fontsize=10)
     for ax in panels.ravel():
         ax.set_aspect("equal")
@@ -55,10 +55,10 @@ def draw_examples(
 
 
 def _cells(grid: Columns, values: F64) -> tuple[F64, tuple[float, float, float, float]]:
-    """Values (N,) as an image (rows by y), and where its edges lie; the N candidates fill a square grid."""
+    """Values (N,) as an image (rows by y) and its extent; the N candidates fill a square grid."""
     side = round(len(grid) ** 0.5)
     order = np.lexsort([grid.base_xy_m[:, 0], grid.base_xy_m[:, 1]])
-    # Rows of a grid have one y but for the last bits of sums in float32.
+    # Cells of a row have equal y except for float32 rounding.
     image = np.empty((side, side))
     by_row = order.reshape(side, side)
     for k, row in enumerate(by_row):
@@ -103,7 +103,7 @@ def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
     ax.plot(0, 0, "+", color="black", ms=8)
     share = picks(score, np.zeros(len(grid), np.int64), grid.is_clear)
     tied = np.flatnonzero(share)
-    # Where no score tells the best apart, the first is shown and their number is said.
+    # Where several cells have the best score, the first is shown with their number.
     pick = tied[0]
     is_good = bool(grid.label[pick])
     look = {"s": 150, "color": "gold", "edgecolors": "black" if is_good else "#d00000", "lw": 1.1}
@@ -117,7 +117,7 @@ def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
 
 
 def _draw_reach(ax: Axes, grid: Columns) -> None:
-    """Where on the floor the arm reaches the target at all: its reach, less the rise to the target."""
+    """Horizontal distance (m) within the arm's reach of the target."""
     reach_m, mount_m, planar_m = (float(a[0]) for a in (grid.reach_m, grid.mount_distance_m, grid.distance_m))
     left_m2 = reach_m**2 - max(mount_m**2 - planar_m**2, 0.0)
     if left_m2 > 0:

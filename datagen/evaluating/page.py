@@ -1,4 +1,4 @@
-"""An evaluation as one HTML page that needs nothing beside it: tables, curves, and grids of a few scenes."""
+"""An evaluation as one self-contained HTML page: tables, curves, and grids of a few scenes."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def page_of(report: Report, gathered: Gathered) -> str:
         for name, told in part["sets"].items():
             body += _set(report, told, f"{number}-{name}")
         for name, why in part["left_out"].items():
-            body.append(f"<h2>Table I: {escape(name)} is left out</h2><p>{escape(why)}</p>")
+            body.append(f"<h2>Table I: {escape(name)} is omitted</h2><p>{escape(why)}</p>")
         body += _grids(report, part)
     if gathered.examples:
         figure = draw_examples(gathered.examples, gathered.columns, report["methods"])
         body += [
             "<h2>Example grids</h2>",
-            "<p class=note>Drawn at random from the whole grids with a good candidate. Truth: green is good, "
-            "pale is clear and bad, grey has no room for the base; scores are shown where it is clear, red "
-            "to green. The star is the pick, rimmed red where it is bad; the dashed circle is the arm's "
+            "<p class=note>Random whole grids with a positive candidate. Labels: green is positive, pale is "
+            "clear and negative, grey is not clear. Scores are shown for clear cells, from red to green. The "
+            "star is the method's choice, red-rimmed where it is negative; the dashed circle is the arm's "
             "reach; red points are the target.</p>",
             svg_of(figure, "examples"),
         ]
@@ -59,7 +59,7 @@ def page_of(report: Report, gathered: Gathered) -> str:
 
 
 def escape(text: str) -> str:
-    """The text as HTML that shows it, with nothing in it that a browser acts on."""
+    """The text escaped for HTML."""
     return html_escape(printable(text))
 
 
@@ -88,7 +88,7 @@ def _set(report: Report, told: Report, name: str) -> list[str]:
 def _grids(report: Report, part: Report) -> list[str]:
     grids = part["grids"]
     if grids is None:
-        return [f"<h2>Table III is left out</h2><p>{escape(part['no_grids'])}</p>"]
+        return [f"<h2>Table III is omitted</h2><p>{escape(part['no_grids'])}</p>"]
     return [
         *_shown(rows.grids_table(report, grids), "h2"),
         *_shown(rows.comparison_table(grids["comparisons"], "whole grids"), kind="text"),
@@ -101,13 +101,13 @@ def _order(report: Report, differences: Sequence[Report], metrics: Sequence[str]
 
 
 def _sources(report: Report) -> Iterable[str]:
-    yield "<h2>What this was made from</h2>"
+    yield "<h2>Inputs</h2>"
     sources = [
         (run["place"], part["label_source"], part["split"], part["candidates"], str(part["per_scene"]),
          part["spec_hash"])
         for run in report["runs"] for part in run["parts"]
     ]  # fmt: skip
-    yield _table(("run", "labels", "split", "candidates", "a scene", "specification"), sources, "text")
+    yield _table(("run", "labels", "split", "candidates", "per scene", "specification"), sources, "text")
     checkpoints = [
         (record["name"], checkpoint["place"], checkpoint["model"], checkpoint["sha256"])
         for record in report["methods"]
@@ -121,7 +121,7 @@ def _sources(report: Report) -> Iterable[str]:
 
 
 def _shown(shown: Shown | None, level: str = "h3", first: str = "", kind: str = "") -> list[str]:
-    """Heading, whatever comes first, and the table; nothing where it has no rows."""
+    """Heading, introduction and table; empty where the table has no rows."""
     if shown is None or not shown.rows:
         return []
     return [f"<{level}>{escape(shown.title)}</{level}>", first, _table(shown.heads, shown.rows, kind)]

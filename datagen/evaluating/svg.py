@@ -1,4 +1,4 @@
-"""Figures as SVG that stands in a page: no outer file, the same bytes for the same numbers."""
+"""Figures as inline SVG: no external file, the same bytes for the same numbers."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import matplotlib as mpl
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-# Colours that stay apart for colour-blind eyes: strong ones for models, quieter ones for baselines.
+# Colours that colour-blind readers can distinguish: strong for models, muted for baselines.
 MODEL_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd", "#2ca02c", "#17becf")
 BASELINE_COLOURS = ("#7f7f7f", "#b5a72a", "#7a9fb8", "#8c564b", "#d98cc0", "#5b8c5a", "#4a4a4a", "#b08d57")
 LINES = ("--", "-.", ":")
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that lays itself out."""
+    """An empty figure with constrained layout."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasSVG(figure)
     return figure
 
 
 def svg_of(figure: Figure, name: str) -> str:
-    """The `<svg>` element; `name` keeps its inner names apart from those of other figures on the page."""
+    """The `<svg>` element; `name` makes its ids unique on the page."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})

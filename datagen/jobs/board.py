@@ -1,4 +1,4 @@
-"""The records that a job keeps of itself in its place: they inform, and never stop the work."""
+"""The status records of a job: they inform readers and never stop the work."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from datagen.schemas.record_files import now
 
 
 class JobBoard:
-    """The board of one job over one run or several. `shards` are all that it has to make.
+    """The status of one job over one run or several. `shards` is the number of shards to make.
 
-    A state that cannot be written, or a request that cannot be read, is passed over: what is wrong with
-    the store is said by the commits.
+    A state that cannot be written and a request that cannot be read are ignored: commits report errors of
+    the store.
     """
 
     def __init__(self, jobs: Jobs, record: JobRecord, shards: int) -> None:
         self._jobs, self._record, self._shards = jobs, record, shards
-        self._before = Tally(0)  # of the runs that this job is through with
+        self._before = Tally(0)  # of the runs that this job has finished
         self._last = JobState(id=record.id, updated=now(), phase="starting", shards=shards)
 
     def begin(self) -> None:
-        """Make the job known. InputError where that cannot be written: then nothing could."""
+        """Publish the job's record. InputError where it cannot be written."""
         self._jobs.begin(self._record)
         self._put(self._last)
 
     def add(self, tally: Tally) -> None:
-        """One run is done; `tally` is the job's up to here."""
+        """Note that one run is done; `tally` is the job's so far."""
         self._before = tally
 
     def tell(self, standing: Standing) -> None:
@@ -54,11 +54,11 @@ class JobBoard:
         return None
 
     def seal(self) -> None:
-        """Say that the shards are made and the store is laid."""
+        """Publish that the shards are made and the store is being sealed."""
         self._put(self._last.model_copy(update={"updated": now(), "phase": "sealing", "in_flight": 0}))
 
     def end(self, end: JobEnd | End, code: int, cause: str, summary: JobSummary | None = None) -> None:
-        """Say how the job ended."""
+        """Publish how the job ended."""
         update = {
             "updated": now(),
             "phase": "ended",
