@@ -27,8 +27,8 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--seed -1", ["seed", "-1", "0"]),
     ("--seed 9223372036854775808", ["seed", "9223372036854775808"]),
     ("--split dev", ["--split", "dev", "train"]),
-    ("--settler bullet", ["settle.engine", "bullet", "pybullet, sapien"]),
-    ("--renderer raster", ["observation.renderer", "raster", "embree"]),
+    ("--settler bullet", ["--settler: settle.engine", "bullet", "pybullet, sapien"]),
+    ("--renderer raster", ["--renderer: observation.renderer", "raster", "embree"]),
     ("--candidates-per-scene 0", ["--candidates-per-scene", "0", "625"]),
     ("--candidates-per-scene 626", ["--candidates-per-scene", "626", "625"]),
     ("--candidates-per-scene all", ["--candidates-per-scene", "all", "grid"]),
@@ -125,7 +125,7 @@ def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.Cap
 
 
 CONFIGS: list[tuple[str, list[str]]] = [
-    ("n_clutter = 3", ["n_clutter", "Take the key out"]),
+    ("n_clutter = 3", ["n_clutter", "Remove or correct the key"]),
     ("[scene]\nclutter = 3", ["scene.clutter", "docs/specification.md"]),
     ("[scene]\nn_clutter = -1", ["scene.n_clutter", "-1"]),
     ("[scene]\nn_clutter = 31", ["scene.n_clutter", "30"]),

@@ -140,7 +140,7 @@ def test_runs_are_calibrated_to_together_and_odd_splits_are_said(
 def test_a_file_that_is_there_stays(trials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rule.toml"
     out.write_text("mine")
-    refused(["calibrate", str(trials), "--out", str(out)], capsys, str(out), "there already")
+    refused(["calibrate", str(trials), "--out", str(out)], capsys, str(out), "already exists")
     assert out.read_text() == "mine"
 
 

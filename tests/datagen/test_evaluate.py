@@ -223,7 +223,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     distance, analytic = report["methods"]
     rule.write_text(f"# run {report['runs'][0]['parts'][0]['spec_hash']}: sim\n[heuristic]\nmu = 0.5\n")
     assert cli.run([*words, "--baselines", "analytic", "--heuristic", str(rule)]) == 2
-    assert "its rule was fitted to the labels of" in capsys.readouterr().err
+    assert "was fitted on the labels of" in capsys.readouterr().err
     assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
 
 
@@ -241,11 +241,11 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     odd.write_text('[heuristic]\nmu = "far"\n')
     heuristic = make_run(tmp_path / "heuristic").storage.url
     cases: list[tuple[list[str], list[str]]] = [
-        ([file], ["RUN", "only checkpoints are named"]),
-        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint's file nor a run's folder"]),
+        ([file], ["PATH", "no run is given"]),
+        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
         ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "no checkpoint"]),
         ([file, heuristic], ["label_source", "heuristic labels", "datagen submit sim"]),
-        ([run, "--baselines", "none"], ["CKPT", "there is nobody to evaluate"]),
+        ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["the same checkpoint as"]),
         ([file, run, run], ["sample_id", "comes twice"]),
         ([file, run, "--bootstrap", "0"], ["--bootstrap"]),

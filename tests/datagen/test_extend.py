@@ -81,7 +81,7 @@ def test_merged_runs_share_what_is_to_come(tmp_path: Path, capsys: pytest.Captur
     assert report["complete"] and report["sealed"] and report["labels"] == report["n"] == total
     assert [part["n"] for part in report["parts"]] == [run.n for run in parts]
     assert cli.run(["status", str(place)]) == 0
-    assert "of each part its own" in capsys.readouterr().out
+    assert "one per part" in capsys.readouterr().out
     labels, last = arrays_of(place)["label"], parts[-1]
     assert len(labels) == total
     alone = make_small_run(tmp_path / "alone", last.n, "--seed", str(last.manifest.spec.seed))

@@ -106,7 +106,7 @@ def test_scenes_are_taken_from_one_of_its_parts(
 def test_refusals_are_one_line(apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = str(tmp_path / "out")
     make_run(tmp_path / "foreign", 10, shards=[0])
-    refused(["merge", "--out", out], capsys, "--runs requires an argument")
+    refused(["merge", "--out", out], capsys, "RUN... is missing")
     refused(["merge", str(tmp_path / "nowhere"), "--out", out], capsys, "no such folder")
     refused(["merge", str(tmp_path), "--out", out], capsys, "not a run")
     kinds = ["merge", str(apart / "whole"), str(tmp_path / "foreign"), "--out", out]
@@ -156,7 +156,7 @@ def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
         [sys.executable, "-c", program, *command], capture_output=True, text=True, check=False
     )
     assert run.returncode == 130, run.stderr
-    said = "interrupted early; what is committed stays. Go on with:"
+    said = "interrupted; committed shards are kept. Resume with:"
     assert run.stderr == f"{said}\n  datagen {' '.join(command)}\ninterrupted\n"
     assert len(Run.open(out).committed()) == 1
     assert cli.run(command) == 0

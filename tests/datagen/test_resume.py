@@ -87,7 +87,7 @@ def test_other_sources_are_refused(
     lose(copied, 2)
     before = files_of(copied)
     refused(["resume", str(copied), option, other, *HERE], capsys, other.partition(":")[2])
-    refused(["resume", str(copied), "--scenes-from", str(copied), *HERE], capsys, "draws its own scenes")
+    refused(["resume", str(copied), "--scenes-from", str(copied), *HERE], capsys, "has its own scenes")
     assert files_of(copied) == before
 
 

@@ -102,8 +102,8 @@ def test_what_cannot_be_trained_is_refused(
 ):
     out, run = tmp_path / "c.ckpt", heuristic_run
     cases: list[tuple[list[str], tuple[str, ...]]] = [
-        (words("stage2", run, out), ("--init", "no checkpoint is named")),
-        (words("stage1", run, out, "--init", str(first)), ("--init", "fresh weights")),
+        (words("stage2", run, out), ("--init", "starts from a checkpoint of stage 1")),
+        (words("stage1", run, out, "--init", str(first)), ("--init", "random weights")),
         (words("stage2", run, out, "--init", tiny), (tiny, "checkpoint")),
         (words("stage1", tmp_path / "none", out), ("none",)),
         (words("stage1", run, out, "--val", str(run)), ("house",)),
@@ -146,7 +146,7 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
     process.send_signal(signal.SIGINT)
     told = process.communicate()[1]
     if process.returncode == 130:  # unless it had come to its end just then
-        assert f"Go on with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
+        assert f"Resume with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
         assert not read_checkpoint(tmp_path / "c.ckpt").head.finished
     else:
         assert process.returncode == 0
