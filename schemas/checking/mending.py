@@ -1,7 +1,6 @@
-"""What checks found, mended: from second copies, from other records, or by making shards again.
+"""Repair the findings of checks: from second copies, from other records, or by making shards again.
 
-Every file is replaced by one atomic put of bytes that are known to be the right ones, so that a mending
-that is broken off has only less mended, and the next goes on.
+Every file is replaced by one atomic put of verified bytes, so that an interrupted repair can be run again.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from datagen.schemas.shard_files import chunk_key
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.storage import Storage, StoredFile
 
-# Mending a record shows what rests on it: commits, then files, then the sealed store.
+# Repairing a record reveals what depends on it: commits, then files, then the sealed store.
 _PASSES = 5
-# Findings on which it depends what rows there are.
+# Findings that decide which rows there are.
 _UNDECIDED = ("record", "lost", "foreign", "sealed")
 
 RemakeShard = Callable[[Run, int], Mapping[str, bytes]]
@@ -38,9 +37,9 @@ Seen = Callable[[int, int], None]
 
 @dataclass
 class Mended:
-    """What a mending did, and what it left."""
+    """The result of a repair."""
 
-    records: list[str] = field(default_factory=list[str])  # keys that were put, by what they were put from
+    records: list[str] = field(default_factory=list[str])  # keys of the written files
     copied_files: list[str] = field(default_factory=list[str])
     remade_files: list[str] = field(default_factory=list[str])
     remade_shards: list[int] = field(default_factory=list[int])
@@ -48,33 +47,33 @@ class Mended:
     resealed: bool = False
     left: list[Finding] = field(default_factory=list[Finding])
     checked: Checked = field(default_factory=Checked)
-    untouched: int = 0  # files as old and as long as before; their digests were checked
-    changed: list[str] = field(default_factory=list[str])  # others that changed meanwhile, though not by this
+    untouched: int = 0  # files with unchanged time and size; their digests were checked
+    changed: list[str] = field(default_factory=list[str])  # others that another process changed meanwhile
 
     @property
     def written(self) -> set[str]:
-        """Keys of all files that were put."""
+        """Keys of all written files."""
         return {*self.records, *self.copied_files, *self.remade_files, *self.sealed_files}
 
 
 def mend_place(
     place: Storage, remake: RemakeShard, workers: int = 1, seen: Seen = lambda done, total: None
 ) -> Mended:
-    """Check the place, mend what can be mended, and check again until nothing more can be.
+    """Check, repair what can be repaired, and check again, until no more can be repaired.
 
-    `remake` gives all files of a shard by path, and raises where it cannot; several shards are made at a
-    time with more `workers`. A remade file is written only where it has the committed digest, and only
-    where all bad files of its shard have. What is left is in the result. InputError as `check_place`.
+    `remake` returns all files of a shard by path, or raises; with more `workers` several shards are made
+    concurrently. A remade file is written only where all bad files of its shard have the committed digests.
+    The result holds the remaining findings. InputError as `check_place`.
     """
     mended = Mended()
     before = {file.key: _state(file) for file in place.list("")}
-    refused: dict[str, str] = {}  # key -> why; not tried twice
+    refused: dict[str, str] = {}  # key -> reason; not tried again
     for _ in range(_PASSES):
         found = _pass(place, remake, workers, seen, mended, refused)
         if not found:
             break
     written = mended.written
-    for file in place.list(""):  # in a second dictionary the files of a large run would not fit
+    for file in place.list(""):  # a second dictionary of all files would not fit into memory for a large run
         state = before.pop(file.key, None)
         if state is None or _is_ours(file.key, written, mended.resealed):
             continue
@@ -87,7 +86,7 @@ def mend_place(
 
 
 def _state(file: StoredFile) -> int:
-    """When a file was written, and its size, as one number; what links to it does not matter."""
+    """Time of change and size of a file as one number; links to it do not change it."""
     return hash((file.modified_s, file.size))
 
 
@@ -98,7 +97,7 @@ def _is_ours(key: str, written: Container[str], resealed: bool) -> bool:
 def _pass(
     place: Storage, remake: RemakeShard, workers: int, seen: Seen, mended: Mended, refused: dict[str, str]
 ) -> bool:
-    """Check once and mend what is found; whether anything was mended."""
+    """Check once and repair the findings; return whether any was repaired."""
     mended.checked, mended.left = Checked(), []
     bad: dict[tuple[str, int], list[Finding]] = {}
     sealed: list[Finding] = []
@@ -118,7 +117,7 @@ def _pass(
         files = _mend_files(place, remake, workers, bad, mended, refused)
     relink = bool(files) and mended.checked.is_sealed and place.folder is not None
     if any(finding.kind in _UNDECIDED for finding in mended.left):
-        why = "Mend the other findings first: nothing is sealed until they are decided"
+        why = "Repair the other findings first: the run cannot be sealed before"
         mended.left += [replace(finding, mend=why, cure=None) for finding in sealed]
     elif sealed or relink:
         done |= _mend_sealed(place, sealed, mended, refused)
@@ -141,7 +140,7 @@ def _put(
     refused: dict[str, str],
     is_guess: bool = False,
 ) -> bool:
-    """Write the right bytes; whether the place changed. A guess gives way to what was written since."""
+    """Write the restored bytes; return whether a file changed. A guess does not replace an existing file."""
     if finding.key not in refused:
         try:
             if is_guess:
@@ -167,7 +166,7 @@ def _mend_files(
     mended: Mended,
     refused: dict[str, str],
 ) -> int:
-    """Files of shards from the sealed store, from their schema, or remade; how many were put."""
+    """Restore files of shards from the sealed store, from the schema, or remade; return their number."""
     slices, put = _slices(place), 0
     to_make: list[tuple[Run, int, list[Finding]]] = []
     for (_, shard), findings in bad.items():
@@ -195,14 +194,14 @@ def _mend_files(
 
 
 def _slices(place: Storage) -> Mapping[str, SealedSlice]:
-    """What the sealed store has of each run, by specification hash."""
+    """Shards in the sealed store, by specification hash."""
     runs = open_roots(place).runs
     root, _ = read_root(place, runs, {run.manifest.spec_hash: run.n for run in runs})
     return slices_of(root, runs) if root else {}
 
 
 def _second_source(place: Storage, slices: Mapping[str, SealedSlice], finding: Finding) -> bytes | None:
-    """The committed bytes of a file where they are known without making the shard again."""
+    """The committed bytes of a file where they can be restored without making the shard again."""
     cure = finding.cure
     if not isinstance(cure, Remake):
         return None
@@ -234,7 +233,7 @@ def _has_digest(data: bytes, entry: FileEntry) -> bool:
 def _remade(
     remake: RemakeShard, to_make: Iterable[tuple[Run, int, list[Finding]]], workers: int
 ) -> Iterator[tuple[Run, int, list[Finding], Mapping[str, bytes] | str]]:
-    """Each shard with its remade files, or with why there are none."""
+    """Yield each shard with its remade files, or with the reason why there are none."""
 
     def make(one: tuple[Run, int, list[Finding]]) -> Mapping[str, bytes] | str:
         try:
@@ -249,23 +248,23 @@ def _remade(
         yield from ((*one, make(one)) for one in shards)
         return
     with ThreadPoolExecutor(workers) as pool:
-        # So many results in memory, and no more.
+        # Bounds the number of results in memory.
         for one, files in zip(shards, in_order(pool, workers, make, shards), strict=True):
             yield (*one, files)
 
 
 def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:
-    """Why remade files are not to be written, or ""."""
+    """Why remade files must not be written, or ""."""
     for finding in findings:
         if isinstance(finding.cure, Remake):
             data = files.get(finding.cure.entry.path)
             if data is None or not _has_digest(data, finding.cure.entry):
-                return "Restore the file from a backup: made again here, the shard has other bytes"
+                return "Restore the file from a backup: on this machine the remade shard has other bytes"
     return ""
 
 
 def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refused: dict[str, str]) -> bool:
-    """Mend the sealed store: as a whole where one rename does it, else file by file."""
+    """Repair the sealed store: at once where one rename does it, else file by file."""
     roots = {SEALED, f"{SEALED}/{ROOT}"}
     try:
         _refuse_fewer_rows(place)
@@ -275,7 +274,7 @@ def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refuse
             seal(place)
             mended.resealed = True
             return True
-        # The root last: it is what opens the store.
+        # The root last: it makes the store readable.
         for finding in sorted(findings, key=lambda f: f.key in roots):
             if isinstance(finding.cure, Reseal):
                 _mend_one(place, finding.key, finding.cure)
@@ -288,17 +287,17 @@ def _mend_sealed(place: Storage, findings: list[Finding], mended: Mended, refuse
 
 
 def _refuse_fewer_rows(place: Storage) -> None:
-    """Raise InputError where sealing would leave out rows that the store has by all of its arrays."""
+    """Raise InputError where sealing would drop rows that all arrays of the store have."""
     contents = read_contents(place, check=False)
     names = [field.name for field in contents.schema.sample_fields]
     try:
         sealed = ShardPlace(place, SEALED, 0, 0, 0, 0, 0).metadata(names)
         held = min(array.shape[0] for array in sealed.values())
     except InputError:
-        return  # what is damaged says nothing
+        return  # a damaged store does not count
     if (rows := contents.rows("sample")) < held:
-        problem = f"has {held} samples, and {rows} are committed and wanted"
-        mend = "Restore the plans or commits that it was laid over, or drop it with `datagen unseal`"
+        problem = f"has {held} samples, but {rows} are committed and wanted"
+        mend = "Restore the plans or commits of its shards, or remove it with `datagen unseal`"
         raise InputError(f"{place.url}/{SEALED}", "", problem, mend)
 
 
