@@ -1,9 +1,8 @@
-"""The worker's side of an attempt: deadline with stack, process notes, account of the cost.
+"""The worker's side of an attempt: deadline with stack, process note, cost.
 
-A worker that is killed cannot answer. So it first writes who it is into a small note, and points
-`faulthandler` at a file beside it: whatever ends the process, the driver finds what is known. Notes
-are kept in a folder of the worker's own machine, under a name that is the job's alone: a job on many
-machines writes no small files over a network, and needs no folder that all of them share.
+A killed worker cannot report. It therefore first writes its process id into a small note file, and gives
+`faulthandler` a stack file: whatever ends the process, the driver finds both. Notes are in a local folder of
+the worker's machine, with a name unique to the job, so that no shared folder is needed.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from datagen.schemas.storage.errors import FULL, StoreFailure, machine_error
 from datagen.schemas.whole_files import whole_file
 
 T = TypeVar("T", bound=Task)
-# What a ledger entry keeps of a stack, from its end, where the failing frame is.
+# Characters of a stack in a ledger entry, from its end, where the failing frame is.
 STACK_LIMIT = 16_000
-_CAUSE_LIMIT = 300  # a cause is read in a table and on a progress line; the stack has the whole text
+_CAUSE_LIMIT = 300  # a cause is shown in tables and progress lines; the stack has the whole text
 
 
 def utc_now() -> str:
@@ -54,14 +53,14 @@ def short_line(text: str) -> str:
 
 
 class Meter:
-    """Counts what an attempt costs from the moment it is made."""
+    """Measures the cost of an attempt from its creation on."""
 
     def __init__(self) -> None:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         _reset_peak_memory()
 
     def cost(self, clock: StageClock | None = None, written_bytes: int = 0) -> Cost:
-        """The cost so far. What no stage of `clock` claimed is wall and CPU time without a name."""
+        """The cost so far. Time outside the stages of `clock` has no stage."""
         clock = clock or StageClock()
         return Cost(
             wall_s=time.perf_counter() - self._wall,
@@ -74,10 +73,10 @@ class Meter:
 
 
 def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = True) -> AttemptReport:
-    """Run one attempt and tell how it ended. Exceptions become failed reports with their stack.
+    """Run one attempt and return its report. Exceptions become failed reports with their stack.
 
-    With `deadline`, the process ends itself when the task takes longer than `task.deadline_s`,
-    also when native code hangs with the interpreter's lock held.
+    With `deadline`, the process exits when the task takes longer than `task.deadline_s`, even where native
+    code hangs while it holds the GIL.
     """
     started, meter = utc_now(), Meter()
     try:
@@ -86,7 +85,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
                 return _failure(task, started, meter, error)
-    except (OSError, JobCannotGoOn) as error:  # of the note itself
+    except (OSError, JobCannotGoOn) as error:  # from writing the note
         return _failure(task, started, meter, error)
     return AttemptReport(
         attempt=task.attempt,
@@ -102,7 +101,7 @@ def guarded(function: Callable[[T, Meter], Product], task: T, deadline: bool = T
 
 
 def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
-    # A store that gives no answer gives none to the next shard either, and a full disk stays full.
+    # An unreachable store or a full disk concerns every shard.
     final = error if isinstance(error, JobCannotGoOn | StoreFailure) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
     return AttemptReport(
@@ -121,27 +120,27 @@ def _failure(task: Task, started: str, meter: Meter, error: Exception) -> Attemp
 
 @contextmanager
 def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
-    """Keep the note and the stack file of an attempt while it runs, and remove them after it."""
+    """Write the note and the stack file of an attempt, and remove them after it."""
     if not task.notes:
         yield
         return
     note, stack = _note_path(task.notes, task.attempt), _stack_path(task.notes, task.attempt)
     note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not is_private(note.parent.lstat()):
-        problem = f"{note.parent}: another user's folder, or others can write to it"
-        raise JobCannotGoOn(f"{problem}. Name a folder of your own as TMPDIR")
+        problem = f"{note.parent}: belongs to another user, or other users can write to it"
+        raise JobCannotGoOn(f"{problem}. Set TMPDIR to a folder of your own")
     with whole_file(note, alone=True) as file:
         file.write(json.dumps({"host": this_host().model_dump(), "started": started}).encode())
-    if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
+    if not deadline:  # the caller's own process keeps its signal handlers
         try:
             yield
         finally:
             note.unlink(missing_ok=True)
         return
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver handles Ctrl-C
     with stack.open("w") as file:
-        faulthandler.enable(file)  # a native crash leaves its stack here too
+        faulthandler.enable(file)  # also writes the stack of a native crash
         faulthandler.dump_traceback_later(task.deadline_s, exit=True, file=file)
         try:
             yield
@@ -156,7 +155,7 @@ def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
 
 @dataclass(frozen=True)
 class Note:
-    """What a worker wrote about itself when it began an attempt."""
+    """A worker's note on an attempt that it began."""
 
     host: Host
     started: str
@@ -164,7 +163,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Remains:
-    """What a dead worker left of an attempt: its note, and the stack that it died with ("" for none)."""
+    """The files of a dead worker's attempt: its note and its stack ("" for none)."""
 
     note: Note | None = None
     stack: str = ""
@@ -172,7 +171,7 @@ class Remains:
 
 @contextmanager
 def notes_of_a_job() -> Generator[str]:
-    """The name under which machines keep their notes of one job; this one's are removed at the end."""
+    """Give the folder name of the notes of one job; this machine's are removed at the end."""
     name = f"datagen-notes-{secrets.token_hex(8)}"
     try:
         yield name
@@ -186,7 +185,7 @@ def clear_notes(notes: str) -> None:
 
 
 def read_note(notes: str, attempt: str) -> Note | None:
-    """This machine's note of an attempt that has begun and not ended by itself; None when there is none."""
+    """This machine's note of an attempt that has begun and not ended normally; else None."""
     if not notes:
         return None
     try:
@@ -197,7 +196,7 @@ def read_note(notes: str, attempt: str) -> Note | None:
 
 
 def collect_remains(notes: str, attempt: str) -> Remains:
-    """What a dead worker left of an attempt on this machine; note and stack file are removed."""
+    """Read and remove note and stack file of a dead worker's attempt on this machine."""
     if not notes:
         return Remains()
     note, path = read_note(notes, attempt), _stack_path(notes, attempt)
@@ -213,11 +212,11 @@ def collect_remains(notes: str, attempt: str) -> Remains:
 
 
 def obituary(task: Task, outcome: Outcome, cause: str, remains: Remains | None = None) -> AttemptReport:
-    """The report of an attempt whose worker is gone, from what it left behind: here, or `remains`.
+    """The report of an attempt whose worker died, from its files here or from `remains`.
 
-    A cause of many lines is cut to one; where the worker left no stack, its whole text stands there.
-    A stack that begins with faulthandler's timeout line tells a hang from a crash. The wall time is
-    counted from the note; CPU time went with the process and is 0.
+    A cause of several lines is cut to one; without a stack, the whole text is kept as the stack. A stack that
+    begins with faulthandler's timeout line means a hang, else a crash. The wall time counts from the note;
+    the CPU time is unknown and 0.
     """
     left, ended = remains or collect_remains(task.notes, task.attempt), utc_now()
     note, stack = left.note, left.stack
@@ -245,7 +244,7 @@ def obituary(task: Task, outcome: Outcome, cause: str, remains: Remains | None =
 
 
 def _folder(notes: str) -> Path:
-    return Path(tempfile.gettempdir(), notes)  # which an absolute path replaces
+    return Path(tempfile.gettempdir(), notes)  # an absolute path is used as it is
 
 
 def _note_path(notes: str, attempt: str) -> Path:
@@ -275,11 +274,11 @@ def this_host() -> Host:
 
 
 def _reset_peak_memory() -> None:
-    # Linux: makes VmHWM start again from what is resident now, so that the peak is the attempt's.
+    # Linux: resets VmHWM to the current memory, so that the peak is the attempt's.
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
-        return  # elsewhere, or forbidden: the peak is then that of the whole process
+        return  # otherwise the peak is that of the whole process
 
 
 def _peak_memory_bytes() -> int:
@@ -293,7 +292,7 @@ def _peak_memory_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds now; 0 where the system does not tell."""
+    """Resident memory of this process (bytes); 0 where unknown."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:

@@ -1,4 +1,4 @@
-"""A job that can be watched and stopped from elsewhere: it says how it is, and heeds what is asked of it."""
+"""Publish a job's status and poll for stop requests."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ Wish = Literal["drain", "force"]
 
 @dataclass(frozen=True)
 class Standing:
-    """How a job is at one moment."""
+    """Status of a job."""
 
     tally: Tally
     labels_per_s: float
-    left_s: float | None  # None while the rate is not known
-    stopping: str  # why nothing new is begun; "" while it is
+    left_s: float | None  # None while the rate is unknown
+    stopping: str  # why no new shard is started; "" while they are
 
 
 class Board(Protocol):
-    """Where a job hangs out its state, and where others leave their wishes."""
+    """Storage of a job's status and of stop requests."""
 
     def tell(self, standing: Standing) -> None: ...
 
     def wish(self) -> Wish | None:
-        """What somebody asked of this job, if anything."""
+        """The stop request for this job, if any."""
         ...
 
 
 @dataclass
 class Watch:
-    """Events that keep a board: the state every `beat_s` seconds, a look for wishes every `look_s`.
+    """Events that publish the status every `beat_s` seconds and poll for stop requests every `look_s`.
 
-    `shown` hears each event before.
-    `clock` gives seconds and only grows. What the wish asks is asked of `stop`, once each.
+    Each event is first passed to `shown`. `clock` is monotonic, in seconds. Each request is passed to `stop`
+    once.
     """
 
     board: Board
@@ -60,16 +60,16 @@ class Watch:
         self._next_beat_s = self._next_look_s = self.clock()
 
     def ended(self, report: AttemptReport, action: str) -> None:
-        """Each attempt is in the ledger; nothing is added here."""
+        """Attempts are recorded in the ledger only."""
         self.shown.ended(report, action)
 
     def stopping(self, reason: str) -> None:
-        """Say at the next tick that the job is stopping."""
+        """Publish at the next tick that the job is stopping."""
         self.shown.stopping(reason)
         self._reason, self._next_beat_s = reason, self.clock()
 
     def tick(self, tally: Tally) -> None:
-        """Look and tell when it is time."""
+        """Poll and publish when it is time."""
         self.shown.tick(tally)
         self._pace.see(tally.labels)
         now_s = self.clock()
@@ -85,6 +85,6 @@ class Watch:
         if wish is None or wish in self._heard:
             return
         self._heard.add(wish)
-        # Somebody at the terminal may have asked before: that is not asking twice.
+        # A request at the terminal may have come before: the two count as one.
         while not (self.stop.force if wish == "force" else self.stop.drain):
             self.stop.ask()

@@ -1,4 +1,4 @@
-"""One picture of a prediction: the frame with the target outlined, the scored grid from above and aslant."""
+"""Picture of a prediction: the frame with the target outlined, the scored grid from above and in perspective."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _draw_aslant(axes: Any, prediction: Prediction) -> None:
     axes.set_box_aspect((2 * half, 2 * half, 1.6), zoom=1.25)
     rel = prediction.grounds[0].T_world_camera[:2, 3] - centre[:2]
     axes.view_init(elev=34, azim=float(np.degrees(np.arctan2(rel[1], rel[0]))) + 25)
-    axes.set_title("aslant, from the camera's side: the best pose in gold")
+    axes.set_title("perspective view from the camera's side: the best pose in gold")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
 

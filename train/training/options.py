@@ -1,4 +1,4 @@
-"""What a training is told, and what the three stages are."""
+"""Options of a training, and the three stages."""
 
 from __future__ import annotations
 
