@@ -58,7 +58,7 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--objects ycb:{missing}", ["{missing}"]),
     ("--objects ycb:{empty}", ["{empty}", "objects.json"]),
     ("--objects ycb:{file}", ["{file}"]),
-    ("--out {file}", ["{file}", "a file stands there"]),
+    ("--out {file}", ["{file}", "is a file"]),
     ("--out {file}/below", ["{file}/below", "Not a directory"]),
     ("--out {foreign}", ["{foreign}", "thesis.tex", "--out"]),
     ("--out {missing}\0", ["not the name of a folder"]),

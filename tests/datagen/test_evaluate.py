@@ -214,7 +214,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     assert report["methods"][0]["threshold"] is None and report["methods"][2]["note"]
     assert report["parts"][0]["sets"]["grid"]["comparisons"] == []  # without models there is nothing to ask
     assert cli.run([*words, "--fit", str(grids)]) == 2
-    assert "is trained on too" in capsys.readouterr().err
+    assert "is also in the training data" in capsys.readouterr().err
     rule = tmp_path / "rule.toml"
     rule.write_text("[heuristic]\nmu = 0.5\ntau = 0.4\n")
     chosen = ["--baselines", "distance", "--baselines", "analytic", "--heuristic", str(rule)]

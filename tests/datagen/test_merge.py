@@ -110,7 +110,7 @@ def test_refusals_are_one_line(apart: Path, tmp_path: Path, capsys: pytest.Captu
     refused(["merge", str(tmp_path / "nowhere"), "--out", out], capsys, "no such folder")
     refused(["merge", str(tmp_path), "--out", out], capsys, "not a run")
     kinds = ["merge", str(apart / "whole"), str(tmp_path / "foreign"), "--out", out]
-    refused(kinds, capsys, "not of one kind", "engines", str(apart / "whole"), str(tmp_path / "foreign"))
+    refused(kinds, capsys, "differs in kind", "engines", str(apart / "whole"), str(tmp_path / "foreign"))
     joins = ["merge", str(apart / "other"), "--out", str(apart / "whole")]
     refused(joins, capsys, "another specification", "Choose a new --out")
     assert not Path(out).exists()

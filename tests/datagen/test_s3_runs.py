@@ -98,9 +98,9 @@ def test_places_on_s3_that_cannot_be_used(
     words = ["submit", "heuristic", "--n", "8", "--workers", "0", "--out"]
     refused([*words, "s3://no-such-bucket/run"], capsys, "s3://no-such-bucket/run", "no such bucket")
     refused(["status", f"{bucket}/none"], capsys, f"{bucket}/none", "not a run")
-    refused([*words, "s3://k:secret@bucket/run"], capsys, "holds more than a bucket and a prefix")
+    refused([*words, "s3://k:secret@bucket/run"], capsys, "has more than a bucket and a prefix")
     open_storage(bucket).put("mine/thesis.txt", b"x")
-    refused([*words, f"{bucket}/mine"], capsys, "holds files of something else")
+    refused([*words, f"{bucket}/mine"], capsys, "holds other files")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")

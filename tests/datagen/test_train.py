@@ -87,7 +87,7 @@ def test_runs_that_do_not_fit_the_stage_are_refused(
     first: Path, heuristic_run: Path, sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "c.ckpt"
-    learns = "learns from those of"
+    learns = "trains on"
     refused(
         words("stage1", sim_run, out), capsys, str(sim_run), "sim labels", learns, "Train stage2 or sim-only"
     )
@@ -159,7 +159,7 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="torch finds no GPU here"):
+    with pytest.raises(InputError, match="torch finds no GPU"):
         choose_device("cuda", None)
     assert choose_device("auto", None) == ("cpu", 1)
     assert choose_device("auto", 3) == ("cpu", 3)

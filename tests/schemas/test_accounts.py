@@ -60,7 +60,7 @@ def test_an_end_that_is_not_its_commits_follows_from_the_commit(run: Run, field:
     assert start is not None
     finding = only(run)
     assert (finding.kind, finding.key, finding.shard) == ("account", "ledger/a-1.json", 1)
-    assert finding.problem.startswith(f"{field}: is not that of the attempt's commit")
+    assert finding.problem.startswith(f"{field}: differs from the attempt's commit")
     assert restored(finding, LedgerEntry) == end_from_commit(run.commit_of(1), start.started)
 
 
@@ -78,7 +78,7 @@ def test_the_only_record_of_another_attempt_is_not_overwritten(run: Run, ending:
 def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run) -> None:
     edit(folder_of(run) / "ledger/a-1.start.json", shard=0)
     finding = only(run)
-    assert (finding.key, finding.problem) == ("ledger/a-1.start.json", "is not that of this attempt")
+    assert (finding.key, finding.problem) == ("ledger/a-1.start.json", "belongs to another attempt")
     assert restored(finding, AttemptStart) == AttemptStart(attempt="a-1", shard=1, started="then", host="h")
 
 

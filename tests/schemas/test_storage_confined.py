@@ -124,7 +124,7 @@ def test_a_folder_of_something_else_is_not_told_to_remove_its_links(place: Stora
 def test_folders_without_end_are_refused(place: Storage):
     assert place.folder is not None
     (place.folder / "/".join(["d"] * 40)).mkdir(parents=True)
-    with pytest.raises(InputError, match="folders within folders without end"):
+    with pytest.raises(InputError, match="folders are nested too deeply"):
         list(place.list(""))
 
 
@@ -132,9 +132,9 @@ def test_a_folder_is_no_file(place: Storage):
     place.put("a/b", b"x")
     assert not place.exists("a")
     for verb in (lambda: place.get("a", 9), lambda: place.put("a", b""), lambda: place.delete(["a"])):
-        with pytest.raises(InputError, match="A folder stands where a file is needed"):
+        with pytest.raises(InputError, match="A folder is where a file is needed"):
             verb()
-    with pytest.raises(InputError, match="A file stands where a folder is needed"):
+    with pytest.raises(InputError, match="A file is where a folder is needed"):
         place.get("a/b/c", 9)
 
 

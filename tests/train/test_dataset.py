@@ -245,7 +245,7 @@ def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tm
     )
     assert alone.origin() == [said[0] | {"cost": None}]
     assert said[0]["spec_hashes"] == [run.manifest.spec_hash]
-    with pytest.raises(InputError, match="samples would come twice"):
+    with pytest.raises(InputError, match="samples would occur twice"):
         SampleStream([place, tmp_path / "merged"])
 
 

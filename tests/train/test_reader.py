@@ -114,7 +114,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     make_run(tmp_path / "bare", n=20, shards=[])
     (tmp_path / "odd.zarr").mkdir()
     cases: list[tuple[list[Path], dict[str, Any], str]] = [
-        ([], {}, "no run is named"),
+        ([], {}, "no run is given"),
         ([tmp_path / "bare"], {}, "20 of the 20 planned samples are not committed"),
         ([tmp_path / "bare"], {"allow_incomplete": True}, "no shard is committed"),
         ([tmp_path / "odd.zarr"], {}, "no such file"),
@@ -213,7 +213,7 @@ def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
     assert {"distance_m", "visibility"} <= swapped
     for name in swapped & {*ALL, *SAMPLES}:
         scenes, samples = ((name,), ()) if name in ALL else ((), (name,))
-        with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*sha256 is not that of the commit"):
+        with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*another sha256 than the commit"):
             list(SampleReader([place], scenes, samples).shards())
     readers: list[Callable[[], object]] = [
         lambda: read_labelled(run),
@@ -221,7 +221,7 @@ def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
         lambda: list(SampleStream([place]).epoch(0)),
     ]
     for read in readers:
-        with pytest.raises(InputError, match="sha256 is not that of the commit"):
+        with pytest.raises(InputError, match="another sha256 than the commit"):
             read()
 
 

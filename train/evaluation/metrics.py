@@ -109,7 +109,7 @@ class Reliability:
 
     @property
     def expected_error(self) -> float:
-        """Expected calibration error: mean distance of mean prediction and observed rate, weighted by count."""
+        """Expected calibration error: count-weighted distance of mean prediction and observed rate."""
         return float(np.average(np.abs(self.said - self.true), weights=self.count))
 
 

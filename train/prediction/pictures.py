@@ -1,4 +1,4 @@
-"""Picture of a prediction: the frame with the target outlined, the scored grid from above and in perspective."""
+"""Picture of a prediction: the frame with the target, the scored grid from above and in perspective."""
 
 from __future__ import annotations
 

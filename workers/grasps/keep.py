@@ -1,4 +1,4 @@
-"""Grasps by content: worked out once, kept in memory and in the user's cache folder."""
+"""Cache of grasps by content, in memory and in the user's cache folder."""
 
 from __future__ import annotations
 

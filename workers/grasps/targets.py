@@ -1,4 +1,4 @@
-"""Which objects a gripper can take from a table, by the grasps that were found and tried."""
+"""Select objects that a gripper can lift from a table, by their scored grasps."""
 
 from __future__ import annotations
 

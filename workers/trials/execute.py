@@ -1,4 +1,4 @@
-"""One planned grasp executed in physics: reach, approach, close, lift, hold, and how it ended."""
+"""Execute one planned grasp in physics: reach, approach, close, lift, hold; and its outcome."""
 
 from __future__ import annotations
 

@@ -212,8 +212,8 @@ def test_what_is_no_checkpoint_is_named(tmp_path: Path):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     cases = [
-        (plain, "not a checkpoint of this program"),
-        (listed, "not a checkpoint of this program"),
+        (plain, "not a datagen checkpoint"),
+        (listed, "not a datagen checkpoint"),
         (newer, "format_version: 2, and this program reads 1. Use the version"),
         (tmp_path, "not a file"),
         (fifo, "not a file"),
@@ -238,7 +238,7 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path):
             "more: the model has no such weights",
         ),
         (Checkpoint(whole.head, {**whole.weights, name: torch.zeros(1)}), f"{name}: .* where the model has"),
-        (Checkpoint(head_of(model="none"), whole.weights), "no such model"),
+        (Checkpoint(head_of(model="none"), whole.weights), "is unknown"),
         (Checkpoint(head_of(model_config={"width": 10**9}), whole.weights), "width"),
         (Checkpoint(head_of(epoch="x"), whole.weights), "epoch"),
         (Checkpoint(head_of(data=({"schema": "sim"},)), whole.weights), "spec_hashes"),

@@ -293,7 +293,7 @@ def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.Mo
 
 def test_a_stage_that_is_only_a_ceiling_is_refused(root: Path):
     export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", [floor_at(2.5)])
-    with pytest.raises(InputError, match="a stage without walls or floor"):
+    with pytest.raises(InputError, match="has neither walls nor floor"):
         load(root)
 
 

@@ -164,7 +164,7 @@ def test_folders_and_references_that_do_not_exist(tmp_path: Path):
     with pytest.raises(InputError, match="ai2thor, builtin, procthor"):
         open_houses("castle:x")
     for ref in ("builtin:0", "builtin:-1", "builtin:many", "builtin:99999999"):
-        with pytest.raises(InputError, match="not a count"):
+        with pytest.raises(InputError, match="not a number"):
             open_houses(ref)
     write_houses(tmp_path, [two_rooms()], sizes=None)
     with pytest.raises(InputError, match="no size table"):
