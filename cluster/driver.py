@@ -257,9 +257,9 @@ class _Driver(Generic[T]):
             if ends_early(self._policy, self._tally.quarantined, self._tally.shards):
                 self._begin_end("failed", f"{self._tally.quarantined} shards are quarantined")
         if decision.action == "abort" or (self._end is None and self._nothing_runs()):
-            again = "" if decision.action == "abort" else "whatever begins is lost, at last by: "
+            again = "" if decision.action == "abort" else "every attempt is lost, the last by: "
             self._begin_end("aborted", again + report.cause)
-            self.kill_all("the job cannot go on")
+            self.kill_all("the job cannot continue")
         self._events.ended(report, decision.action)
 
     def _at_once(self) -> int:

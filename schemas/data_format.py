@@ -26,8 +26,8 @@ RUN/
   copies/...                     second copies of the root's records; a commit's is in its attempt's folder
   ledger/<attempt>.start.json    an attempt began
   ledger/<attempt>.json          how it ended: outcome, cause, stack, cost
-  quarantine/<shard>.json        a shard given up: seeds, causes, stacks
-  quarantine/<shard>.lifted-<k>.json  one that was given up, and then tried again
+  quarantine/<shard>.json        a quarantined shard: seeds, causes, stacks
+  quarantine/<shard>.lifted-<k>.json  a shard that was quarantined, and then tried again
   jobs/<job>.json                a driver that began; .state.json says how it is, .stop.json asks it to stop
   index/<digest>.json.gz         summaries of settled records: a cache, which may be removed at any time
   lineage.json                   of a merged run: the runs that made its shards
@@ -68,11 +68,11 @@ xarray.open_zarr("RUN/data.zarr")
 
 ## Versions
 
-Schema version {SCHEMA_VERSION}; a run keeps the one it was begun with, and goes on in it under newer
-programs. A new array raises the version (`Field.since`); nothing that is stored is renamed, retyped,
-re-ranged or taken out. The versions of what makes scenes and labels are in the specification's `engines`,
-and so in its hash: code that gives the same input another sample needs a new `VERSION`, everything else
-does not ([what needs what](relabel-and-replay.md)).
+Schema version {SCHEMA_VERSION}; a run keeps the version it was started with, also under newer programs. A new
+array raises the version (`Field.since`); nothing that is stored is renamed, retyped, re-ranged or taken out.
+The versions of what makes scenes and labels are in the specification's `engines`, and so in its hash: code
+that gives the same input another sample needs a new `VERSION`, everything else does not ([what needs
+what](relabel-and-replay.md)).
 """
 
 _OUTCOME_HEAD = (

@@ -142,7 +142,10 @@ class Run:
             if wanted >= n:
                 return
             if number >= _MOST_PLANS:  # the next name would be invalid
-                place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
+                place, problem = (
+                    f"{self.storage.url}/plans/{number}.json",
+                    "is beyond the largest number of plans",
+                )
                 raise InputError(place, "", problem, "Move it out of the run")
             number, spec_hash = number + 1, self.manifest.spec_hash
             plan = Plan(n=n, created=created or now(), spec_hash=spec_hash, number=number)

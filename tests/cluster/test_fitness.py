@@ -77,5 +77,5 @@ def test_a_machine_with_other_versions_is_named(run: Run) -> None:
     here = versions_of(names)
     assert here["numpy"] and here["scenes"] == ""
     other = Fitness("", {**here, "numpy": "1.0"})
-    with pytest.raises(InputError, match=r"numpy: it has 1\.0, and this machine .* Install"):
+    with pytest.raises(InputError, match=r"numpy: is 1\.0 there, but .* Install"):
         refuse_unfit_machines(one_machine(finding=other), run, task_of(run))

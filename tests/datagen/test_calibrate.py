@@ -158,7 +158,9 @@ def test_what_cannot_be_fitted_to_is_refused(
     planned = small_spec(1, label_source="plan")
     refused(["calibrate", str(trials), made("plan", planned), *out], capsys, "plan", "sim")
     ruled = trial_spec(2, heuristic=HeuristicParams(mu=0.6))
-    refused(["calibrate", str(trials), made("ruled", ruled), *out], capsys, "heuristic", "another rule")
+    refused(
+        ["calibrate", str(trials), made("ruled", ruled), *out], capsys, "heuristic", "differs from that of"
+    )
     near = trial_spec(3, candidates=CandidateParams(within="in-range", per_scene=5))
     refused(["calibrate", made("near", near), *out], capsys, "in-range", "clear")
     refused(["calibrate", made("one", trial_spec(4), 1), *out, "--candidates", "grid"], capsys, "label")

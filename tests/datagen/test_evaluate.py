@@ -125,7 +125,7 @@ def test_a_set_is_told_over_the_runs_that_hold_it(
         "grid": ([1], len(clear), SCENES),
     }
     assert cli.run(["evaluate", file, str(near), *QUICK, "--candidates", "clear"]) == 2
-    assert "no run was made of clear candidates, but of in-range" in capsys.readouterr().err
+    assert "no run covers clear candidates, only in-range" in capsys.readouterr().err
 
 
 def _check_page(text: str, n_sets: int) -> None:
@@ -247,10 +247,10 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
         ([file, heuristic], ["label_source", "heuristic labels", "datagen submit sim"]),
         ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["the same checkpoint as"]),
-        ([file, run, run], ["sample_id", "comes twice"]),
+        ([file, run, run], ["sample_id", "occurs twice"]),
         ([file, run, "--bootstrap", "0"], ["--bootstrap"]),
         ([file, run, "--seed", "-1"], ["--seed"]),
-        ([file, run, "--baselines", "luck"], ["--baselines: luck: no such baseline"]),
+        ([file, run, "--baselines", "luck"], ["--baselines: luck: is not a baseline"]),
         ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["heuristic labels"]),
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),

@@ -91,7 +91,7 @@ def test_every_reading_verb_takes_it(merged: Path, tmp_path: Path, capsys: pytes
     picture = tmp_path / "scene.png"
     assert cli.run(["show", str(merged), "--scene", str(second), "--out", str(picture)]) == 0
     assert picture.stat().st_size > 10_000
-    refused(["show", str(merged), "--scene", "9", "--out", str(picture)], capsys, "Choose one from 0 to 8")
+    refused(["show", str(merged), "--scene", "9", "--out", str(picture)], capsys, "Give one from 0 to 8")
 
 
 def test_scenes_are_taken_from_one_of_its_parts(
@@ -126,7 +126,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
     words = (f"merged: {out}", "labels 30 of 40; missing shards: 1", f"datagen resume {out}", "3 linked")
     for word in (
         *words,
-        "1 held more than once",
+        "1 duplicates",
         f"{tmp_path}/a: 2 shards, made on test",
         f"{tmp_path}/b: 1",
     ):

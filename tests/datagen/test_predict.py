@@ -208,7 +208,7 @@ def bad_files(folder: Path) -> None:
 
 # The option that is changed, its value, and words of the refusal. `-` leaves the option out.
 REFUSED: list[tuple[str, str, str]] = [
-    ("--mask", "{bad}/black.png", "selects nothing"),
+    ("--mask", "{bad}/black.png", "selects no pixel"),
     ("--mask", "{bad}/small.png", "160x120"),
     ("--rgb", "{bad}/small.png", "160x120"),
     ("--depth", "{bad}/black.png", "16-bit"),

@@ -195,7 +195,7 @@ def test_merged_runs_are_relabelled_part_by_part(
         np.testing.assert_array_equal(values, np.concatenate([arrays[name] for arrays in each]), err_msg=name)
     assert json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])["labels"] == 0
     assert cli.run(["verify", str(out)]) == 0
-    # Where something else is, no part is begun.
+    # Where other files is, no part is begun.
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "todo.txt").write_text("mine")
     for there, words in (
@@ -266,7 +266,7 @@ def test_it_is_not_written_over_something_else(
     refused(["relabel", str(source), "--out", str(relabelled), "--mu", "0.8"], capsys, "heuristic.mu", "0.7")
     refused(["relabel", str(source), "--out", str(source), "--mu", "0.8"], capsys, "another specification")
     (tmp_path / "thesis.tex").write_text("text")
-    refused(["relabel", str(source), "--out", str(tmp_path), "--mu", "0.8"], capsys, "something else")
+    refused(["relabel", str(source), "--out", str(tmp_path), "--mu", "0.8"], capsys, "other files")
     assert files_of(relabelled) == held
 
 
@@ -340,7 +340,13 @@ def test_labels_of_trials_do_not_follow_from_the_rule(
     more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
     assert cli.run(["submit", "plan", "--n", "8", "--out", str(plan), *more]) == 0
     arguments = ["relabel", str(plan), "--out", str(tmp_path / "run"), *RULE]
-    refused(arguments, capsys, "label_source", "plan labels do not follow", "submit heuristic --scenes-from")
+    refused(
+        arguments,
+        capsys,
+        "label_source",
+        "cannot be computed from distance",
+        "submit heuristic --scenes-from",
+    )
 
 
 def test_runs_on_s3_are_relabelled_and_replayed_there(

@@ -93,7 +93,7 @@ def test_ids_that_name_nothing_or_more_are_refused(
     with pytest.raises(InputError, match="no sample"):
         find_sample([beyond], last)
     monkeypatch.setattr("datagen.commands.replay._PREFIX_AT_LEAST", 1)
-    with pytest.raises(InputError, match=r"begins more than one id .*Give more digits"):
+    with pytest.raises(InputError, match=r"matches several samples .*Give more digits"):
         find_sample([beyond], id_of(source, 0)[:1])
 
 

@@ -50,7 +50,9 @@ def test_racing_plans_end_at_the_largest(tmp_path: Path):
 def test_a_plan_after_which_none_can_be_named_is_refused(tmp_path: Path):
     run = make_run(tmp_path, n=1, shards=[])
     (tmp_path / f"plans/{10**18 - 1}.json").write_bytes(encode_record(Plan(n=1, created="")))
-    with pytest.raises(InputError, match=r"plans/9{18}\.json: no run has so many plans\. Move it away"):
+    with pytest.raises(
+        InputError, match=r"plans/9{18}\.json: is beyond the largest number of plans\. Move it out"
+    ):
         run.grow(2)
 
 

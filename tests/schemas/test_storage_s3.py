@@ -190,7 +190,7 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
             lambda: s.put_many({"a": b"", "b": b""}),
         ):
             before = faults.seen["requests"]
-            with pytest.raises(StoreFailure, match=r"the store answers 50[03] .*Wait until the store") as e:
+            with pytest.raises(StoreFailure, match=r"the store responds 50[03] .*Wait until the store") as e:
                 verb()
             assert faults.seen["requests"] - before >= 2
             assert "\n" not in str(e.value) and "made up" not in str(e.value)
@@ -230,13 +230,13 @@ def answer(status: str, code: str) -> bytes:
         (answer("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Check AWS_ACCESS_KEY_ID"),
         (answer("403 Forbidden", "SignatureDoesNotMatch"), "access denied (SignatureDoesNotMatch)"),
         (answer("400 Bad Request", "ExpiredToken"), "access denied (ExpiredToken)"),
-        (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Make the bucket first"),
+        (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Create the bucket"),
         (answer("301 Moved", "PermanentRedirect"), "the bucket is in another region. Set AWS_REGION"),
         (answer("501 Not Implemented", "NotImplemented"), "the store refuses (501 NotImplemented)"),
-        (answer("503 Slow Down", "SlowDown"), "the store answers 503 SlowDown. Wait until"),
+        (answer("503 Slow Down", "SlowDown"), "the store responds 503 SlowDown. Wait until"),
         (b"SSH-2.0-OpenSSH\r\n\r\n", "is not that of an S3 store. Check that AWS_ENDPOINT_URL"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "is not that of an S3 store"),
-        (None, "the store does not answer in time. Check the network, or allow more with"),
+        (None, "the store does not respond in time. Check the network, or raise"),
     ],
 )
 def test_every_trouble_is_one_line_with_its_mend(
@@ -269,7 +269,7 @@ def told_of(port: int, problem: str, monkeypatch: pytest.MonkeyPatch, timeout_s:
 def test_what_is_told_of_an_answer_does_not_hang_on_names():
     told = "Error performing GET http://host/redirect/dns error/k - Server returned non-2xx status code: "
     trouble = store_trouble(GenericError(told + "503 Service Unavailable: <Error><Code>SlowDown</Code>"))
-    assert (trouble.problem, trouble.passing) == ("the store answers 503 SlowDown", True)
+    assert (trouble.problem, trouble.passing) == ("the store responds 503 SlowDown", True)
     asked = "Error performing PUT http://169.254.169.254/latest/api/token - "
     trouble = store_trouble(GenericError(asked + "HTTP error: error sending request"))
     assert (trouble.problem, trouble.passing) == ("no credentials are set", False)

@@ -70,7 +70,7 @@ def evaluate_set(
     weights: Weights,
     trained_objects: Collection[str] = (),
 ) -> dict[str, Any]:
-    """All that is told of one set of candidates; `weights` (B, S) draw the scenes of `columns`.
+    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
 
     InputError where the set is empty, or its labels are all alike.
     """

@@ -110,7 +110,7 @@ def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
 
 def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
     world = frame.points_m @ T[:3, :3].T + T[:3, 3]
-    # Twice as wide as what counts as floor, so that a floor that lies a little off is told of.
+    # Twice the tolerance of the floor, so that a floor with a small offset is reported.
     z = world[np.abs(world[:, 2]) < 0.1, 2]
     near = world[floor_points(world, T[:3, 3]), 2]
     if len(near) < _LEAST_POINTS:
@@ -148,7 +148,7 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
         mend = f"Correct --camera-height, or, if that surface is not the floor: {_MEND}; {told}"
         raise InputError(frame.place, "floor", problem, mend)
     error_m = depth_error_m(points[levels[k], 2])
-    # The points' height is a mean of so many measurements, the height that was given is one more.
+    # The points' height is a mean of many measurements, the given height is one more.
     weights = 1 / np.array([(error_m.mean() ** 2) / 25 + 0.004**2, _GIVEN_ERROR_M**2])
     height_m = float(np.average([below_m[k], camera_height_m], weights=weights))
     below = float((points @ up + height_m < -0.03 - 4 * depth_error_m(points[:, 2])).mean())

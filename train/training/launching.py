@@ -45,7 +45,7 @@ def interruptible() -> Generator[Stopping]:
 
 
 def train_in_processes(work: Work, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
-    """Run `work(job, ranks, stopping)` in so many new processes that can reach each other.
+    """Run `work(job, ranks, stopping)` in new processes that can reach each other.
 
     What one of them raises as InputError is raised here, and ends the others; so does the end of this
     process. Returns whether they came to their end.

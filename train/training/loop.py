@@ -141,7 +141,7 @@ def _step(
 
 
 def _end_epoch(training: Training, clock: _Clock, watcher: Watcher) -> None:
-    """Validate, keep the best weights in mind, and decide whether to go on."""
+    """Validate, keep the best weights, and decide whether to continue."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
     weight, loss, hits, samples = at.sums

@@ -1,4 +1,4 @@
-"""What a training tells while it runs, and to whom: the loop knows this protocol alone."""
+"""The interface of listeners of a training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Step:
 
 
 class Watcher(Protocol):
-    """Is told of steps and epochs."""
+    """Listener for steps and epochs."""
 
     def step(self, step: Step) -> None: ...
 
@@ -50,7 +50,7 @@ class Watchers:
 
 
 class TensorBoard:
-    """Curves for TensorBoard. A training that goes on replaces what was drawn beyond `step`."""
+    """Curves for TensorBoard. A resumed training replaces those beyond `step`."""
 
     def __init__(self, folder: str, step: int = 0) -> None:
         try:

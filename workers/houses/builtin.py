@@ -64,7 +64,7 @@ def open_builtin(text: str) -> BuiltinHouses:
 def house_document(number: int) -> dict[str, Any]:
     """The house of that number as a ProcTHOR document, the same on every machine.
 
-    Drawn again until it has a top of at least 0.5 x 0.4 m, 0.3 to 1.2 m high.
+    Resampled until it has a top of at least 0.5 x 0.4 m, 0.3 to 1.2 m high.
     """
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([_SEED, number])))
     while True:

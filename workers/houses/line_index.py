@@ -72,7 +72,7 @@ class LineIndex:
         text = bytes(self.data[offset : offset + length])
         if self._is_row(row, text):
             return text
-        # The unpacked copy was damaged. Passing the house over would give other scenes in silence.
+        # The unpacked copy was damaged. Skipping the house would silently give other scenes.
         number = int(self.line_numbers[row])
         text = next((line for n, line in _lines(self.path) if n == number), b"")
         if self._is_row(row, text):
@@ -227,7 +227,7 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
         refresh(index_path)
         return _index(path, data, arrays)
     except (OSError, ValueError):
-        return None  # absent or damaged: it is built anew
+        return None  # absent or damaged: it is rebuilt
 
 
 def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:

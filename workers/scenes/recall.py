@@ -33,7 +33,7 @@ _NEAR_M = 10.0
 
 @dataclass(frozen=True, eq=False)
 class RecalledScene:
-    """What a scene's record stands for: a `SettledScene`, with the camera it was observed by."""
+    """A `SettledScene` from a scene's record, with its observation camera."""
 
     index: int
     retry: int

@@ -32,7 +32,7 @@ LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
 _RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
-_LOOK_STEPS = 4  # contacts are looked at after each of the last so many steps of a phase
+_LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
 _SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0

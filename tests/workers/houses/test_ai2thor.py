@@ -221,12 +221,12 @@ def scene_of(stage: str) -> dict:
 
 
 BAD_SCENES = {
-    "no stage": ({"object_instances": []}, "'stage_instance' is missing"),
+    "no stage": ({"object_instances": []}, "has no key 'stage_instance'"),
     "no objects": ({"stage_instance": {"template_name": "stages/iTHOR/home"}}, "'object_instances' is"),
     "escape": (scene_of("../../../etc/passwd"), "not a path below"),
     "absolute": (scene_of("/etc/passwd"), "not a path below"),
     "absent stage": (scene_of("stages/none"), "cannot be read"),
-    "list": ([], "a list where an object"),
+    "list": ([], "a list, not an object"),
 }
 
 
@@ -239,10 +239,10 @@ def test_broken_scenes_are_named(root: Path, case: str):
 
 
 BAD_INSTANCES = {
-    "translation short": ({"translation": [1, 2]}, "2 numbers where 3"),
+    "translation short": ({"translation": [1, 2]}, "has 2 numbers, not 3"),
     "translation NaN": ({"translation": [1, float("nan"), 3]}, r"translation\[1\]: nan"),
     "rotation zero": ({"rotation": [0, 0, 0, 0]}, "not a unit quaternion"),
-    "rotation text": ({"rotation": "none"}, "a text where a list"),
+    "rotation text": ({"rotation": "none"}, "a text, not a list"),
     "scale zero": ({"uniform_scale": 0}, "uniform_scale: 0"),
     "escape": ({"template_name": "objects/../../secret"}, "not a path below"),
 }
