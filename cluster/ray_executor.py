@@ -100,9 +100,7 @@ class RayExecutor(Generic[T]):
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
         self._inquests: list[_Inquest[T]] = []
-        self._killed: dict[
-            str, float
-        ] = {}  # attempts to kill, and when to kill them by their notes on other machines
+        self._killed: dict[str, float] = {}  # attempts to kill, and when to kill them by their notes
         self._begun_elsewhere: set[str] = set()
         self._begun_until_s = 0.0
         self._jobs: set[str] = set()  # folder names of notes

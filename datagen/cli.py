@@ -108,9 +108,8 @@ def _usage_line(error: CycloptsError) -> str:
     if isinstance(error, UnusedCliTokensError):
         return f'{verb}: unexpected argument "{" ".join(error.unused_tokens or ())}". {see}'
     if isinstance(error, MissingArgumentError) and error.argument is not None:
-        problem = (
-            f"{error.keyword or error.argument.name} {'has no value' if error.keyword else 'is missing'}"
-        )
+        named, lacks = error.keyword or error.argument.name, "has no value" if error.keyword else "is missing"
+        problem = f"{named} {lacks}"
         if near := str(error).partition(" Did you mean ")[2]:  # a mistyped option
             return f"{verb}: {problem}. Did you mean {near} {see}"
         about = (error.argument.parameter.help or "").rstrip(".")

@@ -89,9 +89,7 @@ class Run:
                 more = f" or another of {len(merged.parts)}" if len(merged.parts) > 3 else ""
                 problem = f"holds {len(merged.parts)} merged runs, but one run is needed"
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
-            raise InputError(
-                storage.url, "manifest.json", "not a run: no such file", "Name the folder of a run"
-            )
+            raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
         where = f"{storage.url}/manifest.json"
         if manifest.format_version != FORMAT_VERSION:
             raise InputError(
@@ -307,9 +305,7 @@ class Run:
 
     def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
-        mend = (
-            AGAIN if committing else "Restore the file from a copy, or repair the run with `datagen repair`"
-        )
+        mend = AGAIN if committing else "Restore the file from a copy, or run `datagen repair`"
         sizes = {f.key: f.size for f in self.storage.list(folder)}
         if committing and (mark := f"{folder}/{REMOVING}") in sizes:
             place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"

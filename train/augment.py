@@ -181,6 +181,4 @@ def _with_rows(view: View, kept: Mask) -> View:
 
 def _refuse_outside(field: str, value: float, most: float) -> None:
     if not 0 <= value <= most:
-        raise InputError(
-            "augmentation", field, f"{value} is not between 0 and {most:.4g}", "Correct the value"
-        )
+        raise InputError("augmentation", field, f"{value} is not between 0 and {most:.4g}", "Correct it")

@@ -32,7 +32,7 @@ _FIDELITY = ("heuristic", "plan", "sim")
 
 def audit(
     runs: Annotated[
-        list[str], Parameter(name="RUN...", negative=(), help="Runs of one label source or of several.")
+        list[str], Parameter(name="RUN...", negative=(), help="Runs of one or several label sources.")
     ],
     /,
     *,

@@ -40,15 +40,11 @@ class _Calibrated:
     before: HeuristicParams
     after: HeuristicParams
     by_fold: tuple[HeuristicParams, ...]
-    agreements: dict[
-        str, Agreement
-    ]  # before, after (on houses left out of the fit), fitted (on the fitted labels)
+    agreements: dict[str, Agreement]  # before, after (on houses left out), fitted (on the fitted labels)
 
 
 def calibrate(
-    runs: Annotated[
-        list[str], Parameter(name="RUN...", negative=(), help="Runs of sim labels, or of plan labels.")
-    ],
+    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs of sim or plan labels.")],
     /,
     *,
     out: Annotated[Path, Parameter(help="The .toml file to write; it must not exist.")],

@@ -45,9 +45,7 @@ def evaluate(
         Path | None, Parameter(help="Parameters of the analytic baseline, from `datagen calibrate`.")
     ] = None,
     bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
-    seed: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Seed of the resamples and of the example scenes.")
-    ] = 0,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the resamples and example scenes.")] = 0,
     allow_seen_houses: Annotated[
         bool, Parameter(negative=(), help="Report training houses separately instead of failing.")
     ] = False,

@@ -35,9 +35,7 @@ def gc(
             "that is running: with 0s the merge loses files and must be run again."
         ),
     ] = "24h",
-    dry_run: Annotated[
-        bool, Parameter(negative=(), help="List what would be removed, and remove nothing.")
-    ] = False,
+    dry_run: Annotated[bool, Parameter(negative=(), help="List the files, but remove nothing.")] = False,
     json: AsJson = False,
 ) -> int:
     """Remove files that no commit names: of superseded or unfinished attempts, drafts and probes.
@@ -67,9 +65,7 @@ def age_of(text: str) -> float:
     """Return the seconds of an age like 24h. Raises InputError for anything else."""
     found = _AGE.fullmatch(text.strip())
     if found is None:
-        raise InputError(
-            "--older-than", text, "is not an age", "Give a whole number of s, m, h or d, like 24h"
-        )
+        raise InputError("--older-than", text, "is not an age", "Give a number of s, m, h or d, like 24h")
     return int(found[1]) * _UNIT_S[found[2]]
 
 

@@ -24,9 +24,7 @@ def merge(
     runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs, or merged runs, to merge.")],
     /,
     *,
-    out: Annotated[
-        str, Parameter(help="Folder or s3:// address of the result; an existing one is added to.")
-    ],
+    out: Annotated[str, Parameter(help="Folder or s3:// address of the result, which may exist.")],
     json: AsJson = False,
 ) -> int:
     """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.

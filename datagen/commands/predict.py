@@ -157,9 +157,7 @@ def _frames(
     if len(named) > _MOST_FRAMES:
         raise InputError("--frame", "", f"is given {len(named)} times", f"Give at most {_MOST_FRAMES} frames")
     if pictures and missing:
-        raise InputError(
-            ", ".join(missing), "", "is missing", "Give --rgb, --depth and --intrinsics together"
-        )
+        raise InputError(", ".join(missing), "", "is missing", "Give --rgb, --depth and --intrinsics")
     frames: list[SensorFrame] = []
     if rgb is not None and depth is not None and intrinsics is not None:
         frames.append(
@@ -205,9 +203,7 @@ def _direction(text: str) -> F64:
 def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
     """Raise InputError for an output that is a folder or one of the inputs."""
     if html is not None:
-        import_module(
-            "datagen.train.prediction.page"
-        )  # a missing library is reported before anything is scored
+        import_module("datagen.train.prediction.page")  # reports a missing library before scoring
     read = {path.resolve() for path in inputs if path is not None}
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:

@@ -46,9 +46,7 @@ def repair(
     For example: datagen repair runs/first
     """
     if not 0 <= workers <= 256:
-        raise InputError(
-            "--workers", str(workers), "is not between 0 and 256", "Omit it to work in this process"
-        )
+        raise InputError("--workers", str(workers), "is not between 0 and 256", "Omit it for this process")
     place = open_storage(run, probe=False, create=False)
     with (
         counting("shards checked", as_json=json) as seen,

@@ -47,10 +47,8 @@ def submit(
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number extends the run.")],
     out: Annotated[str, Parameter(help="Folder or s3:// address of the run.")],
-    houses: Annotated[
-        str | None, Parameter(help="Houses: builtin, procthor:DIR or ai2thor:DIR [builtin].")
-    ] = None,
-    objects: Annotated[str | None, Parameter(help="Objects: builtin or ycb:DIR [builtin].")] = None,
+    houses: Annotated[str | None, Parameter(help="builtin, procthor:DIR or ai2thor:DIR [builtin].")] = None,
+    objects: Annotated[str | None, Parameter(help="builtin or ycb:DIR [builtin].")] = None,
     scenes_from: Annotated[
         str | None, Parameter(help="Run whose scenes and candidates are labelled again.")
     ] = None,

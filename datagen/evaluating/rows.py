@@ -173,9 +173,7 @@ def notes(report: Report) -> list[tuple[str, str]]:
         ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
     ]
     if any(record["threshold"] is None for record in report["methods"]):
-        found.append(
-            ("*", "has no threshold: its choice among a robot's candidates is positive, the rest negative")
-        )
+        found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
     found += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]
     return found + [(name, f"omitted: {why}") for name, why in report["left_out"].items()]
 

@@ -100,7 +100,7 @@ def test_a_commit_without_its_files_is_refused(tmp_path: Path):
     victim = tmp_path / "shards/000000/a/label/c.0"
     data = victim.read_bytes()
     victim.unlink()
-    with pytest.raises(InputError, match=r"label/c\.0: missing"):
+    with pytest.raises(InputError, match=r"label/c\.0: is missing"):
         run.commit(commit)
     victim.write_bytes(data[:-1])
     with pytest.raises(InputError, match="bytes, but"):

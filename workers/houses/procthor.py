@@ -45,9 +45,7 @@ class ProcthorHouses:
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file, its line, the house and the JSON path."""
         if house_id not in self.rows:
-            raise InputError(
-                self.folder, "", f"has no house {house_id!r}", "Give the id of one of its houses."
-            )
+            raise InputError(self.folder, "", f"has no house {house_id!r}", "Give one of its ids.")
         if house_id in self.clashes:
             mend = "Rename or remove one of them."
             raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", mend)
