@@ -120,7 +120,7 @@ def test_a_larger_n_extends_and_shard_size_changes_no_array(copied: Path, finish
 @pytest.mark.parametrize(
     ("more", "fields"),
     [
-        (["--seed", "5"], ["seed: it has 0, asked 5"]),
+        (["--seed", "5"], ["seed: 0, but 5 was given"]),
         (["--settler", "pybullet"], ["settle.engine", "sapien", "pybullet"]),
         (["--split", "val", "--robots-per-scene", "2"], ["split", "'all'", "'val'", "robots_per_scene"]),
         (["--candidates-per-scene", "9"], ["candidates_per_scene", "8", "9"]),

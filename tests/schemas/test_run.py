@@ -69,9 +69,9 @@ def test_another_specification_is_refused_with_every_differing_field(tmp_path: P
         make_run(tmp_path, n=500, spec=other, shards=[])
     text = str(e.value)
     for part in (
-        "seed: it has 0, asked 7",
-        "observation.n_points: it has 64, asked 65",
-        "'all', asked 'val'",
+        "seed: 0, but 7 was given",
+        "observation.n_points: 64, but 65 was given",
+        "'all', but 'val' was given",
     ):
         assert part in text
     assert "\n" not in text

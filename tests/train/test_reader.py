@@ -120,7 +120,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
         ([tmp_path / "odd.zarr"], {}, "no such file"),
         ([tmp_path / "none"], {}, "no such folder"),
         ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: is not a field of the run"),
-        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: not a field of samples"),
+        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: is not a field of samples"),
     ]
     for places, fields, problem in cases:
         with pytest.raises(InputError, match=problem):

@@ -222,7 +222,10 @@ def scene_of(stage: str) -> dict:
 
 BAD_SCENES = {
     "no stage": ({"object_instances": []}, "has no key 'stage_instance'"),
-    "no objects": ({"stage_instance": {"template_name": "stages/iTHOR/home"}}, "has no key 'object_instances'"),
+    "no objects": (
+        {"stage_instance": {"template_name": "stages/iTHOR/home"}},
+        "has no key 'object_instances'",
+    ),
     "escape": (scene_of("../../../etc/passwd"), "not a path below"),
     "absolute": (scene_of("/etc/passwd"), "not a path below"),
     "absent stage": (scene_of("stages/none"), "cannot be read"),

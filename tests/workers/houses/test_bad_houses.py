@@ -173,7 +173,7 @@ def test_folders_and_references_that_do_not_exist(tmp_path: Path):
 
 def test_a_folder_without_houses(tmp_path: Path):
     write_houses(tmp_path, [])
-    with pytest.raises(InputError, match="no house"):
+    with pytest.raises(InputError, match="without houses"):
         open_houses(f"procthor:{tmp_path}")
     (tmp_path / "houses.jsonl.gz").unlink()
     with pytest.raises(InputError, match="file with houses"):
