@@ -1,4 +1,4 @@
-"""Where shards run: the driver loop, its policy, and the executors behind it."""
+"""Execution of shards: the driver loop, its policy, and the executors."""
 
-if __name__ != "datagen.cluster":  # in a checkout's folder the other name would make every class twice
+if __name__ != "datagen.cluster":  # a second name, from a checkout's folder, would define every class twice
     raise ImportError("import it as datagen.cluster")

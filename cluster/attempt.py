@@ -1,4 +1,4 @@
-"""One attempt at one shard, from its key to its commit. Runs in a worker; knows nothing of Ray."""
+"""One attempt of one shard, from its task to its commit. Runs in a worker, independent of Ray."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from datagen.workers.world import World, open_world
 
 
 def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
-    """Make the shard's arrays, write them, and commit them unless another attempt was first.
+    """Compute the shard's arrays, write them, and commit them unless another attempt was first.
 
-    Raises JobCannotContinue where the run or its sources cannot be opened or its disk is full; what
-    else goes wrong is raised as it is, and concerns this attempt alone unless a disk is full (`guarded`).
+    Raises JobCannotContinue where the run or its sources cannot be opened, or the disk is full. Other exceptions
+    are not caught and concern this attempt only (see `guarded`).
     """
     spec_hash = task.spec.hash()
     run, world, scenes_run = open_task(task)
@@ -60,9 +60,9 @@ def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
 
 
 def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
-    """The run, the world of its sources, and the run whose scenes are labelled again, if there is one.
+    """Open the run, the world of its sources, and the run whose scenes are labelled again, if any.
 
-    They are opened once a process. Raises JobCannotContinue where that cannot be done here.
+    They are opened once per process. Raises JobCannotContinue where that fails.
     """
     with ends_job(every_input_error=True):
         run, world = _open(task.run, task.spec.hash(), task.houses, task.objects)
@@ -72,7 +72,7 @@ def open_task(task: ShardTask) -> tuple[Run, World, Run | None]:
 
 @contextmanager
 def ends_job(every_input_error: bool = False) -> Generator[None]:
-    """Raise JobCannotContinue for a full or forbidden disk or, where asked, for any InputError."""
+    """Raise JobCannotContinue for a full or read-only disk and, optionally, for any InputError."""
     try:
         yield
     except (InputError, OSError) as error:
@@ -89,7 +89,7 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
         raise InputError(place, "spec_hash", "the run now has another specification", "Submit to a new --out")
     arm = run.manifest.spec.arm
     if arm is not None:
-        gripper_of(arm.robot)  # a robot whose files are broken is so for every shard
+        gripper_of(arm.robot)  # broken robot files concern every shard
     return run, open_world(run.manifest.spec, houses, objects)
 
 
@@ -97,6 +97,6 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
 def _open_scenes_run(place: str, scenes_hash: str) -> Run:
     scenes_run = Run.open(place)
     if scenes_run.manifest.spec.scenes_hash != scenes_hash:
-        mend = "Give --scenes-from the run that this one was started with"
+        mend = "Give --scenes-from with the run that this one was started with"
         raise InputError(place, "spec_hash", "the run now has other scenes", mend)
     return scenes_run

@@ -35,14 +35,14 @@ T = TypeVar("T", bound=Task)
 
 
 class Meter:
-    """Counts what an attempt costs from the moment it is made."""
+    """Measures the cost of an attempt from its creation on."""
 
     def __init__(self) -> None:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         _reset_peak_memory()
 
     def cost(self, clock: StageClock | None = None, written_bytes: int = 0) -> Cost:
-        """The cost so far. What no stage of `clock` claimed is wall and CPU time without a name."""
+        """The cost so far. Time outside the stages of `clock` has no stage."""
         clock = clock or StageClock()
         return Cost(
             wall_s=time.perf_counter() - self._wall,
@@ -55,10 +55,10 @@ class Meter:
 
 
 def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bool = True) -> AttemptReport:
-    """Run one attempt and tell how it ended. Exceptions become failed reports with their stack.
+    """Run one attempt and return its report. Exceptions become failed reports with their stack.
 
-    With `deadline`, the process ends itself when the task takes longer than `task.deadline_s`,
-    also when native code hangs with the interpreter's lock held.
+    With `deadline`, the process exits when the task takes longer than `task.deadline_s`, even where native
+    code hangs while it holds the GIL.
     """
     started, meter = utc_now(), Meter()
     try:
@@ -67,7 +67,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
                 return _failure(task, started, meter, error)
-    except (OSError, JobCannotContinue) as error:  # of the note itself
+    except (OSError, JobCannotContinue) as error:  # from writing the note
         return _failure(task, started, meter, error)
     return AttemptReport(
         attempt=task.attempt,
@@ -83,7 +83,7 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
 
 
 def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
-    # A store that gives no answer gives none to the next shard either, and a full disk stays full.
+    # An unreachable store or a full disk concerns every shard.
     final = error if isinstance(error, JobCannotContinue | StoreUnavailable) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
     return AttemptReport(
@@ -102,27 +102,27 @@ def _failure(task: Task, started: str, meter: Meter, error: Exception) -> Attemp
 
 @contextmanager
 def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
-    """Keep the note and the stack file of an attempt while it runs, and remove them after it."""
+    """Write the note and the stack file of an attempt, and remove them after it."""
     if not task.notes:
         yield
         return
     note, stack = note_path(task.notes, task.attempt), stack_path(task.notes, task.attempt)
     note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not is_private(note.parent.lstat()):
-        problem = f"{note.parent}: another user's folder, or others can write to it"
-        raise JobCannotContinue(f"{problem}. Name a folder of your own as TMPDIR")
+        problem = f"{note.parent}: belongs to another user, or other users can write to it"
+        raise JobCannotContinue(f"{problem}. Set TMPDIR to a folder of your own")
     with whole_file(note, alone=True) as file:
         file.write(json.dumps({"host": this_host().model_dump(), "started": started}).encode())
-    if not deadline:  # the caller's own process: it must outlive the attempt, and keeps its handlers
+    if not deadline:  # the caller's own process keeps its signal handlers
         try:
             yield
         finally:
             note.unlink(missing_ok=True)
         return
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver handles Ctrl-C
     with stack.open("w") as file:
-        faulthandler.enable(file)  # a native crash leaves its stack here too
+        faulthandler.enable(file)  # also writes the stack of a native crash
         faulthandler.dump_traceback_later(task.deadline_s, exit=True, file=file)
         try:
             yield
@@ -154,11 +154,11 @@ def this_host() -> Host:
 
 
 def _reset_peak_memory() -> None:
-    # Linux: makes VmHWM start again from what is resident now, so that the peak is the attempt's.
+    # Linux: resets VmHWM to the current memory, so that the peak is the attempt's.
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
-        return  # elsewhere, or forbidden: the peak is then that of the whole process
+        return  # otherwise the peak is that of the whole process
 
 
 def _peak_memory_bytes() -> int:
@@ -172,7 +172,7 @@ def _peak_memory_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds now; 0 where the system does not tell."""
+    """Resident memory of this process (bytes); 0 where unknown."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:

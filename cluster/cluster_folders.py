@@ -1,6 +1,6 @@
-"""Folders below /tmp that only this user can enter, and the processes that belong to them.
+"""Private folders of this user below /tmp, and the processes that belong to them.
 
-Ray opens its own folders to everybody, so each cluster of this machine has its folder inside a closed one.
+Ray makes its own folders accessible to all users, so each local cluster has its folder inside a private one.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from datagen.schemas.whole_files import whole_file
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"
-_STOP_WITHIN_S = 4.0  # politely; some of Ray's processes ignore that
+_STOP_WITHIN_S = 4.0  # after SIGTERM, which some of Ray's processes ignore
 
-# Variable that names the folder to each process that belongs to it; Ray reads it too.
+# Variable with the folder in each of its processes; Ray reads it too.
 OWNER = "RAY_TMPDIR"
-RAY = "ray"  # the part that Ray writes to, and opens to everybody who can reach it
+RAY = "ray"  # the subfolder that Ray writes to
 
 
 @contextmanager
 def private_folder() -> Generator[Path]:
-    """Give a new folder of mode 0700; when the block ends, its processes are ended and it is removed.
+    """Give a new folder of mode 0700; when the block ends, its processes are killed and it is removed.
 
-    First removes what killed programs of this user left.
+    First removes folders of killed programs of this user.
     """
     with locked_folder(_KIND, _PARENT, remove_folder) as folder:
         (folder / RAY).mkdir()
@@ -44,7 +44,7 @@ def new_folder(kind: str) -> Path:
 
 
 def write_private(path: Path, text: str) -> None:
-    """Write a file of mode 0600 that appears whole."""
+    """Write a file of mode 0600 atomically."""
     with whole_file(path, mode=0o600) as file:
         file.write(text.encode())
 
@@ -56,7 +56,7 @@ def remove_folder(folder: Path) -> None:
 
 
 def end_processes(processes: list[psutil.Process]) -> None:
-    """SIGTERM, and SIGKILL some seconds later to those that are still there."""
+    """Send SIGTERM and, some seconds later, SIGKILL to the remaining processes."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         for process in processes:
             try:
@@ -70,7 +70,7 @@ def _belongs(process: psutil.Process, folder: str) -> bool:
     try:
         if process.pid == os.getpid() or process.uids().real != os.getuid():
             return False
-        # Each sign is missing somewhere: a process that changes its title may overwrite the others.
+        # A process that changes its title may overwrite either of these signs, so both are checked.
         options = [word for word in process.cmdline() if word.startswith("--")]
         files = [file.path for file in process.open_files()]
         return process.environ().get(OWNER) == folder or any(folder in text for text in [*options, *files])

@@ -1,13 +1,13 @@
-"""The driver: keeps a window of attempts in flight and decides what each ending means.
+"""The driver: keeps a window of attempts in flight and decides on retries and quarantine.
 
     while shards are open:
-        fill the window: retries that are due first, then new shards
-        wait a moment for reports, and settle each: ledger, then done, retry or quarantine
-        look after attempts that are silent beyond their deadline
-        look for what other drivers have committed, once there was a sign of one
-        handle a request to stop
+        fill the window: due retries first, then new shards
+        wait briefly for reports, and handle each: ledger, then done, retry or quarantine
+        check attempts that are silent beyond their deadline
+        check what other drivers have committed, after a sign of one
+        handle a stop request
 
-The driver alone owns attempts: executors never repeat one by themselves.
+Only the driver retries: executors never repeat an attempt by themselves.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 
 T = TypeVar("T")
-# Upper bound of one wait, so that a request to stop is handled soon.
+# Upper bound of one wait, so that a stop request is handled soon.
 _POLL_S = 0.25
 
 
 @dataclass(frozen=True)
 class AttemptOrder:
-    """What the driver decides about an attempt before it starts."""
+    """The driver's parameters of an attempt."""
 
     shard: int
     attempt: str
@@ -56,7 +56,7 @@ class AttemptOrder:
 
 
 class Recorder(Protocol):
-    """Where the driver writes down how attempts and shards ended."""
+    """Records of the ends of attempts and shards."""
 
     def close(self, entry: LedgerEntry) -> None: ...
 
@@ -67,15 +67,15 @@ class Recorder(Protocol):
         ...
 
     def missing(self) -> ShardRanges:
-        """Shards that nobody has committed or given up, as it is now."""
+        """Shards that are currently neither committed nor quarantined."""
         ...
 
 
 class Events(Protocol):
-    """What a progress display hears."""
+    """Events for a progress display."""
 
     def ended(self, report: AttemptReport, action: str) -> None:
-        """An attempt was settled; `action` is the policy's decision."""
+        """An attempt was recorded; `action` is the policy's decision."""
         ...
 
     def tick(self, totals: JobTotals) -> None:
@@ -83,17 +83,17 @@ class Events(Protocol):
         ...
 
     def stopping(self, reason: str) -> None:
-        """No new shard is begun from here on."""
+        """No new shard is started from now on."""
         ...
 
 
 @dataclass
 class _Flight:
     order: AttemptOrder
-    number: int  # of this driver's attempts
+    number: int  # of the attempt, per driver
     submitted_s: float
-    check_s: float  # when to look after it next
-    alone: bool  # no other attempt was in flight at any moment of this one
+    check_s: float  # when to check it next
+    alone: bool  # no other attempt was in flight at the same time
     begun: bool = False
     verdict: tuple[Outcome, str] | None = None  # set when the driver ended it
 
@@ -108,10 +108,10 @@ def drive(
     stop: StopRequest,
     clock: Callable[[], float] = time.monotonic,
 ) -> JobSummary:
-    """Run every shard to its commit, or give it up; return how the job ended.
+    """Run every shard until it is committed or quarantined; return the summary.
 
-    `clock` gives seconds and only grows. Raises InputError when the recorder cannot be written; then,
-    and on any other exception, what is in flight is ended by force first.
+    `clock` is monotonic, in seconds. Raises InputError when records cannot be written; on any exception the
+    attempts in flight are killed first.
     """
     driver = _Driver(shards, make_task, executor, recorder, policy, events, stop, clock)
     try:
@@ -137,19 +137,19 @@ class _Driver(Generic[T]):
         self._totals = JobTotals(len(shards))
         self._flights: dict[str, _Flight] = {}
         self._troubled: dict[int, ShardFailures] = {}
-        self._due: list[tuple[float, int]] = []  # heap of (when, shard) that wait for a retry
+        self._due: list[tuple[float, int]] = []  # heap of (time, shard) that wait for a retry
         self._durations = Durations()
         self._numbered = 0
         self._lost_in_a_row = 0
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
         self._open = OpenShards(shards, random.Random(self._name))
-        # The number of the first attempt that began after this driver last went elsewhere.
+        # The number of the first attempt after this driver last moved to other shards.
         self._here_since = 1
-        self._look_s = float("inf")  # when to look at what others do; never before there was a sign of one
+        self._look_s = float("inf")  # when to check other drivers; never before a sign of one
         self._looked_s = float("-inf")
         self._next_check_s = float("inf")
-        self._end: End | None = None  # set once nothing new is begun
+        self._end: End | None = None  # set once no new shard is started
         self._cause = ""
         self._drain_until_s = float("inf")
 
@@ -171,7 +171,7 @@ class _Driver(Generic[T]):
         failed = too_many_quarantined(self._policy, self._totals.quarantined, self._totals.shards)
         end = self._end
         if end is None or (end == "interrupted" and self._totals.finished == self._totals.shards):
-            end = "failed" if failed else "complete"  # a stop that left nothing to do is none
+            end = "failed" if failed else "complete"  # after the last shard, a stop request has no effect
         return JobSummary(end, self._cause, self._totals, self._clock() - start_s)
 
     # Begin ---------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ class _Driver(Generic[T]):
             flying = (flight.order.shard for flight in self._flights.values())
             if not (self._is_suspect(shard) and any(map(self._is_suspect, flying))):
                 return shard
-            # Those that were lost together would be lost together again, by the fault of one of them.
+            # Attempts that were lost together may be lost together again because of one of them.
             heapq.heappush(self._due, (now_s + _POLL_S, shard))
         if len(self._due) >= self._policy.max_waiting:
             return None
@@ -208,7 +208,7 @@ class _Driver(Generic[T]):
         )
         now_s = self._clock()
         check_s = now_s + order.deadline_s + self._policy.grace_s
-        if len(self._flights) == 1:  # of more, none is alone
+        if len(self._flights) == 1:  # of several, none is alone
             next(iter(self._flights.values())).alone = False
         self._flights[order.attempt] = _Flight(order, self._numbered, now_s, check_s, not self._flights)
         self._next_check_s = min(self._next_check_s, check_s)
@@ -224,13 +224,13 @@ class _Driver(Generic[T]):
     def _settle(self, report: AttemptReport) -> None:
         flight = self._flights.pop(report.attempt, None)
         if flight is None:
-            return  # settled before: a report came twice, or after the driver gave up waiting
+            return  # handled before: a second report, or one after the driver gave up waiting
         if report.outcome == "cancelled" and flight.verdict is not None:
             outcome, cause = flight.verdict
             report = replace(report, outcome=outcome, cause=cause)
         elif report.outcome == "cancelled" and self._end is None and not self._stop.drain:
-            # Nobody here asked for it: the shard is as open as after any loss, and not dropped.
-            report = replace(report, outcome="lost", cause="cancelled by somebody else")
+            # Not cancelled by this driver: it counts as lost, and the shard stays open.
+            report = replace(report, outcome="lost", cause="cancelled by another process")
         if report.outcome not in ("committed", "superseded"):
             report = self._what_the_run_says(report)
         shard = report.shard
@@ -238,7 +238,7 @@ class _Driver(Generic[T]):
         decision = decide(
             self._policy, self._troubled.get(shard, ShardFailures()), report, successes, flight.alone
         )
-        if report.outcome not in ("cancelled", "hung"):  # of those nobody answered
+        if report.outcome not in ("cancelled", "hung"):  # those have no worker's report
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
         self._books.close(_ledger_entry(report))
         self._totals.count(report)
@@ -258,9 +258,9 @@ class _Driver(Generic[T]):
             if ends_early(self._policy, self._totals.quarantined, self._totals.shards):
                 self._begin_end("failed", f"{self._totals.quarantined} shards are quarantined")
         if decision.action == "abort" or (self._end is None and self._nothing_runs()):
-            again = "" if decision.action == "abort" else "whatever begins is lost, at last by: "
+            again = "" if decision.action == "abort" else "every attempt is lost, the last by: "
             self._begin_end("aborted", again + report.cause)
-            self.kill_all("the job cannot go on")
+            self.kill_all("the job cannot continue")
         self._events.ended(report, decision.action)
 
     def _width(self) -> int:
@@ -270,7 +270,7 @@ class _Driver(Generic[T]):
         return nothing_runs(self._policy, self._lost_in_a_row, self._width())
 
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
-        """A worker may die, or lose its store's answer, after its commit: the commit record decides."""
+        """A worker may die, or miss the store's response, after its commit: the commit record decides."""
         commit = self._books.commit_of(report.shard)
         if commit is None:
             return report
@@ -291,7 +291,7 @@ class _Driver(Generic[T]):
     # Others --------------------------------------------------------------------------------
 
     def _make_way(self, flight: _Flight) -> None:
-        """Another driver was faster at a shard: go on elsewhere, and look what it has done."""
+        """Another driver was faster at a shard: move to other shards, and check what it has committed."""
         if flight.number >= self._here_since:
             self._open.go_elsewhere()
             self._here_since = self._numbered + 1
@@ -304,7 +304,7 @@ class _Driver(Generic[T]):
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
         if not dropped:
-            self._look_s = float("inf")  # nobody, or nobody near: the next sign will tell
+            self._look_s = float("inf")  # no other driver nearby: wait for the next sign
             return
         # Listing a large run takes time: at most a small share of the driver's.
         self._look_s = self._looked_s + max(self._policy.look_s, self._policy.look_factor * took_s)
@@ -324,10 +324,10 @@ class _Driver(Generic[T]):
                 cause = f"still running after its deadline of {order.deadline_s:g} s; ended by the driver"
                 self._kill(flight, "hung", cause)
             elif self._executor.has_begun(order.attempt):
-                # Since when is not known, so its time counts from now.
+                # Its start is unknown, so its time counts from now.
                 flight.begun, flight.check_s = True, now_s + order.deadline_s + self._policy.grace_s
             elif now_s - flight.submitted_s > self._policy.queue_deadlines * order.deadline_s:
-                self._kill(flight, "lost", "no worker reported to have begun it")
+                self._kill(flight, "lost", "no worker reported its start")
             else:
                 flight.check_s = now_s + order.deadline_s + self._policy.grace_s
         self._next_check_s = min((f.check_s for f in self._flights.values()), default=float("inf"))
@@ -353,7 +353,7 @@ class _Driver(Generic[T]):
             self._events.stopping(cause)
 
     def kill_all(self, cause: str) -> None:
-        """End what is in flight by force; the endings are reported as those of cancelled attempts."""
+        """Kill the attempts in flight; they are reported as cancelled."""
         for flight in list(self._flights.values()):
             if flight.verdict is None:
                 self._kill(flight, "cancelled", cause)

@@ -1,7 +1,7 @@
-"""Environment variables: changed for the time of a block, or handed to a detached job in a file.
+"""Environment variables: changed for a block, or passed to a detached job in a file.
 
-What a runtime environment of Ray says stands on command lines and in logs. So secrets travel in a file
-that its user alone can read; the job's driver and workers read it when they start.
+Ray shows a runtime environment on command lines and in logs, so secrets are passed in a file that only its
+user can read; the job's driver and workers read it when they start.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-# Names the file to a detached job.
+# Path of the file, for a detached job.
 JOB_ENVIRONMENT = "DATAGEN_JOB_ENVIRONMENT"
 _OF_THE_SHELL = ("AWS_", "DATAGEN_", "XDG_CACHE_HOME")
 
 
 def is_of_the_shell(name: str) -> bool:
-    """Whether a detached job has this variable from the shell that submits it, not from Ray's head."""
+    """Whether a detached job gets this variable from the submitting shell, not from Ray's head."""
     return name.startswith(_OF_THE_SHELL)
 
 
 def adopt_job_environment() -> None:
-    """Set the variables that a detached job was given; Ray calls it in each worker of the job."""
+    """Set the variables of a detached job; Ray calls it in each worker of the job."""
     if named := os.environ.get(JOB_ENVIRONMENT):
         os.environ.update(json.loads(Path(named).read_text()))
 
@@ -41,7 +41,7 @@ def job_environment() -> Generator[None]:
 
 @contextmanager
 def changed_environment(values: Mapping[str, str | None]) -> Generator[None]:
-    """Set variables, or unset those that are None, and put all back as it was when the block ends."""
+    """Set variables, or unset those that are None, and restore all when the block ends."""
     before = {name: os.environ.get(name) for name in values}
     _set(values)
     try:

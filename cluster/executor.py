@@ -1,4 +1,4 @@
-"""What the driver needs from a place where attempts run."""
+"""The interface of executors, which run attempts for the driver."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T_contra = TypeVar("T_contra", contravariant=True)
 
 
 class Executor(Protocol[T_contra]):
-    """Runs attempts. Every submitted attempt is answered by one report, whatever happens to it."""
+    """Runs attempts. Every submitted attempt gives one report, whatever happens to it."""
 
     @property
     def slots(self) -> int:
@@ -18,17 +18,17 @@ class Executor(Protocol[T_contra]):
         ...
 
     def submit(self, task: T_contra, /) -> None:
-        """Take an attempt; return at once."""
+        """Start an attempt; return at once."""
         ...
 
     def wait(self, timeout_s: float, /) -> list[AttemptReport]:
-        """Reports of attempts that ended, as soon as there is one, or none after the timeout."""
+        """Reports of ended attempts, as soon as there is one, or none after the timeout."""
         ...
 
     def has_begun(self, attempt: str, /) -> bool:
-        """Whether a worker is known to have begun the attempt."""
+        """Whether a worker has begun the attempt."""
         ...
 
     def kill(self, attempt: str, /) -> None:
-        """End an attempt by force. Its report follows through `wait`, with outcome `cancelled`."""
+        """Kill an attempt. Its report follows through `wait`, with outcome `cancelled`."""
         ...

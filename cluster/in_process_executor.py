@@ -1,4 +1,4 @@
-"""Shards one after another in this very process: for debuggers, small jobs and machines without Ray."""
+"""Run shards one after another in this process: for debuggers, small jobs and machines without Ray."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T", bound=Task)
 
 
 class InProcessExecutor(Generic[T]):
-    """Runs what was submitted inside `wait`. There is no deadline: a hang or a crash is the process's own."""
+    """Runs attempts inside `wait`, without a deadline: a hang or a crash is that of this process."""
 
     slots = 1
 
@@ -31,18 +31,18 @@ class InProcessExecutor(Generic[T]):
         if not self._queue and not self._cancelled:
             time.sleep(timeout_s)
         ended, self._cancelled = self._cancelled, []
-        if self._queue:  # one at a time: between two the driver hears what is asked of it
+        if self._queue:  # one at a time: the driver polls for stop requests in between
             task = self._queue.popleft()
             try:
                 ended.append(guarded(self._function, task, deadline=False))
             except KeyboardInterrupt:
-                # The second Ctrl-C breaks into the running shard (see stop_on_signals).
+                # The second Ctrl-C interrupts the running shard (see stop_on_signals).
                 ended += [_cancelled(t) for t in (task, *self._queue)]
                 self._queue.clear()
         return ended
 
     def has_begun(self, attempt: str) -> bool:
-        return False  # nothing runs while the driver asks
+        return False  # no attempt runs while the driver does
 
     def kill(self, attempt: str) -> None:
         for task in [t for t in self._queue if t.attempt == attempt]:

@@ -1,4 +1,4 @@
-"""The running account of a job and its closing summary. Sums only: a million shards cost no more."""
+"""Running sums of a job and its summary, in constant memory."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _NAMED = 20  # quarantined shards that the summary lists by number
 
 @dataclass
 class JobTotals:
-    """What happened since this driver began. Seconds are sums over attempts."""
+    """Counts since this driver began. Seconds are sums over attempts."""
 
-    shards: int  # of this job, without those that were done before it began
+    shards: int  # of this job, without those done before
     committed: int = 0
     superseded: int = 0  # shards that another driver or an earlier attempt had committed
     elsewhere: int = 0  # shards that another driver had committed before an attempt began here
@@ -59,7 +59,7 @@ class JobTotals:
             self.quarantined_shards.append(shard)
 
     def plus(self, other: JobTotals) -> JobTotals:
-        """Both together, as the totals of one job over several runs."""
+        """The sum of both, for one job over several runs."""
         sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(JobTotals)}
         sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
         return JobTotals(**sums)
@@ -69,9 +69,9 @@ class JobTotals:
 class JobSummary:
     """How a job ended.
 
-    complete: every shard is committed or, within the allowed share, quarantined. interrupted: it
-    was asked to stop. failed: too many shards are quarantined. aborted: `cause` names what no
-    retry can cure, and its mend.
+    complete: every shard is committed or, within the allowed share, quarantined. interrupted: by a stop
+    request. failed: too many shards are quarantined. aborted: `cause` names an error that no retry can fix,
+    and its fix.
     """
 
     end: End
@@ -82,21 +82,21 @@ class JobSummary:
 
     @property
     def remaining(self) -> int:
-        """Shards that a resumed job would still have to make."""
+        """Number of shards that are left to make."""
         return self.totals.shards - self.totals.finished
 
     @property
     def exit_code(self) -> int:
-        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
+        """Exit code of the command line: 0 complete, 1 failed, 2 aborted, 130 interrupted."""
         return {"complete": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
 
     def plus(self, later: JobSummary) -> JobSummary:
-        """Both as one job over several runs, in the worse end, by the cause of the first that ended so."""
+        """The sum of both, for one job over several runs, with the worse end and its first cause."""
         worst = max(self, later, key=lambda summary: get_args(End).index(summary.end))
         totals = self.totals.plus(later.totals)
         return JobSummary(worst.end, worst.cause, totals, self.elapsed_s + later.elapsed_s)
 
 
 def empty_summary() -> JobSummary:
-    """How a job ends that has nothing to do."""
+    """Summary of a job without work."""
     return JobSummary("complete", "", JobTotals(0), 0.0)

@@ -1,4 +1,4 @@
-"""The shards of a job that no attempt here was made at yet, in an order that keeps clear of other drivers."""
+"""The shards of a job without an attempt so far, in an order that avoids other drivers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from datagen.schemas.shard_ranges import ShardRanges
 
 
 class OpenShards:
-    """Gives shards in ascending order from a random one on, and from the first one behind the last.
+    """Gives shards in ascending order from a random start, then from the first one on.
 
-    Drivers that begin at the same shard would make every shard twice. One that runs into another goes on
-    at another random place.
-    16 bytes a range of neighbours, however many shards there are.
+    Drivers with the same start would make every shard twice. A driver that meets another one continues at a
+    new random position. Memory: 16 bytes per range of consecutive shards.
     """
 
     def __init__(self, shards: Sequence[int], rng: random.Random) -> None:
@@ -27,7 +26,7 @@ class OpenShards:
         return len(self._present) + self._after
 
     def next(self) -> int | None:
-        """The next shard; None when all were given out."""
+        """The next shard; None after the last."""
         if not self._present:
             if self._at + 1 >= len(self._bounds):
                 return None
@@ -37,14 +36,14 @@ class OpenShards:
         return shard
 
     def go_elsewhere(self) -> None:
-        """Go on at a random place among the shards that are left."""
+        """Continue at a random position among the remaining shards."""
         left = self._left()
         self._begin(left, left[self._rng.randrange(len(left))] if left else None)
 
     def keep(self, missing: ShardRanges) -> int:
-        """Drop the shards that are not in `missing`; return how many those were.
+        """Drop the shards that are not in `missing`; return their number.
 
-        Where the very next shard is dropped, somebody works right here: it goes on elsewhere.
+        Where the next shard is dropped, another driver works here: continue at a random position.
         """
         before = self._left()
         left = before.within(missing)
@@ -63,7 +62,7 @@ class OpenShards:
         return _joined(rest)
 
     def _begin(self, left: ShardRanges, start: int | None) -> None:
-        """Give out `left` from `start` on and, behind its end, from the first one again."""
+        """Give `left` from `start` on and, after its end, from the first one on."""
         bounds = left.bounds
         if start is not None and start in left:
             row = int(np.searchsorted(bounds[:, 1], start, side="right"))
@@ -83,7 +82,7 @@ class OpenShards:
 
 
 def _joined(bounds: np.ndarray) -> ShardRanges:  # type: ignore[type-arg]
-    """Ranges in any order as a set; neighbours become one."""
+    """Ranges in any order as a set; adjacent ones are joined."""
     bounds = bounds[np.argsort(bounds[:, 0])].astype(np.int64)
     if not len(bounds):
         return ShardRanges(bounds)

@@ -1,4 +1,4 @@
-"""Whether every machine of a cluster can make the shards of a run: asked before the first one."""
+"""Check, before the first shard, that every machine of a cluster can make shards of the run."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from datagen.cluster.task import JobCannotContinue, ShardTask
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 
-_PATIENCE_S = 120.0  # sources are opened, and the first time their digests are taken
-_SHARED = "Put the run and its sources where every machine has them under the same name, or on s3://"
+_PATIENCE_S = 120.0  # sources are opened, and their digests computed
+_SHARED = "Put the run and its sources on a path that every machine has, or on s3://"
 
 
 @dataclass(frozen=True)
 class MachineReport:
-    """Why a machine cannot make shards of the run ("" when it can), and its versions of what matters."""
+    """Why a machine cannot make shards of the run ("" when it can), and its versions of libraries."""
 
     problem: str
     versions: dict[str, str]
 
 
 def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: ShardTask) -> None:
-    """Raise InputError that names the first machine that cannot make the run's shards.
+    """Raise InputError for the first machine that cannot make the run's shards.
 
-    `ask(function, *arguments, patience_s=...)` gives each other machine's answer by its name. A
-    machine is fit when it sees this very run and can write to it, finds the sources, and has the
-    same versions of what moves bits of labels. One that does not answer in time is passed over.
+    `ask(function, *arguments, patience_s=...)` returns each other machine's result by its name. A machine is
+    fit when it can read and write the same run, finds the sources, and has the same versions of libraries
+    that can change bits. Machines that do not respond in time are skipped.
     """
     names, probe = sorted(task.spec.engines), f".probe-{secrets.token_hex(8)}"
     run.storage.put_new(probe, b"driver")
@@ -45,17 +45,17 @@ def refuse_unfit_machines(ask: Callable[..., dict[str, Any]], run: Run, task: Sh
             raise InputError(place, "", fitness.problem, _SHARED)
         if others := {n: v for n, v in fitness.versions.items() if v != here[n]}:
             name, its = min(others.items())
-            problem = f"it has {its or 'none'}, and this machine {here[name]}"
+            problem = f"is {its or 'missing'} there, but {here[name]} on this machine"
             raise InputError(place, name, problem, "Install the versions of constraints.txt on every machine")
 
 
 def inspect_machine(task: ShardTask, probe: str, names: Iterable[str]) -> MachineReport:
-    """What this machine, asked by another, can say of itself."""
+    """The fitness of this machine; runs on each machine."""
     versions = versions_of(names)
     try:
         run, _, _ = open_task(task)
         if not run.storage.exists(probe):
-            return MachineReport(f"{task.run}: another folder has this name there", versions)
+            return MachineReport(f"{task.run}: is another folder there", versions)
         answer = f"{probe}-{secrets.token_hex(8)}"
         run.storage.put_new(answer, b"seen")
         run.storage.delete([answer])
@@ -65,7 +65,7 @@ def inspect_machine(task: ShardTask, probe: str, names: Iterable[str]) -> Machin
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:
-    """Installed versions of those names that are distributions; "" for what is not installed."""
+    """Installed versions of the names that are distributions; "" where not installed."""
     found: dict[str, str] = {}
     for name in names:
         try:

@@ -1,4 +1,4 @@
-"""What a job shows while it runs: a driver's events as progress of its shards."""
+"""Progress of a job: a driver's events shown as progress of its shards."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from datagen.schemas.progress import Pace, Progress, clock_text, whole
 class JobProgress:
     """Events that show shards done, rate, time left, retries, quarantined shards and cost so far.
 
-    `done_before` shards are those that earlier jobs had done.
+    `done_before` counts the shards of earlier jobs.
     """
 
     def __init__(self, shown: Progress, labels_per_shard: int, done_before: int = 0) -> None:
@@ -31,13 +31,13 @@ class JobProgress:
 
     def stopping(self, reason: str) -> None:
         self._note = "  stopping"
-        text = f"{reason}: waiting for what is in flight; Ctrl-C again ends it at once"
+        text = f"{reason}: waiting for running attempts; Ctrl-C again stops at once"
         self._shown.say("stopping", {"reason": reason}, text, "yellow")
 
     def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
         rate, left_s = self._pace.per_s(), left_of(totals, self._pace, self._labels_per_shard)
         cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
-        # What is seldom there takes no room: a usual terminal has 80 columns.
+        # Rare figures are omitted when 0, to fit 80 columns.
         given_up = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
         text = (
             f"{rate:,.0f} labels/s  {clock_text(left_s)} left  "
@@ -58,5 +58,5 @@ class JobProgress:
 
 
 def left_of(totals: JobTotals, pace: Pace, labels_per_shard: int) -> float | None:
-    """Seconds until the last shard at the pace of labels; None while that is unknown."""
+    """Seconds until the last shard at the current rate; None while unknown."""
     return pace.left_s((totals.shards - totals.finished) * labels_per_shard)

@@ -1,7 +1,7 @@
-"""Starting a Ray cluster on this machine, or joining one that runs, and the token that goes with it.
+"""Start a Ray cluster on this machine, or join a running one, with its token.
 
-A cluster that is started here listens on the loopback address alone and answers only those who know
-its random token. A running one is asked whether it wants a token; it is looked for where Ray looks.
+A local cluster listens on loopback and requires a random token. For a running one the token is taken from
+where Ray looks for it, if the cluster requires one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from datagen.cluster.ray_settings import (
 from datagen.schemas.errors import InputError
 
 _PATIENCE_S = 10.0
-_SILENT_START_S = 5.0  # then standard error says what is waited for
+_SILENT_START_S = 5.0  # then a message is printed
 _TOKEN_MEND = (
     "Set RAY_AUTH_TOKEN to the token that the cluster was started with, or RAY_AUTH_TOKEN_PATH to its file"
 )
@@ -39,21 +39,21 @@ _START_MEND = "Start Ray there and give HOST:PORT, or use --address local"
 
 @dataclass(frozen=True)
 class RaySettings:
-    """Where and how wide to run."""
+    """Address and size of a cluster."""
 
     address: str = "local"  # or `auto`, `HOST:PORT`, `ray://...` of a running cluster
-    workers: int | None = None  # slots of a local cluster; None is one a core
-    attempts_per_worker: int = 500  # then a fresh process, against slow leaks
-    resident_limit_bytes: int = 3 * 2**30  # above it after an attempt: a fresh process at once
+    workers: int | None = None  # slots of a local cluster; None: one per core
+    attempts_per_worker: int = 500  # then a new process, because of memory leaks
+    resident_limit_bytes: int = 3 * 2**30  # above it after an attempt: a new process at once
     object_store_bytes: int = OBJECT_STORE_BYTES
 
 
 @contextmanager
 def ray_cluster(settings: RaySettings) -> Generator[Any]:
-    """Start a local cluster, or connect to a running one, for the time of the block; gives `ray`.
+    """Start a local cluster, or connect to a running one, for the block; gives the module `ray`.
 
-    A local cluster has a private folder and no dashboard. Raises InputError when it does not start, the
-    other cannot be reached, or wants another token than is known here.
+    A local cluster has a private folder and no dashboard. Raises InputError when it does not start, when the
+    other one cannot be reached, or requires another token.
     """
     local = settings.address == "local"
     with ExitStack() as whole, ExitStack() as start:
@@ -69,7 +69,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         else:
             address = _resolved(settings.address)
             wanted, options = head_environment("") | token_for(address), {}
-        start.enter_context(changed_environment(wanted))  # workers inherit it; the caller's own stays
+        start.enter_context(changed_environment(wanted))  # workers inherit it; the caller's is restored
         import ray
         from ray.exceptions import AuthenticationError
 
@@ -87,7 +87,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
         except (OSError, RuntimeError, ValueError, AuthenticationError) as error:
             raise _refusal(settings.address, error) from error
         start.close()
-        # Ray prints a paragraph on standard output for each dead worker; the driver reports it already.
+        # Ray prints a paragraph for each dead worker; the driver reports it already.
         ray._private.worker._worker_logs_enabled = False  # pyright: ignore
         whole.callback(ray.shutdown)
         yield ray
@@ -95,7 +95,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
 
 @contextmanager
 def _announced(line: str) -> Generator[None]:
-    """Write a line to standard error when the block takes longer than some seconds."""
+    """Print a line to standard error when the block takes longer than some seconds."""
     timer = threading.Timer(_SILENT_START_S, sys.stderr.write, [line])
     timer.start()
     try:
@@ -105,7 +105,7 @@ def _announced(line: str) -> Generator[None]:
 
 
 def _refusal(address: str, error: BaseException) -> BaseException:
-    """What to raise for an error of Ray while it starts or joins a cluster."""
+    """The InputError for an error of Ray while it starts or joins a cluster."""
     if address == "local":
         return InputError("ray", "", f"does not start: {first_line(error)}", START_MEND)
     if not isinstance(error, RuntimeError):
@@ -118,9 +118,9 @@ def _refusal(address: str, error: BaseException) -> BaseException:
 
 
 def refuse_unusable(address: str) -> None:
-    """Raise InputError where no cluster answers, or one that lets nobody in with the token known here.
+    """Raise InputError where no cluster responds, or it refuses the known token.
 
-    `local` passes. Ray itself tries for minutes, and with messages of its own.
+    `local` is always accepted. Ray itself would retry for minutes.
     """
     if address != "local":
         address = _resolved(address)
@@ -129,10 +129,10 @@ def refuse_unusable(address: str) -> None:
 
 
 def refuse_unreachable(address: str) -> None:
-    """Raise InputError where nothing listens at a `[ray://]HOST:PORT`."""
+    """Raise InputError where no server listens at a `[ray://]HOST:PORT`."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and len(port) < 6):
-        raise InputError("--address", address, "not the address of a cluster", _START_MEND)
+        raise InputError("--address", address, "is not the address of a cluster", _START_MEND)
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE_S).close()
     # A name that cannot be encoded is a ValueError, a port above 65535 an OverflowError.
@@ -141,19 +141,19 @@ def refuse_unreachable(address: str) -> None:
 
 
 def token_for(address: str) -> dict[str, str]:
-    """Environment with which a client of the cluster at HOST:PORT is let in.
+    """Environment of a client of the cluster at HOST:PORT.
 
-    A token is given only to a cluster that asks for one. Raises InputError where none is known here,
-    or the one that is known is not the cluster's.
+    A token is sent only to a cluster that requires one. Raises InputError where none is set, or the cluster
+    refuses it.
     """
-    if address.startswith("ray://"):  # another protocol, which cannot be asked
+    if address.startswith("ray://"):  # another protocol, without this request
         found = known_token()
         return token_environment(found[0]) if found else {"RAY_AUTH_MODE": "disabled"}
     if not _turns_away(address, None):
         return {"RAY_AUTH_MODE": "disabled"}
     found = known_token()
     if found is None:
-        raise InputError("--address", address, "the cluster asks for a token, and none is set", _TOKEN_MEND)
+        raise InputError("--address", address, "the cluster requires a token, but none is set", _TOKEN_MEND)
     token, place = found
     if _turns_away(address, token):
         raise InputError("--address", address, f"the cluster refuses the token in {place}", _TOKEN_MEND)
@@ -161,7 +161,7 @@ def token_for(address: str) -> dict[str, str]:
 
 
 def known_token() -> tuple[str, str] | None:
-    """The token that Ray would find, and where: in the environment, a file that it names, or ~/.ray."""
+    """The token that Ray would use, and its origin: the environment, a file that it names, or ~/.ray."""
     if token := os.environ.get("RAY_AUTH_TOKEN", "").strip():
         return token, "RAY_AUTH_TOKEN"
     path = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
@@ -181,7 +181,7 @@ def first_line(error: BaseException) -> str:
 
 
 def _resolved(address: str) -> str:
-    """`auto` as the HOST:PORT of the cluster that runs here."""
+    """`auto` as the HOST:PORT of the cluster of this machine."""
     if address != "auto":
         return address
     from ray._private.services import canonicalize_bootstrap_address_or_die
@@ -197,7 +197,7 @@ def _resolved(address: str) -> str:
 
 
 def _turns_away(address: str, token: str | None) -> bool:
-    """Whether the cluster refuses a client with this token, or without one. Asks for the cluster's name."""
+    """Whether the cluster refuses a client with this token, or without one, by a request for its name."""
     import grpc
 
     headers = (("authorization", f"Bearer {token}"),) if token else ()
@@ -209,15 +209,15 @@ def _turns_away(address: str, token: str | None) -> bool:
             code = error.code()  # pyright: ignore[reportAttributeAccessIssue]
             if code == grpc.StatusCode.UNAUTHENTICATED:
                 return True
-            problem = f"answers, but not as a Ray cluster does ({code.name.lower()})"
+            problem = f"responds, but not as a Ray cluster ({code.name.lower()})"
             raise InputError("--address", address, problem, _START_MEND) from None
     return False
 
 
 def _keep_ray_local() -> None:
-    """Let Ray use 127.0.0.1 as it is, not this machine's outer address, and upload no code under `uv run`.
+    """Make Ray use 127.0.0.1 instead of this machine's external address, and upload no code under `uv run`.
 
-    It reads both from the environment, but only once, when it is imported, which may have been before.
+    Ray reads both from the environment, but only when it is imported, which may have been before.
     """
     from ray._private import ray_constants
 
@@ -226,8 +226,8 @@ def _keep_ray_local() -> None:
 
 
 def forget_former_token() -> None:
-    """Let Ray read its environment again: it keeps what it read once, in this process."""
+    """Make Ray read its environment again, which it caches in this process."""
     from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
 
-    Config.initialize("")  # first: the loader looks up whether there is to be a token
+    Config.initialize("")  # first: the loader checks whether a token is required
     AuthenticationTokenLoader.instance().reset_cache()

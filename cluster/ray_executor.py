@@ -1,8 +1,7 @@
-"""Attempts as Ray core tasks, on this machine or on a cluster.
+"""Run attempts as Ray tasks, on this machine or on a cluster.
 
-Ray repeats nothing (`max_retries=0`): the driver owns attempts, and a hidden repetition would
-falsify the account of the cost. A hung native call ignores a soft cancellation and leaks its CPU
-slot, so attempts are only ever ended by force.
+Ray retries nothing (`max_retries=0`): the driver retries, and a hidden retry would falsify the cost. A hung
+native call ignores a soft cancellation and leaks its CPU slot, so attempts are always killed.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from datagen.schemas.run_records import Outcome
 
 _SLOTS_SEEN_FOR_S = 5.0
 _BEGUN_SEEN_FOR_S = 1.0
-# A forced cancellation ends a worker that heeds Ray at once; after this, others are ended by their note.
+# A forced cancellation normally kills a worker at once; after this, it is killed by its note.
 _HEEDS_RAY_WITHIN_S = 1.0
-# How long other machines are waited for; they may have to start a process first.
+# Timeout for other machines, which may have to start a process first.
 _BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
 
 T = TypeVar("T", bound=Task)
@@ -34,7 +33,7 @@ T = TypeVar("T", bound=Task)
 
 @dataclass(frozen=True)
 class _Death(Generic[T]):
-    """What Ray says of an attempt whose worker gave no report."""
+    """Ray's result for an attempt without a worker's report."""
 
     task: T
     outcome: Outcome
@@ -53,7 +52,7 @@ class _PostMortemCheck(Generic[T]):
 def ray_executor(
     function: Callable[[T, Meter], AttemptResult], settings: RaySettings
 ) -> Generator[RayExecutor[T]]:
-    """An executor over `ray_cluster(settings)`; a local cluster that dies is started anew."""
+    """Give an executor over `ray_cluster(settings)`; a local cluster that dies is restarted."""
     with ExitStack() as stack:
 
         def restart() -> Any:
@@ -69,10 +68,10 @@ def ray_executor(
 
 
 class RayExecutor(Generic[T]):
-    """An executor over a Ray cluster that lives as long as `ray_cluster` is open.
+    """Executor over a Ray cluster that is open as long as `ray_cluster`.
 
-    Where the cluster dies, everything in flight is lost. `restart` gives another one; without it the
-    reports end the job.
+    If the cluster dies, all attempts in flight are lost. `restart` starts another one; without it the reports
+    end the job.
     """
 
     def __init__(
@@ -96,10 +95,10 @@ class RayExecutor(Generic[T]):
         self._tasks: dict[Any, T] = {}  # by the reference to the result
         self._refs: dict[str, Any] = {}  # by attempt
         self._post_mortem_checks: list[_PostMortemCheck[T]] = []
-        self._killed: dict[str, float] = {}  # attempts to end, and when to do so by their notes elsewhere
+        self._killed: dict[str, float] = {}  # attempts to kill, and when to kill them by their notes
         self._begun_elsewhere: set[str] = set()
         self._begun_until_s = 0.0
-        self._jobs: set[str] = set()  # names under which notes are kept
+        self._jobs: set[str] = set()  # folder names of notes
         self._join(ray)
 
     def _join(self, ray: Any) -> None:
@@ -132,7 +131,7 @@ class RayExecutor(Generic[T]):
         self._end_stubborn()
         refs = [*self._tasks, *asked]
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
-        if ready:  # take along whatever else has ended
+        if ready:  # also take all others that have ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for check in self._post_mortem_checks:
             self.others.hear(check.question, ready)
@@ -147,7 +146,7 @@ class RayExecutor(Generic[T]):
             return False
         if attempts_begun(self._tasks[ref].notes, [attempt]):
             return True
-        if time.monotonic() >= self._begun_until_s:  # many are asked about at a time
+        if time.monotonic() >= self._begun_until_s:  # checked in batches, at intervals
             self._begun_elsewhere = {
                 begun
                 for notes, flying in self._by_notes(self._tasks.values()).items()
@@ -165,16 +164,16 @@ class RayExecutor(Generic[T]):
             return
         self._killed[attempt] = time.monotonic() + _HEEDS_RAY_WITHIN_S
         self._ray.cancel(ref, force=True)
-        end_attempts(self._tasks[ref].notes, [attempt])  # a stopped process does not heed Ray
+        end_attempts(self._tasks[ref].notes, [attempt])  # a stopped process ignores Ray
 
     def close(self) -> None:
-        """Remove what the job's workers left on other machines."""
+        """Remove the notes of the job's workers on other machines."""
         for notes in self._jobs - {""}:
             self.others.ask(clear_notes, notes, patience_s=_FORGOTTEN_WITHIN_S)
         self._jobs.clear()
 
     def _end_stubborn(self) -> None:
-        """End by their notes those on other machines that have outlived their cancellation."""
+        """Kill attempts on other machines that outlived their cancellation, by their notes."""
         now_s = time.monotonic()
         due = [attempt for attempt, when_s in self._killed.items() if when_s <= now_s]
         if not due:
@@ -182,10 +181,10 @@ class RayExecutor(Generic[T]):
         self._killed.update(dict.fromkeys(due, float("inf")))
         stubborn = [self._tasks[ref] for a in due if (ref := self._refs.get(a)) is not None]
         for notes, attempts in self._by_notes(stubborn).items():
-            self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # nothing is waited for
+            self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # without waiting
 
     def _lose_all(self, cause: str) -> list[AttemptReport]:
-        """Reports of all that was in flight on a cluster that died: what has answered, and what is lost."""
+        """Reports of all attempts of a dead cluster: finished ones, and lost ones."""
         refs = list(self._tasks)
         ended = [self._answer(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
         reports = [answer for answer in ended if not isinstance(answer, _Death)]
@@ -202,7 +201,7 @@ class RayExecutor(Generic[T]):
             try:
                 self._join(self._restart())
             except InputError as error:
-                ends_job, cause = True, f"{cause}, and Ray cannot be started anew: {error}"
+                ends_job, cause = True, f"{cause}, and Ray cannot be restarted: {error}"
         for death in deaths:
             end_attempts(death.task.notes, [death.task.attempt])  # a worker may outlive its raylet
             report = failure_report(death.task, death.outcome, death.cause)
@@ -215,21 +214,21 @@ class RayExecutor(Generic[T]):
         killed = self._killed.pop(task.attempt, None) is not None
         try:
             return self._ray.get(ref)
-        except e.RayTaskError as error:  # outside the guard: the task or its module did not arrive whole
+        except e.RayTaskError as error:  # outside the guard: the task or its module could not be loaded
             return _Death(task, "failed", f"{type(error.cause).__name__}: {error.cause}")
         except e.TaskCancelledError:
-            return _Death(task, "cancelled", "ended by force")
+            return _Death(task, "cancelled", "killed")
         except e.OutOfMemoryError as error:
             return _Death(task, "out_of_memory", first_line(error))
         except e.WorkerCrashedError:
             if killed:
-                return _Death(task, "cancelled", "ended by force")
-            return _Death(task, "crashed", "the worker process died (killed, or ended by native code)")
-        except e.RayError as error:  # node, raylet, owner or object gone: the shard is not to blame
+                return _Death(task, "cancelled", "killed")
+            return _Death(task, "crashed", "the worker process died (killed, or crashed in native code)")
+        except e.RayError as error:  # node, raylet, owner or object lost: not the shard's fault
             return _Death(task, "lost", f"{type(error).__name__}: {first_line(error)}")
 
     def _failure_reports(self, deaths: list[_Death[T]]) -> list[AttemptReport]:
-        """Reports of dead attempts from what they left here; other machines are asked about the rest."""
+        """Reports of dead attempts from their files here; other machines are asked for the rest."""
         reports: list[AttemptReport] = []
         unknown: dict[str, list[_Death[T]]] = defaultdict(list)
         has_others = bool(deaths) and bool(self.others.alive())
@@ -259,9 +258,10 @@ class RayExecutor(Generic[T]):
             self._post_mortem_checks.remove(check)
             for death in check.deaths:
                 found, outcome, cause = left.get(death.task.attempt), death.outcome, death.cause
-                # A worker that died left its note on its machine. Where none has it, the machine went too.
+                # A dead worker left its note on its machine. Where no machine has it, the machine was lost
+                # too.
                 if found is None and outcome == "crashed":
-                    outcome, cause = "lost", "its worker is gone, and the machine that had it does not answer"
+                    outcome, cause = "lost", "its worker died, and its machine does not respond"
                 reports.append(failure_report(death.task, outcome, cause, found or PostMortem()))
         return reports
 
@@ -275,10 +275,10 @@ class RayExecutor(Generic[T]):
 
 
 def retire_worker() -> None:
-    """Let this Ray worker process end once its present task has been answered.
+    """Make this Ray worker process exit after its current task.
 
-    Ray ends a worker when its count of executions reaches `max_calls`; there is no public way to
-    ask for it, so the count is put to the last before the end.
+    Ray ends a worker when its count of executions reaches `max_calls`; there is no public way to request it,
+    so the count is set to the last before the end.
     """
     import ray
 

@@ -1,6 +1,7 @@
-"""A Ray head of this machine for detached jobs: it outlives the shell, listens on loopback, asks for a token.
+"""The Ray head of this machine for detached jobs: it outlives the shell, and is private to the user.
 
-One for each user, known by a file in the user's state folder that others cannot read.
+It listens on loopback and requires a token. There is one per user, recorded in a private file in the user's
+state folder.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _MAX_BYTES = 1 << 16
 
 
 class Head(StoredRecord):
-    """head.json in the state folder: the head that this user's detached jobs go to."""
+    """head.json in the state folder: the Ray head of this user's detached jobs."""
 
     jobs_api: str = Field(pattern=r"^http://127\.0\.0\.1:[0-9]{1,5}$")
     token: str = Field(pattern=r"^[0-9a-f]{64}$")
@@ -43,7 +44,7 @@ class Head(StoredRecord):
 
 
 def state_folder() -> Path:
-    """Where this user's programs keep what outlives them: DATAGEN_STATE, else the system's place for it."""
+    """The user's state folder: DATAGEN_STATE, else the default of the system."""
     if named := os.environ.get("DATAGEN_STATE"):
         return Path(named).expanduser().absolute()
     home = os.environ.get("XDG_STATE_HOME")
@@ -51,24 +52,24 @@ def state_folder() -> Path:
 
 
 def running_head() -> Head | None:
-    """The head that answers on this machine; None where none does."""
+    """The running head of this machine; else None."""
     head = _read()
     return head if head is not None and _answers(head) else None
 
 
 def ensure_head(workers: int) -> Head:
-    """The head of this machine, started with this many slots where none runs. InputError where it fails."""
+    """The head of this machine, started with this many slots where none runs. InputError on failure."""
     with _locked():
         head = running_head()
         if head is None:
             if (stale := _read()) is not None:
-                _end(stale)  # it does not answer: what is left of it would keep its cores busy
+                _end(stale)  # it does not respond: its remaining processes would keep cores busy
             head = _start(workers)
         return head
 
 
 def stop_head() -> bool:
-    """End the head and all that runs on it; False where there is none."""
+    """Stop the head and all its jobs; False where there is none."""
     with _locked():
         head = _read()
         if head is None:
@@ -78,7 +79,7 @@ def stop_head() -> bool:
 
 
 def head_token(jobs_api: str) -> str:
-    """The token for the Jobs API at this address, where it is our head's; "" for others."""
+    """The token of the Jobs API at this address where it is this user's head; "" for others."""
     head = _read()
     return head.token if head is not None and head.jobs_api == jobs_api else ""
 
@@ -86,11 +87,11 @@ def head_token(jobs_api: str) -> str:
 @contextmanager
 def _locked() -> Generator[None]:
     folder = state_folder()
-    mend = "Name a folder of your own, of mode 0700, as DATAGEN_STATE"
+    mend = "Set DATAGEN_STATE to a folder of your own, of mode 0700"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not is_private(folder.stat()):
-            raise InputError(folder, "", "other users can write to it, or it is another user's", mend)
+            raise InputError(folder, "", "belongs to another user, or other users can write to it", mend)
         file = (folder / "head.lock").open("w")
     except OSError as error:
         raise InputError(folder, "", f"cannot be written: {error.strerror}", mend) from error
@@ -103,10 +104,10 @@ def _read() -> Head | None:
     try:
         with (state_folder() / "head.json").open("rb") as file:
             if not is_private(os.fstat(file.fileno())):
-                return None  # another user's: who follows it would run what that user says
+                return None  # another user's file: following it would run that user's code
             return Head.model_validate_json(file.read(_MAX_BYTES))
     except (OSError, ValidationError):
-        return None  # lost or broken: then the next job starts a head of its own
+        return None  # missing or damaged: the next job starts a new head
 
 
 def _start(workers: int) -> Head:
@@ -122,17 +123,17 @@ def _start(workers: int) -> Head:
             write_private(state_folder() / "head.json", head.model_dump_json())
             return head
         remove_folder(folder)
-        # Ray gives its own processes 15 to 30 s, which a busy machine does not keep.
+        # Ray's own timeouts of 15 to 30 s are too short for a busy machine.
         if time.monotonic() >= until_s:
             mend = "Submit again when the machine is less busy, or without --detach"
             raise InputError("ray", "", f"does not start: {head}", mend)
-        sys.stderr.write(f"Ray did not start and is started again: {head}\n")
+        sys.stderr.write(f"Ray did not start; trying again: {head}\n")
 
 
 def _started(workers: int, folder: Path, until_s: float) -> Head | str:
-    """The head, started once in this private folder; what it said last where it failed."""
+    """Start the head in this private folder; return it, or its last message where it failed."""
     token, said = new_token(), folder / "start.txt"
-    # Jobs bring stores and caches of their own: one must never work with the credentials of another.
+    # Jobs bring their own store settings: no job may use the credentials of another.
     inherited = {n: value for n, value in os.environ.items() if n != "RAY_ADDRESS" and not is_of_the_shell(n)}
     arguments = [*head_arguments(max(1, workers)), f"--temp-dir={folder / RAY}"]
     with said.open("w") as out:
@@ -143,7 +144,7 @@ def _started(workers: int, folder: Path, until_s: float) -> Head | str:
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # the end of the shell is not its end
+            start_new_session=True,  # it outlives the shell
         )
         try:
             code = process.wait(max(0.0, until_s - time.monotonic()))
@@ -153,7 +154,7 @@ def _started(workers: int, folder: Path, until_s: float) -> Head | str:
     text = said.read_text(errors="replace")
     found = _URL.search(text)
     if code != 0 or found is None:
-        return next((line for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
+        return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
     return Head(jobs_api=found[0], token=token, group=process.pid, folder=str(folder))
 
 

@@ -1,4 +1,4 @@
-"""Ray's Jobs API: commands that a cluster runs for whoever may ask, with their output and their end."""
+"""Client of Ray's Jobs API, which runs commands on a cluster."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from datagen.cluster.ray_cluster import first_line, known_token, refuse_unreacha
 from datagen.schemas.errors import InputError
 
 _MEND = (
-    "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it asks for one"
+    "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
 )
-# A head that has just started has no agent yet.
+# A newly started head has no agent yet.
 _AGENT_WITHIN_S = 60.0
 _ANSWER_WITHIN_S = 5.0
 _WORK = ("PENDING", "RUNNING")
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
-# Ray takes these over the address that it is given.
+# Ray prefers these to the given address.
 _OVERRIDES = ("RAY_ADDRESS", "RAY_API_SERVER_ADDRESS")
 
 
@@ -32,9 +32,9 @@ class RayJobs:
         self._client = client
 
     def submit(self, entrypoint: str, submission: str, environment: Mapping[str, str]) -> None:
-        """Let the cluster's head run a shell command under a name of our own.
+        """Run a shell command on the cluster's head under a name of our own.
 
-        Others may see the variables: no secret may be among them.
+        Others may see the variables, so they must not contain secrets.
         """
         runtime: dict[str, Any] = {"env_vars": dict(environment)}
         if JOB_ENVIRONMENT in environment:
@@ -52,7 +52,7 @@ class RayJobs:
                 time.sleep(0.5)
 
     def state(self, submission: str) -> str:
-        """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED; "" where the cluster does not know it."""
+        """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED; "" for an unknown job."""
         try:
             return str(self._client.get_job_status(submission).value)
         except RuntimeError as error:
@@ -61,20 +61,20 @@ class RayJobs:
             raise InputError(self.url, submission, first_line(error), _MEND) from error
 
     def message(self, submission: str) -> str:
-        """What Ray says of the job."""
+        """Ray's message on the job."""
         return " ".join(str(self._client.get_job_info(submission).message).split())
 
     def output(self, submission: str) -> str:
-        """All that the command has written so far."""
+        """The output of the command so far."""
         try:
             return str(self._client.get_job_logs(submission))
         except RuntimeError as error:
             raise InputError(
-                self.url, submission, first_line(error), "The cluster has forgotten it"
+                self.url, submission, first_line(error), "The cluster does not keep this job any more"
             ) from error
 
     def stop(self, submission: str) -> None:
-        """End the command: politely, and by force some seconds later."""
+        """Stop the command: SIGTERM, and SIGKILL some seconds later."""
         try:
             self._client.stop_job(submission)
         except RuntimeError as error:
@@ -88,15 +88,15 @@ class RayJobs:
 
 
 def open_ray_jobs(address: str, token: str = "") -> RayJobs:
-    """The Jobs API at a dashboard (`http://HOST:PORT`) or of a cluster (`HOST:PORT`, `ray://...`, `auto`).
+    """Open the Jobs API at a dashboard (`http://HOST:PORT`) or cluster (`HOST:PORT`, `ray://...`, `auto`).
 
-    Without `token` the one is given that Ray would find, to a cluster that asks for it. InputError where
-    nothing answers there, or not to us.
+    Without `token`, the one that Ray would use is sent to a cluster that requires one. InputError where no
+    cluster responds, or it refuses the token.
     """
     changed: dict[str, str | None] = dict.fromkeys(_OVERRIDES)
     if "@" in address:
-        mend = "Leave it out; a token goes into RAY_AUTH_TOKEN"
-        raise InputError("--address", "", "a password in an address gets into records and logs", mend)
+        mend = "Remove it; set a token as RAY_AUTH_TOKEN"
+        raise InputError("--address", "", "has a password, which would appear in records and logs", mend)
     if address.startswith(("http://", "https://")):
         url = address
     else:
@@ -120,7 +120,7 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
 
 
 def _speaks_http(address: str) -> bool:
-    """Whether HOST:PORT is a dashboard: the other ports of a cluster do not answer such a request."""
+    """Whether HOST:PORT is a dashboard: other ports of a cluster do not respond to HTTP."""
     return "://" not in address and address != "auto" and _status(f"http://{address}") is not None
 
 
@@ -129,7 +129,7 @@ def _turns_away(url: str) -> bool:
 
 
 def _status(url: str) -> int | None:
-    """What a dashboard answers to one who says nothing of himself; None where it does not."""
+    """A dashboard's response to a request without a token; None where there is none."""
     parts = urlsplit(url)
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     connection = kind(parts.netloc, timeout=_ANSWER_WITHIN_S)

@@ -1,8 +1,8 @@
-"""A Ray node of this machine alone, with the two processes that run tasks and nothing else.
+"""A minimal Ray node of this machine: only the two native processes that run tasks.
 
-Ray also starts a dashboard, monitors and two agents in Python. They take seconds and 400 MB, its raylet
-ends itself where an agent is not up within 15 s, and agents outlive a killed driver. Nothing of a local job
-needs them: no runtime environments, no Jobs API, no metrics.
+Ray normally also starts a dashboard, monitors and two agents in Python. They take seconds and 400 MB, the
+raylet exits where an agent does not start within 15 s, and agents outlive a killed driver. A local job needs
+none of them: no runtime environments, no Jobs API, no metrics.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from datagen.schemas.errors import InputError
 
 _START_WITHIN_S = 300.0
 _LOOK_S = 0.05
-# Files in which the raylet waits for its agents to say where they listen. Nobody connects to port 1.
+# Files in which the raylet expects the ports of its agents. Port 1 is never connected to.
 _AGENT_PORTS = (
     "dashboard_agent_listen_port",
     "metrics_agent_port",
     "metrics_export_port",
     "runtime_env_agent_port",
 )
-# In place of an agent: it ends when the raylet does, because its input then ends.
+# In place of an agent: it exits with the raylet, when its input ends.
 _NO_AGENT = "/bin/cat"
 START_MEND = (
     "Start it again when the machine is less busy; use --workers 0, which needs no Ray, or the --address of "
@@ -34,9 +34,9 @@ START_MEND = (
 
 @contextmanager
 def slim_node() -> Generator[None]:
-    """Let Ray start a cluster of this machine with its two native processes alone, for the time of the block.
+    """Make Ray start local clusters with only its two native processes, within the block.
 
-    Inside it, `ray.init` raises InputError where the node is not up in five minutes.
+    Inside it, `ray.init` raises InputError where the node does not start in five minutes.
     """
     from ray._private import node, services
 
@@ -60,7 +60,7 @@ def slim_node() -> Generator[None]:
             self._await_raylet()
 
         def _await_raylet(self) -> None:
-            """Wait until the node is known: Ray itself gives up after 30 s."""
+            """Wait until the node is registered; Ray itself gives up after 30 s."""
             raylet: Any = self.all_processes["raylet"][0].process
             until_s = time.monotonic() + _START_WITHIN_S
             while True:

@@ -1,4 +1,4 @@
-"""The machines of a Ray cluster: whether the driver's own is part of it, and what only others can see."""
+"""The machines of a Ray cluster: their health, and requests to the others."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from typing import Any
 
 from datagen.cluster.post_mortem import PostMortem, collect_post_mortem, read_note
 
-_MUTE_S = 30.0  # a machine that did not answer is left alone for so long
+_MUTE_S = 30.0  # a machine that did not respond is not asked again for this time
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
-# A GCS server of others may be started anew, and be back at once. Without one, Ray ends the process at 60 s.
+# A remote GCS server may be restarted. Without one, Ray ends this process after 60 s.
 _PATIENCE_S = 20.0
 
 
 class OwnNode:
-    """The two servers that a driver needs: its machine's raylet, and the cluster's GCS server.
+    """Health of the two servers that a driver needs: its machine's raylet and the cluster's GCS server.
 
-    Ray lets a driver without them wait, fail or die, a minute later. So they are asked whether they
-    listen: once a second, and right before each request that would block.
+    Without them, Ray makes a driver wait, fail or exit a minute later. So they are checked once a second, and
+    before each request that would block.
     """
 
     def __init__(self, ray: Any, address: str) -> None:
-        self._node = ray._private.worker._global_node  # None for a client (ray://), which needs neither
+        self._node = ray._private.worker._global_node  # None for a client (ray://), which needs none of them
         self._patience_s = 0.0 if address == "local" else _PATIENCE_S
         self._heard_s = self._looked_s = time.monotonic()
 
     def dead(self) -> str:
-        """Which server has been silent for too long; "" where none has."""
+        """The server that has not responded for too long; "" for none."""
         if self._node is None or time.monotonic() < self._looked_s + _LOOK_S:
             return ""
         self._looked_s, silent = time.monotonic(), self.silent()
@@ -42,50 +42,50 @@ class OwnNode:
         return silent if self._looked_s - self._heard_s >= self._patience_s else ""
 
     def silent(self) -> str:
-        """Which server does not answer now; "" where both do."""
+        """The server that does not respond now; "" for none."""
         if self._node is None:
             return ""
         host, _, port = self._node.gcs_address.rpartition(":")
         try:
             socket.create_connection((host.strip("[]"), int(port)), _CONNECTS_WITHIN_S).close()
         except OSError as error:
-            return f"Ray's GCS server at {host}:{port} does not answer ({error})"
+            return f"Ray's GCS server at {host}:{port} does not respond ({error})"
         try:
             with socket.socket(socket.AF_UNIX) as raylet:
                 raylet.settimeout(_CONNECTS_WITHIN_S)
                 raylet.connect(self._node.raylet_socket_name)
         except OSError as error:
-            return f"Ray's raylet on this machine does not answer ({error})"
+            return f"Ray's raylet on this machine does not respond ({error})"
         return ""
 
 
 @dataclass
 class Question:
-    """A question to every other machine, and the answers so far, by the machine's name."""
+    """A request to every other machine, with the results so far by the machine's name."""
 
-    silent: dict[Any, tuple[str, str]]  # reference to the answer -> the machine's id and name
-    until_s: float  # when those that are still silent are given up
+    silent: dict[Any, tuple[str, str]]  # reference to the result -> the machine's id and name
+    until_s: float  # timeout
     answers: dict[str, Any] = field(default_factory=dict)
 
 
 class OtherNodes:
-    """The machines of a cluster beside the driver's own, as they come and go.
+    """The machines of a cluster except the driver's own.
 
-    Each question is one tiny task a machine, pinned to it. A machine that does not answer in time is
-    no error: what it would have said is missing.
+    Each request is one small task per machine, pinned to it. Results of machines that do not respond in time
+    are missing, without an error.
     """
 
     def __init__(self, ray: Any, address: str) -> None:
         self._ray = ray
         self.own = OwnNode(ray, address)
         self._alone = address == "local"
-        # The client of `ray://` runs on no machine of the cluster.
+        # A client of `ray://` is not a machine of the cluster.
         self._own = "" if address.startswith("ray://") else str(ray.get_runtime_context().get_node_id())
         self._mute_until_s: dict[str, float] = {}
         self._tasks: dict[Callable[..., Any], Any] = {}  # each is sent to the cluster once
 
     def alive(self) -> dict[str, str]:
-        """Name of each living machine but the driver's, by id: address, and what tells neighbours apart."""
+        """Unique name of each living machine except the driver's, by id."""
         if self._alone or self.own.silent():
             return {}
         return {
@@ -95,9 +95,9 @@ class OtherNodes:
         }
 
     def ask(self, function: Callable[..., Any], *arguments: Any, patience_s: float) -> dict[str, Any]:
-        """What `function(*arguments)` gives on each machine, by its name, of those that answer in time.
+        """Results of `function(*arguments)` on each machine that responds in time, by its name.
 
-        Waits for them, but leaves those alone for a while that were silent at the last time.
+        Machines that did not respond to the last request are skipped for a while.
         """
         now_s = time.monotonic()
         deaf = [node for node, until_s in self._mute_until_s.items() if now_s < until_s]
@@ -111,7 +111,7 @@ class OtherNodes:
     def put(
         self, function: Callable[..., Any], *arguments: Any, patience_s: float, but: Sequence[str] = ()
     ) -> Question:
-        """Put a question to every machine that is not among `but`, without waiting for answers."""
+        """Send a request to every machine that is not in `but`, without waiting."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         if function not in self._tasks:
@@ -126,39 +126,39 @@ class OtherNodes:
         return Question(sent, time.monotonic() + patience_s)
 
     def hear(self, question: Question, ready: Iterable[Any]) -> None:
-        """Take the answers that have come among these references."""
+        """Collect the finished results among these references."""
         for ref in [r for r in ready if r in question.silent]:
             _, name = question.silent.pop(ref)
             try:
                 question.answers[name] = self._ray.get(ref)
-            except self._ray.exceptions.RayError:  # the machine went, or cannot load this package
+            except self._ray.exceptions.RayError:  # the machine was lost, or cannot load this package
                 continue
 
 
-# What the machines are asked; each of these runs there.
+# The requests; each of these functions runs on the other machines.
 
 
 def attempts_begun(notes: str, attempts: Sequence[str]) -> list[str]:
-    """Those of the attempts that this machine is at."""
+    """The attempts that are running on this machine."""
     return [attempt for attempt in attempts if read_note(notes, attempt) is not None]
 
 
 def post_mortems_of(notes: str, attempts: Sequence[str]) -> dict[str, PostMortem]:
-    """What dead workers of this machine left of the attempts; what is given is removed here."""
+    """Take the files of dead workers of the attempts from this machine."""
     found = {attempt: collect_post_mortem(notes, attempt) for attempt in attempts}
     return {attempt: left for attempt, left in found.items() if left.note is not None}
 
 
 def end_attempts(notes: str, attempts: Sequence[str]) -> None:
-    """SIGKILL to the workers of this machine that are at one of the attempts."""
+    """Kill the workers of this machine that run one of the attempts."""
     for attempt in attempts:
-        note = read_note(notes, attempt)  # exists only while a process is at it
+        note = read_note(notes, attempt)  # exists only while a process runs it
         if note is not None and note.host.name == platform.node():
             _kill_worker(note.host.pid)
 
 
 def _kill_worker(pid: int) -> None:
-    """SIGKILL to a process of this machine if it is a Ray worker; others are left alone."""
+    """Kill a process of this machine if it is a Ray worker."""
     try:
         if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::"):
             os.kill(pid, signal.SIGKILL)

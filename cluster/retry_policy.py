@@ -1,6 +1,6 @@
-"""When to try again, when to give up, how long to wait: pure functions of plain values.
+"""Retries, quarantine and deadlines: pure functions of plain values.
 
-Nothing here reads a clock or draws a number, so a script of failures plays the same every time.
+No function reads a clock or random numbers, so decisions are reproducible in tests.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ Action = Literal["done", "retry", "quarantine", "drop", "abort"]
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """The budgets of a job. Seconds unless a name says otherwise."""
+    """The limits of a job. Times in seconds."""
 
-    max_failures: int = 3  # crash, hang, exception or bad output; then the shard is given up
-    max_lost: int = 10  # losses that count against the shard (see `decide`), in a budget of their own
-    max_lost_rounds: int = 5  # all that was in flight lost so many times in a row: the executor is at fault
+    max_failures: int = 3  # crash, hang, exception or bad output; then the shard is quarantined
+    max_lost: int = 10  # losses that count against the shard (see `decide`), a separate limit
+    max_lost_rounds: int = 5  # consecutive rounds in which all attempts were lost: the executor is at fault
     max_out_of_memory: int = 2
     backoff_s: float = 0.5  # wait before the second attempt; doubles with every further one
     max_backoff_s: float = 60.0
-    window_factor: float = 2.0  # attempts in flight per slot, so that no worker waits for the driver
-    initial_deadline_s: float = 1800.0  # before anything is known about this job's shards
+    window_factor: float = 2.0  # attempts in flight per slot, so that workers never wait for the driver
+    initial_deadline_s: float = 1800.0  # before the durations of this job's shards are known
     min_deadline_s: float = 60.0
-    deadline_factor: float = 10.0  # over the 95th percentile of what committed attempts took
-    deadlines_known_after: int = 20  # committed attempts before the percentile is believed
-    grace_s: float = 10.0  # the worker's own deadline comes first; the driver's this much later
-    queue_deadlines: float = 20.0  # deadlines after which an attempt that never began is lost
-    drain_s: float = 60.0  # how long a stop waits for what is in flight
+    deadline_factor: float = 10.0  # times the 95th percentile of committed attempts
+    deadlines_known_after: int = 20  # committed attempts before the percentile is used
+    grace_s: float = 10.0  # delay of the driver's deadline after the worker's own
+    queue_deadlines: float = 20.0  # deadlines after which an attempt that has not begun is lost
+    drain_s: float = 60.0  # how long a stop waits for attempts in flight
     kill_s: float = 10.0  # how long the driver waits for a killed attempt to be reported
-    max_quarantined_share: float = 0.01  # of the shards of this job; above it the job has failed
+    max_quarantined_share: float = 0.01  # of this job's shards; above it the job fails
     give_up_after: int = 20  # quarantined shards before the share may end the job early
-    look_s: float = 5.0  # between two looks at what other drivers of the run have committed
-    look_factor: float = 20.0  # and at least so many times as long as the last look took
-    max_waiting: int = 1000  # shards that wait for a retry; with more, no new shard is begun
+    look_s: float = 5.0  # between two checks of the commits of other drivers
+    look_factor: float = 20.0  # and at least this multiple of the duration of the last check
+    max_waiting: int = 1000  # shards that wait for a retry; with more, no new shard is started
 
 
 @dataclass(frozen=True)
 class ShardFailures:
-    """What went wrong with one shard so far. Shards without trouble have none of these."""
+    """The failures of one shard so far."""
 
     failures: int = 0
     lost: int = 0  # those that count
@@ -58,7 +58,7 @@ class ShardFailures:
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do after an attempt ended. `wait_s` is for retries."""
+    """The action after an attempt. `wait_s` is for retries."""
 
     action: Action
     trouble: ShardFailures
@@ -72,12 +72,12 @@ def decide(
     successes: int = 0,
     alone: bool = False,
 ) -> Decision:
-    """What to do with a shard after this report.
+    """Decide what to do with a shard after this report.
 
-    A superseded attempt is done: the shard is committed, by whoever was first. A cancelled one is
-    dropped: the job is stopping and the shard stays open for the next. A loss counts against the shard
-    where it was `alone` in flight, or where others succeeded since it was lost before (`successes` are
-    those of the job so far): a machine or a cluster that is gone loses everything, whichever shard it is.
+    A superseded attempt is done: another one is committed. A cancelled one is dropped: the job is stopping,
+    and the shard stays open for the next. A loss counts against the shard where it was `alone` in flight, or
+    where others succeeded since its last loss (`successes` counts the job's): a lost machine or cluster loses
+    all attempts, whatever the shard.
     """
     if report.outcome in ("committed", "superseded"):
         return Decision("done", trouble)
@@ -109,7 +109,7 @@ def decide(
 
 
 def is_suspect(trouble: ShardFailures) -> bool:
-    """Whether the shard may be what takes its machine along: then no other suspect is in flight with it."""
+    """Whether the shard may crash its machine: then no other suspect runs at the same time."""
     return trouble.lost >= 2
 
 
@@ -124,18 +124,18 @@ def at_once(lost_in_a_row: int, width: int) -> int:
 def nothing_runs(policy: RetryPolicy, lost_in_a_row: int, width: int) -> bool:
     """Whether the executor, not a shard, is at fault: of `width` attempts in flight all are lost, always.
 
-    Not before the budget of a shard that is the only one left has decided.
+    Not before the limit of a shard that is the only one left is reached.
     """
     return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * width)
 
 
 def window(policy: RetryPolicy, slots: int) -> int:
-    """How many attempts to keep in flight."""
+    """Number of attempts to keep in flight."""
     return max(1, math.ceil(policy.window_factor * slots))
 
 
 class Durations:
-    """The wall seconds of the latest committed attempts: bounded memory, cheap to ask."""
+    """The wall seconds of the latest committed attempts, in bounded memory."""
 
     def __init__(self, kept: int = 256) -> None:
         self._latest: deque[float] = deque(maxlen=kept)
@@ -145,7 +145,7 @@ class Durations:
     def add(self, wall_s: float) -> None:
         self._latest.append(wall_s)
         self._seen += 1
-        # Sorting at every shard would cost more than the answer is worth.
+        # Sorting for every shard would be too slow.
         if self._seen <= 32 or self._seen % 32 == 0:
             self._p95_s = percentile_95(self._latest)
 
@@ -159,13 +159,13 @@ class Durations:
 
 
 def percentile_95(values: Sequence[float] | deque[float]) -> float:
-    """The smallest value that at least 95 % of the values do not exceed; `values` is not empty."""
+    """The 95th percentile: the smallest value that 95 % do not exceed; `values` is not empty."""
     ordered = sorted(values)
     return ordered[math.ceil(0.95 * len(ordered)) - 1]
 
 
 def deadline_s(policy: RetryPolicy, durations: Durations, trouble: ShardFailures) -> float:
-    """How long an attempt may run: well above what others took, doubled after each hang."""
+    """Deadline of an attempt: well above the duration of others, doubled after each hang."""
     if durations.seen < policy.deadlines_known_after:
         base = policy.initial_deadline_s
     else:
@@ -179,5 +179,5 @@ def too_many_quarantined(policy: RetryPolicy, quarantined: int, shards: int) -> 
 
 
 def ends_early(policy: RetryPolicy, quarantined: int, shards: int) -> bool:
-    """Whether going on would only burn money: so many shards are bad that the job has failed."""
+    """Whether to stop early because the job has failed already."""
     return quarantined >= policy.give_up_after and too_many_quarantined(policy, quarantined, shards)

@@ -14,21 +14,21 @@ from datagen.schemas.run_records import Commit, LedgerEntry, QuarantineRecord
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.summaries import refresh
 
-# The index is brought up to date after so many attempts, and not before so many times the time that it
-# took last: a job of a million shards spends a small share of its driver on it.
+# The index is updated after this many attempts, and at the earliest after this multiple of the duration of
+# the last update, so that it takes a small share of the driver's time.
 _INDEX_EVERY = 500
 _INDEX_FACTOR = 30.0
 
 
 class RunRecorder:
-    """Writes the ledger and the quarantine of one run, and now and then its index."""
+    """Writes the ledger, the quarantine and, at intervals, the index of one run."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._since_index, self._index_s = 0, time.monotonic()
 
     def close(self, entry: LedgerEntry) -> None:
-        """Note how an attempt ended. An end that was noted before stands, unless it was a guess."""
+        """Record how an attempt ended. An earlier record is kept, unless it was a guess."""
         self._run.ledger.end(entry)
         self._since_index += 1
         if self._since_index >= _INDEX_EVERY and time.monotonic() >= self._index_s:
@@ -38,7 +38,7 @@ class RunRecorder:
             self._since_index, self._index_s = 0, end_s + _INDEX_FACTOR * (end_s - start_s)
 
     def quarantine(self, shard: int, trouble: ShardFailures) -> None:
-        """Give a shard up, with all that is needed to run it alone."""
+        """Quarantine a shard, with all that is needed to run it alone."""
         scenes = self._run.layout.scenes_per_shard
         self._run.quarantine(
             QuarantineRecord(
@@ -54,31 +54,29 @@ class RunRecorder:
         )
 
     def commit_of(self, shard: int) -> Commit | None:
-        """The shard's commit record, or None while there is none."""
+        """The shard's commit record, or None."""
         return self._run.commit_of(shard) if self._run.storage.exists(commit_key(shard)) else None
 
     def missing(self) -> ShardRanges:
-        """Planned shards that are neither committed nor in quarantine, by listing."""
+        """Planned shards that are neither committed nor quarantined, by listing."""
         return self._run.missing()
 
 
 def refresh_index(run: Run) -> None:
-    """Bring the run's index up to date where that is possible."""
+    """Update the run's index where possible."""
     try:
         refresh(run)
     except InputError:
-        return  # a full disk, say: answers take longer without it, and nothing else is lost
+        return  # for example on a full disk; without the index, reports only take longer
 
 
 def close_lost_attempts(run: Run) -> int:
-    """Close in the ledger what a former driver left open; return how many attempts that were.
+    """Write end records for attempts of killed drivers; return their number.
 
-    Call it when a job has ended; it brings the run's index up to date, too. An attempt that began and
-    never ended belonged to a driver that was killed; its worker may outlive the driver by moments and
-    still reach its commit. So an attempt is judged only once its shard is decided: the one that won is
-    closed as committed, at the commit's cost, others as lost, at a cost that nobody knows; where the
-    driver lives after all, its own note replaces this one. Where the shard is still open they stay
-    open, for the job that resumes.
+    Call it when a job has ended; it also updates the run's index. The worker of a killed driver may outlive
+    it and still commit, so an attempt is closed only once its shard is decided: the committed one with the
+    commit's cost, others as lost with unknown cost. If the driver is still running, its own record replaces
+    this one. Attempts of open shards stay open for the job that resumes.
     """
     recorder, quarantined, closed = RunRecorder(run), run.quarantined(), 0
     for start in run.ledger.unfinished():

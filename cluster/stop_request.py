@@ -9,7 +9,7 @@ from types import FrameType
 
 
 class StopRequest:
-    """Counts how often somebody asked to stop. Safe to set from a signal handler."""
+    """Counts stop requests. Safe to use in a signal handler."""
 
     def __init__(self) -> None:
         self._asked = 0
@@ -19,21 +19,21 @@ class StopRequest:
 
     @property
     def drain(self) -> bool:
-        """Submit nothing more, wait a bounded time for what is in flight."""
+        """Whether to start nothing more and wait a bounded time for running attempts."""
         return self._asked >= 1
 
     @property
     def force(self) -> bool:
-        """End what is in flight now."""
+        """Whether to kill the running attempts."""
         return self._asked >= 2
 
 
 @contextmanager
 def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[StopRequest]:
-    """Let Ctrl-C and SIGTERM ask `stop` while the block runs; the former handlers come back after.
+    """Make Ctrl-C and SIGTERM stop requests within the block; the handlers are restored after it.
 
-    With `interrupt` the second signal also raises KeyboardInterrupt: shards that run in this very
-    process cannot be ended in another way.
+    With `interrupt` the second signal also raises KeyboardInterrupt, which is the only way to stop shards
+    that run in this process.
     """
 
     def handle(number: int, frame: FrameType | None) -> None:

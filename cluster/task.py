@@ -1,4 +1,4 @@
-"""What travels to a worker and what comes back: one immutable key, one small report."""
+"""Data sent to a worker and back: an immutable task, a small report."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from datagen.schemas.specification import Specification
 
 
 class Task(Protocol):
-    """What every executor and the guard need to know of a unit of work."""
+    """The interface of tasks for executors and the guard."""
 
     @property
     def shard(self) -> int: ...
 
     @property
     def attempt(self) -> str:
-        """Name of this execution, unique over all drivers of the run, usable as a file name."""
+        """Name of this attempt, unique over all drivers of the run, usable as a file name."""
         ...
 
     @property
@@ -25,39 +25,39 @@ class Task(Protocol):
 
     @property
     def notes(self) -> str:
-        """Name of the folder, in its machine's folder for temporary files, in which the worker leaves
-        its process id and its stack; "" for none. Unique to the job; an absolute path stands as it is.
+        """Name of the folder, within the machine's temporary folder, for the worker's process id and
+        stack; "" for none. Unique to the job; an absolute path is used as it is.
         """
         ...
 
 
 @dataclass(frozen=True)
 class ShardTask:
-    """One attempt at one shard. Equal keys give equal arrays, wherever they run."""
+    """One attempt of one shard. Equal tasks give equal arrays on every machine."""
 
     run: str  # folder or URL of the run
     spec: Specification
     layout: Layout
     shard: int
     attempt: str
-    houses: str  # source reference, as the command line takes it: `builtin`, `procthor:DIR`
+    houses: str  # source reference as on the command line: `builtin`, `procthor:DIR`
     objects: str
     deadline_s: float
     notes: str = ""
-    scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" draws new ones
+    scenes_from: str = ""  # folder or URL of the run whose scenes are labelled again; "" for new scenes
 
     @property
     def scene_indices(self) -> range:
-        """The scenes of this shard in the run's endless sequence."""
+        """Indices of this shard's scenes in the run."""
         first = self.shard * self.layout.scenes_per_shard
         return range(first, first + self.layout.scenes_per_shard)
 
 
 @dataclass(frozen=True)
 class AttemptResult:
-    """What a task function answers when it reached its commit."""
+    """Result of a task function that reached its commit."""
 
-    won: bool  # False when another attempt had committed the shard before
+    won: bool  # False where another attempt was committed before
     labels: int
     positives: int
     cost: Cost
@@ -65,7 +65,7 @@ class AttemptResult:
 
 @dataclass(frozen=True)
 class AttemptReport:
-    """How one attempt ended. Executors write it for workers that can no longer do so."""
+    """How one attempt ended. Executors make it for dead workers."""
 
     attempt: str
     shard: int
@@ -78,9 +78,9 @@ class AttemptReport:
     positives: int = 0
     cost: Cost | None = None
     host: Host | None = None
-    # The job cannot go on: no other attempt could end differently (full disk, sources missing).
+    # The job cannot continue: every attempt would fail (full disk, sources missing).
     ends_job: bool = False
 
 
 class JobCannotContinue(Exception):
-    """Raised by a task function for what no retry can cure. Its text is one line with the mend."""
+    """Raised by a task function for an error that no retry can fix. Its text is one line with the fix."""

@@ -1,18 +1,26 @@
-"""The program `datagen`: its verbs, and what becomes of errors on the way out.
+"""The program `datagen`: its verbs, its one-line errors and its exit codes.
 
-Exit codes: 0 good, 1 finished and something is wrong (too many failures, findings, differences), 2 bad input,
-130 interrupted, 141 if the reader of the output closed it. Verbs are loaded only when called, so that
-`datagen --help` does not wait for simulators.
+Exit codes: 0 success, 1 finished with failures, findings or differences, 2 bad input, 130 interrupted, 141 if
+the reader of the output closed it. A verb is imported when it is called, so that `datagen --help` does not
+wait for simulators.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
+from difflib import get_close_matches
+from inspect import getdoc
 from typing import TYPE_CHECKING
 
-from cyclopts import App, Parameter
-from cyclopts.exceptions import CycloptsError, UnknownCommandError
+from cyclopts import App, Group, Parameter
+from cyclopts.exceptions import (
+    CycloptsError,
+    MissingArgumentError,
+    UnknownCommandError,
+    UnusedCliTokensError,
+)
 
 from datagen import __version__
 from datagen.cluster.environment import job_environment
@@ -26,46 +34,51 @@ if TYPE_CHECKING:
 
 EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
-# Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
+# Verb -> (where it is defined, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
     "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.commands.resume:resume", "Make what is missing of a run, or of merged runs."),
-    "extend": ("datagen.commands.extend:extend", "Want more labels of a run, and make them."),
-    "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop, and wait for their end."),
-    "logs": ("datagen.commands.logs:logs", "What happened in a run, in order of time."),
-    "status": ("datagen.commands.status:status", "How far a run is, and what failed."),
-    "seal": ("datagen.commands.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
+    "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run, or of merged runs."),
+    "extend": ("datagen.commands.extend:extend", "Raise the number of labels of a run and make them."),
+    "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop and wait until they have."),
+    "logs": ("datagen.commands.logs:logs", "List what happened in a run, in order of time."),
+    "status": ("datagen.commands.status:status", "Show the progress and the failures of a run."),
+    "seal": ("datagen.commands.seal:seal", "Make one Zarr store of a run that any Zarr reader opens."),
     "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
-    "merge": ("datagen.commands.merge:merge", "One run of several that were made apart."),
-    "verify": ("datagen.commands.verify:verify", "Whether a run is what it says, to the last byte."),
-    "repair": ("datagen.commands.repair:repair", "Mend what verify finds, and touch nothing else."),
-    "replay": ("datagen.commands.replay:replay", "One sample's scene made again, beside what is stored."),
-    "relabel": ("datagen.commands.relabel:relabel", "Labels by another rule, from stored distances."),
-    "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's rule to labels of trials."),
-    "audit": ("datagen.commands.audit:audit", "What labels cost, by stage, and what 180,000 would."),
-    "gc": ("datagen.commands.gc:gc", "Remove what a run holds and nothing names."),
-    "show": ("datagen.commands.show:show", "A picture of one scene of a run."),
-    "train": (
-        "datagen.commands.train:train",
-        "Train a model on labels: stage 1, stage 2, or sim labels alone.",
-    ),
-    "evaluate": (
-        "datagen.commands.evaluate:evaluate",
-        "How good models are, beside baselines and the paper.",
-    ),
-    "predict": ("datagen.commands.predict:predict", "A base pose from a depth camera's frame."),
-    "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
+    "merge": ("datagen.commands.merge:merge", "Merge runs into one."),
+    "verify": ("datagen.commands.verify:verify", "Check every record and every byte of a run."),
+    "repair": ("datagen.commands.repair:repair", "Fix the damage that verify finds."),
+    "replay": ("datagen.commands.replay:replay", "Make a stored scene again and compare the two."),
+    "relabel": ("datagen.commands.relabel:relabel", "Label a heuristic run by other parameters."),
+    "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's parameters to trial labels."),
+    "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
+    "gc": ("datagen.commands.gc:gc", "Remove leftover files of a run."),
+    "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
+    "train": ("datagen.commands.train:train", "Train a model on labels."),
+    "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
+    "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
+    "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
+}
+
+_HEADINGS = {
+    "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
+    "Look at runs": ("status", "logs", "show", "audit"),
+    "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
+    "Models": ("train", "evaluate", "predict", "calibrate"),
+    "This machine": ("doctor", "assets"),
 }
 
 
 def build_app(called: str = "") -> App:
-    """The command line with every verb of `VERBS` registered and none imported.
+    """Return the command line with every verb of `VERBS` registered and none imported.
 
-    The verb that is called describes itself, by its docstring.
+    The docstring of the verb that is called is its help text.
     """
+    headings = [(Group.create_ordered(name), verbs) for name, verbs in _HEADINGS.items()]
+    groups = {verb: group for group, verbs in headings for verb in verbs}
     app = App(
         name="datagen",
+        group_commands=Group.create_ordered("Options"),
         help="Labelled robot base poses from furnished houses.",
         version=f"datagen {__version__}",
         # `main` prints errors itself: one line each, without a frame.
@@ -77,23 +90,36 @@ def build_app(called: str = "") -> App:
         default_parameter=Parameter(show_default=lambda value: None if value is False else value),
     )
     for verb, (target, line) in VERBS.items():
-        app.command(target, name=verb, help=None if verb == called else line)
+        app.command(target, name=verb, help=None if verb == called else line, group=groups.get(verb))
     return app
 
 
 def _usage_line(error: CycloptsError) -> str:
     """One line for a wrong command line; unknown verbs are answered without loading the known ones."""
     error.verbose = False
-    if isinstance(error, UnknownCommandError) and not error.command_chain:
+    words = ["datagen", *(error.command_chain or ())]
+    verb, see = " ".join(words), f"See: {' '.join(words)} --help"
+    if isinstance(error, UnknownCommandError) and len(words) == 1:
         token = (error.unused_tokens or ["?"])[0]
-        word = "option" if token.startswith("-") else "command"
-        return f'unknown {word} "{token}". Choose one of: {", ".join(VERBS)}'
-    chain = " ".join(error.command_chain or ())
-    return f"{error} See: datagen {chain} --help" if chain else f"{error} See: datagen --help"
+        if token.startswith("-"):
+            return f'unknown option "{token}" before the command. {see}'
+        near = get_close_matches(token, VERBS, n=1)
+        return f'unknown command "{token}". {f"Did you mean {near[0]}? " if near else ""}{see}'
+    if isinstance(error, UnusedCliTokensError):
+        return f'{verb}: unexpected argument "{" ".join(error.unused_tokens or ())}". {see}'
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        named, lacks = error.keyword or error.argument.name, "has no value" if error.keyword else "is missing"
+        problem = f"{named} {lacks}"
+        if near := str(error).partition(" Did you mean ")[2]:  # a mistyped option
+            return f"{verb}: {problem}. Did you mean {near} {see}"
+        about = (error.argument.parameter.help or "").rstrip(".")
+        example = re.search(r"For example: (.+)", getdoc(error.target) or "")
+        return f"{verb}: {problem}: {about}. {f'{example[0]}. ' if example else ''}{see}"
+    return re.sub(r'unable to convert (".*") into float', r"\1 is not a number", f"{error} {see}")
 
 
 def _validation_lines(error: ValidationError) -> list[str]:
-    """One line for each field that a model refused."""
+    """One line for each field that a pydantic model refused."""
     lines: list[str] = []
     for detail in error.errors(include_url=False, include_context=False):
         field = ".".join(str(part) for part in detail["loc"]) or "value"
@@ -104,7 +130,7 @@ def _validation_lines(error: ValidationError) -> list[str]:
 
 
 def _lines_for(error: Exception) -> list[str] | None:
-    """What the user is told, or None when the error is a defect of this program."""
+    """Lines for the user, or None where the error is a defect of this program."""
     if isinstance(error, InputError):
         return [str(error)]
     if isinstance(error, CycloptsError):
@@ -115,7 +141,7 @@ def _lines_for(error: Exception) -> list[str] | None:
         return [str(known)] if (known := machine_error(error)) else None
     if (missing := missing_library(error)) is not None:
         return [str(missing)]
-    # pydantic takes 0.1 s to import; whoever raised its error has imported it.
+    # pydantic takes 0.1 s to import; its errors exist only where it is imported already.
     if "pydantic" in sys.modules:
         from pydantic import ValidationError
 
@@ -125,9 +151,9 @@ def _lines_for(error: Exception) -> list[str] | None:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit code; messages go to standard error.
+    """Run one command line and return its exit code; errors go to standard error.
 
-    Defects of this program are not caught: their traceback is what a report of them needs.
+    Defects of this program are not caught: a bug report needs their traceback.
     """
     try:
         result = build_app(next(iter(arguments), ""))([refuse_not_utf8(word) for word in arguments])
@@ -136,10 +162,10 @@ def run(arguments: Sequence[str]) -> int:
         sys.stderr.write("interrupted\n")
         return EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit) as error:
-        # The reader went away (`datagen status | head`), which rich makes an exit of its own.
+        # The reader closed the pipe (`datagen status | head`); rich raises SystemExit for it.
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
-        # Python's own flush at exit would complain.
+        # Without this, Python reports a second error when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_CLOSED_PIPE
     except Exception as error:
@@ -153,9 +179,9 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script `datagen`."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:  # closed by the shell (`>&-`): no file may get its number
+        if getattr(sys, name) is None:  # closed by the shell (`>&-`): no other file may get its descriptor
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     with job_environment():
         code = run(sys.argv[1:])

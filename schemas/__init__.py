@@ -1,4 +1,4 @@
-"""Everything on disk: errors, fields, specification, manifest, commits, ledger, store."""
+"""The data on disk: specification, records, fields, stores, checks and merges; and errors."""
 
-if __name__ != "datagen.schemas":  # in a checkout's folder the other name would make every class twice
+if __name__ != "datagen.schemas":  # a second name, from a checkout's folder, would define every class twice
     raise ImportError("import it as datagen.schemas")

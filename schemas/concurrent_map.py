@@ -1,4 +1,4 @@
-"""Several things under way at once, their results taken in order."""
+"""Concurrent map with bounded look-ahead and ordered results."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ Item = TypeVar("Item")
 def concurrent_map(
     pool: ThreadPoolExecutor, most: int, do: Callable[[Item], Result], items: Iterable[Item]
 ) -> Generator[Result]:
-    """What `do` gives for each item, in their order, with at most so many begun that are not yet taken.
+    """Yield `do(item)` for each item in order, with a bounded number of results computed ahead.
 
-    The first failure ends it. However it ends, nothing of it is under way afterwards: what is undone then
-    stays undone. `items` are taken by the caller's thread, as they are needed. `do` must not wait for the
-    pool that it runs in.
+    The first exception ends it; no call is running after the iterator has ended. `items` is consumed in the
+    caller's thread, as needed. `do` must not wait for the pool that it runs in.
     """
     begun: deque[Future[Result]] = deque()
     try:

@@ -1,4 +1,4 @@
-"""What an attempt cost: seconds by stage, memory, bytes, and the machine that paid."""
+"""Cost of an attempt: wall and CPU seconds by stage."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ STAGES = ("draw", "settle", "observe", "visibility", "grasps", "plan", "execute"
 class StageClock:
     """Adds up wall and CPU seconds by stage.
 
-    CPU seconds are those of the whole process, so that a library's threads are counted. A stage
-    within another is taken out of the outer one, so that every second is counted once.
+    CPU seconds are those of the whole process, so that threads of libraries count. The time of a nested stage
+    is subtracted from the outer one, so that every second counts once.
     """
 
     wall_s: dict[str, float] = field(default_factory=dict)

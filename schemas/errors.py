@@ -1,15 +1,17 @@
-"""The one error that people see for bad input: it names the place, the field and the mend."""
+"""The one error for bad input: it names the place, the field, the problem and the fix."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 
 class InputError(ValueError):
     """Input that cannot be used. The command line prints it as one line and exits with 2.
 
-    `place` is a file, a folder, a run or a command-line option; `field` is where in it the
-    trouble lies (a JSON path, a column, a line), or "" when the whole place is at fault.
+    `place` is a file, a folder, a run or a command-line option; `field` is the part of it that is wrong (a
+    JSON path, a column, a line), or "" for the whole; `mend` says how to fix it.
     """
 
     def __init__(self, place: str | Path, field: str, problem: str, mend: str) -> None:
@@ -24,12 +26,12 @@ class InputError(ValueError):
         return one_line(f"{where}: {self.problem}. {self.mend}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
-        # Exceptions cross process borders; the default would call __init__ with one argument.
+        # Exceptions are pickled between processes; the default would call __init__ with one argument.
         return (type(self), (self.place, self.field, self.problem, self.mend))
 
 
 def refuse_not_utf8(text: str) -> str:
-    """The text. InputError where it is no Unicode, as the name of a file may be: no record holds it."""
+    """Return the text. InputError where it is not valid Unicode, which file names may be and records not."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -39,17 +41,19 @@ def refuse_not_utf8(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """The text with each character that a terminal or a page acts on as its escape: \\x1b, \\u202e."""
+    """The text with control and formatting characters as escapes: \\x1b, \\u202e."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def one_line(text: str) -> str:
-    """The text on one line, printable, without runs of spaces."""
+    """The text on one line, printable, with single spaces."""
     return printable(" ".join(text.split()))
 
 
-def choices(valid: object) -> str:
-    """`choose one of: a, b, c` for an error's mend."""
-    return "Choose one of: " + ", ".join(sorted(str(v) for v in valid))  # type: ignore[attr-defined]
+def choices(valid: Iterable[object], given: str = "") -> str:
+    """`Did you mean b? Choose one of: a, b, c.` for the fix of an error; `given` is what was mistyped."""
+    names = sorted(map(str, valid))
+    near = get_close_matches(given, names, n=1)
+    return f"{f'Did you mean {near[0]}? ' if near else ''}Choose one of: {', '.join(names)}"

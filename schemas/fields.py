@@ -1,7 +1,7 @@
-"""Record schemas: the single source of truth for what a scene and a sample store.
+"""Record schemas: the fields of a scene and of a sample.
 
-Store creation, batch checks, the attributes of stored arrays and the data-format page all derive
-from the tables below.
+Store creation, checks of batches, attributes of stored arrays and the data-format page all derive from the
+tables below.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from datagen.schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
 
-# Of all schemas. It rises when fields are added, which then say so by `since`; fields never go or change.
+# Version of all schemas. New fields raise it and note it in `since`; fields are never removed or changed.
 SCHEMA_VERSION = 2
 OLDEST_SCHEMA_VERSION = 2
 
@@ -27,9 +27,9 @@ OLDEST_SCHEMA_VERSION = 2
 class Field:
     """One array of a store.
 
-    `dims` names the axes after the table's own ("scene" or "sample"); their lengths are given by
-    `RecordSchema.sizes`. `low` and `high` bound every finite value (closed interval). `since` is the
-    schema version that brought it: runs of an older one go on without it.
+    `dims` names the axes after the table's own ("scene" or "sample"); `RecordSchema.sizes` has their lengths.
+    `low` and `high` bound every finite value (closed interval). `since` is the first schema version with the
+    field: runs of older versions do not have it.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Field:
     doc: str
     low: float | None = None
     high: float | None = None
-    codes: tuple[str, ...] = ()  # what the values 0, 1, ... mean
+    codes: tuple[str, ...] = ()  # meanings of the values 0, 1, ...
     since: int = OLDEST_SCHEMA_VERSION
 
     @property
@@ -52,7 +52,7 @@ class Field:
 class RecordSchema:
     """The arrays of one label source and the lengths of their axes.
 
-    `later` names the fields that newer versions have; they are made and not stored.
+    `later` names the fields of newer versions, which are computed but not stored.
     """
 
     name: str
@@ -66,7 +66,7 @@ class RecordSchema:
         return self.scene_fields if table == "scene" else self.sample_fields
 
     def shape(self, f: Field, rows: int) -> tuple[int, ...]:
-        """Shape of the field's array with so many rows."""
+        """Shape of the field's array with `rows` rows."""
         return (rows, *(self.sizes[d] for d in f.dims))
 
     def sized(self, **sizes: int) -> RecordSchema:
@@ -74,7 +74,7 @@ class RecordSchema:
         return replace(self, sizes={**self.sizes, **sizes})
 
     def at(self, version: int) -> RecordSchema:
-        """The schema as that version had it."""
+        """The schema as of that version."""
         scene, sample = (
             tuple(f for f in fields if f.since <= version)
             for fields in (self.scene_fields, self.sample_fields)
@@ -84,13 +84,13 @@ class RecordSchema:
         return replace(self, version=version, scene_fields=scene, sample_fields=sample, later=later)
 
     def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Refuse a batch that lacks a field, has a foreign one, or breaks dtype, shape or range."""
+        """Raise InputError for a batch with missing or unknown fields, or a wrong dtype, shape or range."""
         fields = {f.name: f for f in self.table(table)}
         place = f"batch of {self.name} {table}s"
         mend = "This is a defect of the label source: its output must follow its schema."
         if set(arrays) != set(fields):
             odd = sorted(set(arrays) ^ set(fields))
-            raise InputError(place, ", ".join(odd), "fields missing or unknown", mend)
+            raise InputError(place, ", ".join(odd), "are missing or unknown fields", mend)
         for name, f in fields.items():
             a = arrays[name]
             if a.shape != self.shape(f, rows):
@@ -100,7 +100,7 @@ class RecordSchema:
             if a.dtype != np.dtype(f.dtype):
                 raise InputError(place, name, f"dtype {a.dtype}, not {f.dtype}", mend)
             if a.dtype.kind == "f" and not np.isfinite(a).all():
-                raise InputError(place, name, "NaN or infinite values", mend)
+                raise InputError(place, name, "has NaN or infinite values", mend)
             if a.size and f.low is not None and a.min() < f.low:
                 raise InputError(place, name, f"value {a.min()} below {f.low}", mend)
             if a.size and f.high is not None and a.max() > f.high:
@@ -109,15 +109,15 @@ class RecordSchema:
 
 @dataclass(frozen=True, eq=False)
 class SceneRows:
-    """What is stored of one scene, by field name: its record, and its samples, one row a candidate."""
+    """The stored rows of one scene by field name: its record, and its samples, one per candidate."""
 
     record: Mapping[str, Any]
     samples: Mapping[str, np.ndarray[Any, Any]]
 
 
-_EXTENT = 1000.0  # no house is larger; a larger coordinate is a unit error or garbage
+_EXTENT = 1000.0  # no house is larger; a larger coordinate is an error
 
-# A table reads best with one field a line.
+# One field per line reads best.
 # fmt: off
 SCENE_FIELDS = (
     Field("scene_index", "int64", (), "1", "", "index of the scene in the run's sequence", 0),
@@ -226,9 +226,9 @@ SCHEMAS: dict[str, RecordSchema] = {
 
 
 def sized_schema(name: str, spec: Specification, version: int | None = None) -> RecordSchema:
-    """The named schema with the specification's axis lengths, as `version` had it (default: the present).
+    """Return the named schema with the specification's axis lengths, as of `version` (default: the newest).
 
-    InputError for an unknown name, and for a version that this program does not know.
+    InputError for an unknown name or version.
     """
     if name not in SCHEMAS:
         raise InputError("specification", "label_source", f"no record schema {name!r}", choices(SCHEMAS))
@@ -238,7 +238,7 @@ def sized_schema(name: str, spec: Specification, version: int | None = None) -> 
             raise InputError(
                 name,
                 "schema_version",
-                f"{version}, and this program knows {OLDEST_SCHEMA_VERSION} to {schema.version}",
+                f"is {version}, but this program reads {OLDEST_SCHEMA_VERSION} to {schema.version}",
                 "Use the version of the program that made the run, or start a new run",
             )
         schema = schema.at(version)

@@ -1,7 +1,7 @@
-"""What a run holds and nothing names: found, and removed without taking what is or becomes committed.
+"""Find and remove garbage of a run, without removing files of attempts that are or become committed.
 
-An attempt and the removal of its files race for one commit. Neither can lock the other out, as stores know
-no transaction over two keys; so each first leaves its mark and then looks for the other's:
+An attempt and the removal of its files race for one commit. Stores have no transactions over two keys, so
+each first writes its mark and then checks for the other's:
 
     removal                                         commit
     1 writes `removing` into the attempt's folder   1 finds its files whole and no `removing`
@@ -11,10 +11,10 @@ no transaction over two keys; so each first leaves its mark and then looks for t
     4 reads the commit again, to tell if it names
       what is gone; removes `removing` last
 
-Whichever mark is written second is seen by its writer's look: a commit that stands has its files. What
-remains is an attempt that dies between its steps 2 and 3 while its files are being removed: that commit
-names files which are gone, step 4 or `verify` says so, and `repair` makes the shard again. It takes an
-attempt as old as `older_than` for that. A removal that was cut short goes on when it is called again.
+The writer of the second mark sees the first one, so a surviving commit has its files. One case remains: an
+attempt dies between its steps 2 and 3 while its files are removed. Its commit then names missing files,
+which step 4 or `verify` reports, and `repair` makes the shard again. This needs an attempt older than
+`older_than`. An interrupted removal is completed by the next call.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _PROBE = re.compile(r"\.probe-[0-9a-f]{16}(?:\.[0-9a-f]{16}\.part)?")
 
 @dataclass(frozen=True)
 class Garbage:
-    """A file, or a folder with all its files, that nothing names."""
+    """A file, or a folder with all its files, that no record names."""
 
-    storage: Storage  # of the run or of the merged place that holds it
+    storage: Storage  # of the run, or of the merged runs, that hold it
     kind: Kind
     key: str
     files: int
@@ -58,15 +58,15 @@ class Garbage:
 
 @dataclass(frozen=True)
 class Swept:
-    """What was removed."""
+    """The result of a removal."""
 
     files: int = 0
     bytes: int = 0
-    spared: int = 0  # attempts that were committed after they were found
-    damaged: tuple[str, ...] = ()  # commits whose files were removed in spite of all
+    spared: int = 0  # attempts that were committed meanwhile
+    damaged: tuple[str, ...] = ()  # commits whose files were removed nevertheless
 
     def plus(self, other: Swept) -> Swept:
-        """Both together."""
+        """The sum of both."""
         return Swept(
             self.files + other.files,
             self.bytes + other.bytes,
@@ -78,10 +78,10 @@ class Swept:
 def find_garbage(
     place: Storage, older_than_s: float, now_s: float, seen: Seen = lambda done, of: None
 ) -> list[Garbage]:
-    """Garbage of a place, last written more than `older_than_s` before `now_s` (seconds since 1970 UTC).
+    """List garbage last written more than `older_than_s` before `now_s` (seconds since 1970 UTC).
 
-    While jobs are at work there, what was written since the first of them began is left alone, whatever
-    its age. `seen` hears of (shards looked at, shards). InputError where there is no run.
+    While jobs run, files written since the first of them began are kept, whatever their age. `seen` is called
+    with (searched shards, shards). InputError where there is no run.
     """
     runs = open_runs(place)
     began = [_seconds(job.record.started) for job in Jobs(place).all() if job.health() in ("live", "silent")]
@@ -89,14 +89,14 @@ def find_garbage(
     found: list[Garbage] = []
     for run in runs:
         found += _of_run(run, before_s, seen)
-    if all(run.storage.url != place.url for run in runs):  # a merged place
+    if all(run.storage.url != place.url for run in runs):  # merged runs
         rest = (file for file in place.list("") if not file.key.startswith("parts/"))
         found += _loose(place, rest, set(), before_s)
     return found
 
 
 def sweep(garbage: Garbage) -> Swept:
-    """Remove one piece of garbage; attempts that were committed meanwhile are spared."""
+    """Remove one item of garbage; attempts that were committed meanwhile are kept."""
     if garbage.attempt is not None:
         shard, name = garbage.attempt
         done = Run.open(garbage.storage).remove_attempt(shard, name)
@@ -114,8 +114,7 @@ def sweep(garbage: Garbage) -> Swept:
 
 def _of_run(run: Run, before_s: float, seen: Seen) -> Iterator[Garbage]:
     storage = run.storage
-    # Which shards are committed is asked before what there is: what is committed in between is seen
-    # when its attempt is about to be removed.
+    # Commits are listed before files: a commit in between is noticed before its attempt is removed.
     committed = run.committed()
     started = {
         file.key.removeprefix("ledger/").removesuffix(".start.json"): file.modified_s
@@ -133,7 +132,7 @@ def _of_run(run: Run, before_s: float, seen: Seen) -> Iterator[Garbage]:
         seen(min(passed, len(committed)), len(committed))
         newest_s = max([started.get(name, 0.0), *(file.modified_s for file in files)])
         if shard in committed and _winner(run, shard) in (name, None):
-            # Only what a removal or a killed writer left in the folder that is named.
+            # Only leftovers of a removal or a killed writer in the committed attempt's folder.
             left = [file for file in files if file.key == f"{key}/{REMOVING}" or _DRAFT.fullmatch(file.key)]
             yield from (_one(storage, "drafts", file) for file in left if file.modified_s < before_s)
         elif newest_s < before_s and not (shard not in committed and _has_claim(shard, name, files)):
@@ -142,12 +141,12 @@ def _of_run(run: Run, before_s: float, seen: Seen) -> Iterator[Garbage]:
 
 
 def _has_claim(shard: int, name: str, files: Iterable[StoredFile]) -> bool:
-    """Whether the commit record may have been lost: `repair` restores it from the claim in the folder."""
+    """Whether the commit record may be lost: `repair` restores it from the copy in the folder."""
     return any(file.key == commit_copy_key(shard, name) for file in files)
 
 
 def _winner(run: Run, shard: int) -> str | None:
-    """The attempt that a shard's commit names; None where the record is damaged or just went."""
+    """The attempt that a shard's commit names; None where the record is damaged or missing."""
     try:
         return run.commit_of(shard).attempt
     except InputError:
@@ -155,7 +154,7 @@ def _winner(run: Run, shard: int) -> str | None:
 
 
 def _folder_of(file: StoredFile) -> str:
-    """The folder that is removed or kept as a whole, or "" for a file by itself."""
+    """The folder that is removed or kept as a whole, or "" for a single file."""
     for folder in (_ATTEMPT, _STORE_DRAFT):
         if found := folder.match(file.key):
             return found[0].rstrip("/")
@@ -165,7 +164,7 @@ def _folder_of(file: StoredFile) -> str:
 def _loose(
     storage: Storage, files: Iterable[StoredFile], spent: set[str], before_s: float
 ) -> Iterator[Garbage]:
-    """Garbage among files outside the attempts' folders, which are those of one draft, or by themselves."""
+    """Garbage outside the attempts' folders: drafts of stores, and single files."""
     drafted: dict[str, list[StoredFile]] = {}
     for file in files:
         if found := _STORE_DRAFT.match(file.key):
@@ -191,4 +190,4 @@ def _seconds(text: str) -> float:
     try:
         return datetime.fromisoformat(text).timestamp()
     except ValueError:
-        return 0.0  # since when it works is not known: nothing is old enough
+        return 0.0  # its start is unknown: nothing is old enough

@@ -1,4 +1,4 @@
-"""Names and random streams that depend on what is made, never on who makes it or when."""
+"""Sample ids and random streams, which depend only on specification and indices."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
-    """The generator of one stage of one item; the same on every machine.
+    """Return the random generator of one stage of one item; the same on every machine.
 
-    `index` is (scene index, retry), and for what a candidate draws (scene index, retry, candidate).
+    `index` is (scene index, retry), or for a candidate (scene index, retry, candidate).
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), *index))
     return np.random.Generator(np.random.PCG64(sequence))

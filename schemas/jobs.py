@@ -1,7 +1,7 @@
-"""Jobs at a place: who works on it, how far they are, and requests that they stop.
+"""Records of the jobs of a run: their drivers, progress, and stop requests.
 
-`jobs/<id>.json` says who began; `jobs/<id>.state.json` is replaced while the job lives and says at the end
-how it ended; `jobs/<id>.stop.json` asks it to stop. They decide nothing about data: commits alone do.
+`jobs/<id>.json` identifies the driver; `jobs/<id>.state.json` is replaced while the job runs, last with its
+end; `jobs/<id>.stop.json` asks it to stop. Data depends only on commits, not on these records.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ JobId = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{8}$")]
 JobEnd = Literal["", "complete", "interrupted", "failed", "aborted", "broken"]
 Health = Literal["ended", "live", "silent", "dead"]
 SILENT_AFTER = timedelta(minutes=1)
-# A process that began later than the job's record was written has only taken over its number.
+# A process that began after the job's record was written only reuses its number.
 _PID_SLACK_S = 5.0
 _JOB_FILE = re.compile(r"jobs/([0-9]{8}T[0-9]{6}-[0-9a-f]{8})\.json")
 
@@ -42,48 +42,48 @@ class JobRecord(StoredRecord):
     host: str
     pid: int = Field(ge=0)
     started: str
-    address: str  # local, or that of the Ray cluster it works on
-    submission: str = ""  # of a detached job: its name at the Jobs API, and where that listens
+    address: str  # local, or the address of the Ray cluster
+    submission: str = ""  # of a detached job: its name at the Jobs API, and the address of that
     jobs_api: str = ""
 
 
 class JobState(StoredRecord):
-    """jobs/<id>.state.json: how a driver is, every few seconds, and how it ended."""
+    """jobs/<id>.state.json: progress of a driver, every few seconds, and its end."""
 
     format_version: int = FORMAT_VERSION
     id: JobId
     updated: str
     phase: Literal["starting", "making", "sealing", "ended"]
-    shards: int = Field(default=0, ge=0)  # of this job, without those done before it
+    shards: int = Field(default=0, ge=0)  # of this job, without those of earlier jobs
     done: int = Field(default=0, ge=0)
     in_flight: int = Field(default=0, ge=0)
     labels: int = Field(default=0, ge=0)
-    labels_per_s: float = Field(default=0, ge=0)  # over the last minute; over the job once it ended
+    labels_per_s: float = Field(default=0, ge=0)  # over the last minute; after the end, over the job
     left_s: float | None = None  # None while the rate is not known
     retries: int = Field(default=0, ge=0)
     quarantined: int = Field(default=0, ge=0)
-    stopping: str = ""  # why nothing new is begun
+    stopping: str = ""  # why no new shard is started
     end: JobEnd = ""
     exit_code: int | None = None
     cause: str = ""
 
 
 class StopRecord(StoredRecord):
-    """jobs/<id>.stop.json: somebody wants the job to stop."""
+    """jobs/<id>.stop.json: a request to stop the job."""
 
     format_version: int = FORMAT_VERSION
     id: JobId
-    now: bool  # end what is in flight by force
+    now: bool  # kill the running attempts
     asked: str
     host: str
 
 
 @dataclass(frozen=True)
 class StoredJob:
-    """All that the place knows of one job."""
+    """All records of one job."""
 
     record: JobRecord
-    state: JobState | None  # None in the moment between its two first writes
+    state: JobState | None  # None between its first two writes
     order: StopRecord | None
 
     @property
@@ -91,12 +91,12 @@ class StoredJob:
         return self.record.id
 
     def silence(self, at: datetime | None = None) -> timedelta:
-        """Time since it was last heard of."""
+        """Time since its last record."""
         heard = self.state.updated if self.state else self.record.started
         return max((at or datetime.now(UTC)) - _time_of(heard), timedelta())
 
     def health(self, at: datetime | None = None) -> Health:
-        """Whether it has ended, lives, is dead, or is somewhere else and has not been heard for a minute."""
+        """ended, live, dead, or silent: on another machine, without a record for a minute."""
         if self.state is not None and self.state.end:
             return "ended"
         if self.silence(at) <= SILENT_AFTER:
@@ -107,55 +107,55 @@ class StoredJob:
 
 
 class Jobs:
-    """The jobs of one place: a run, or several that were merged."""
+    """The jobs of one run, or of merged runs."""
 
     def __init__(self, place: Storage) -> None:
         self._place = place
 
     def begin(self, record: JobRecord) -> None:
-        """Note that a job begins."""
+        """Record that a job begins."""
         if not self._place.put_new(f"jobs/{record.id}.json", encode_record(record)):
             where = f"{self._place.url}/jobs/{record.id}.json"
-            raise InputError(where, "", "this job has already begun", "Start it again: it gets another name")
+            raise InputError(where, "", "exists already", "Start the job again: it gets another name")
 
     def put_state(self, state: JobState) -> None:
-        """Replace what is known of a job."""
+        """Replace the state of a job."""
         self._place.put(f"jobs/{state.id}.state.json", encode_record(state))
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
-        """Ask a job to stop. A request to end at once is not taken back by a gentler one."""
+        """Ask a job to stop. A request to stop at once is not replaced by a weaker one."""
         standing = self.stop_order(job)
         if standing is None or (at_once and not standing.now):
             order = StopRecord(id=job, now=at_once, asked=utc_now(), host=platform.node())
             self._place.put(f"jobs/{job}.stop.json", encode_record(order))
 
     def stop_order(self, job: str) -> StopRecord | None:
-        """The request to stop that stands for a job."""
+        """The stop request for a job, if any."""
         return self._passing(f"jobs/{job}.stop.json", StopRecord)
 
     def get(self, job: str) -> StoredJob | None:
-        """One job; None where there is none of this name. InputError where its record is damaged."""
+        """Read one job; None where it does not exist. InputError where its record is damaged."""
         where = f"{self._place.url}/jobs/{job}.json"
         try:
             record = read_record(self._place, f"jobs/{job}.json", JobRecord)
         except InputError as error:
-            mend = "Remove it: it says who worked here, and nothing about data"
+            mend = "Remove it: no data depends on it"
             raise InputError(where, error.field, error.problem, mend) from error
         if record is None:
             return None
         if record.id != job:
-            raise InputError(where, "id", f"{record.id}, not {job}", "Remove this foreign file")
+            raise InputError(where, "id", f"is {record.id}, not {job}", "Remove this foreign file")
         return StoredJob(record, self._passing(f"jobs/{job}.state.json", JobState), self.stop_order(job))
 
     def all(self) -> list[StoredJob]:
-        """Every job that began here, in order of time."""
+        """Every job, in order of time."""
         names = (_JOB_FILE.fullmatch(file.key) for file in self._place.list("jobs"))
         found = [job for name in names if name and (job := self.get(name[1])) is not None]
-        # Names tell seconds only, and two jobs may begin within one.
+        # Names have seconds only, and two jobs may begin within one.
         return sorted(found, key=lambda job: (job.record.started, job.record.id))
 
     def _passing(self, key: str, model: type[Replaced]) -> Replaced | None:
-        # Replaced too often to be made durable: a power cut may tear it, which is as if it were absent.
+        # Replaced too often for fsync: after a power cut it may be torn, and then counts as absent.
         data = self._place.get(key, MAX_RECORD_BYTES)
         if data is None:
             return None
@@ -166,7 +166,7 @@ class Jobs:
 
 
 def new_job_id() -> str:
-    """A name that sorts by time and is nobody else's."""
+    """A unique name that sorts by time."""
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{secrets.token_hex(4)}"
 
 
@@ -174,7 +174,7 @@ def _time_of(text: str) -> datetime:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        return datetime.fromtimestamp(0, UTC)  # a record that was made up says nothing
+        return datetime.fromtimestamp(0, UTC)  # an invalid time
     return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 

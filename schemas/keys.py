@@ -1,15 +1,15 @@
-"""Where the files of a run lie, and the runs of a merged place: keys below its root."""
+"""Keys of the files of a run, and of the parts of merged runs, relative to the root."""
 
 from __future__ import annotations
 
-# The record of a merged place, which names its parts.
+# The record of merged runs, which names the parts.
 MERGED = "merged.json"
-# The mark in the folder of an attempt that is being removed.
+# Marks the folder of an attempt that is being removed.
 REMOVING = "removing"
 
 
 def shard_folder(shard: int, attempt: str) -> str:
-    """Key of the folder of one attempt at a shard."""
+    """Key of the folder of one attempt of a shard."""
     return f"shards/{shard:06d}/{attempt}"
 
 
@@ -24,5 +24,5 @@ def commit_copy_key(shard: int, attempt: str) -> str:
 
 
 def part_folder(spec_hash: str) -> str:
-    """Folder of the part of a merged place with this specification."""
+    """Folder of the part with this specification in merged runs."""
     return f"parts/{spec_hash[:16]}"

@@ -1,4 +1,4 @@
-"""The ledger of a run: every attempt that began, and how it ended and what it cost."""
+"""The ledger of a run: start, outcome and cost of every attempt."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
 from datagen.schemas.storage import Storage
 
 MAX_STACK_CHARS = 20_000
-LOST_CAUSE = "it left no end, and its shard was decided without it"
+LOST_CAUSE = "it left no end record, and its shard was decided without it"
 Record = TypeVar("Record", bound=BaseModel)
 
 
 class Ledger:
-    """Two records an attempt, its start and its end, under `ledger/` of a run's storage."""
+    """Two records per attempt, its start and its end, under `ledger/` of a run's storage."""
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
 
     def start(self, attempt: str, shard: int) -> None:
-        """Note that an attempt begins. Two attempts of one name are a defect, and refused."""
+        """Record that an attempt begins. InputError for two attempts of one name, which is a defect."""
         record = AttemptStart(
             attempt=attempt, shard=shard, started=utc_now(), host=platform.node(), writer=secrets.token_hex(8)
         )
         if not self._storage.put_new(start_key(attempt), encode_record(record)):
             place = f"{self._storage.url}/{start_key(attempt)}"
-            raise InputError(place, "", "this attempt has already begun", "Give every attempt its own name")
+            raise InputError(place, "", "exists already", "Give every attempt its own name")
 
     def end(self, entry: LedgerEntry) -> bool:
-        """Note how an attempt ended; False when its end was noted before. Long stacks are cut.
+        """Record how an attempt ended; False when its end was recorded before. Long stacks are cut.
 
-        An attempt that another job took for lost may still answer: its account replaces the guess. One
-        that ended before it could note that it began gets its start here, so that every end has one.
+        The end of an attempt that another job recorded as lost replaces that guess. Where the start record is
+        missing, it is written here, so that every end has one.
         """
         if entry.outcome not in ("committed", "superseded") and not self._storage.exists(
             start_key(entry.attempt)
@@ -62,20 +62,20 @@ class Ledger:
         return {name.removesuffix(".start") for name in self.stamps()}
 
     def start_of(self, attempt: str) -> AttemptStart | None:
-        """The record that an attempt began; None where there is none."""
+        """The start record of an attempt; None where there is none."""
         return read_record(self._storage, start_key(attempt), AttemptStart)
 
     def end_of(self, attempt: str) -> LedgerEntry | None:
-        """How an attempt ended; None while it has not."""
+        """The end record of an attempt; None while it has not ended."""
         return read_record(self._storage, end_key(attempt), LedgerEntry)
 
     def ends(self) -> Iterator[LedgerEntry]:
-        """Ends of all attempts, in order of their names."""
+        """End records of all attempts, in order of their names."""
         names = sorted(name for name in self.stamps() if not name.endswith(".start"))
         yield from self._read(names, LedgerEntry)
 
     def unfinished(self, stamps: Mapping[str, str] | None = None) -> list[AttemptStart]:
-        """Attempts that began and left no end: running elsewhere, or lost. `stamps` saves a listing."""
+        """Start records of attempts without an end: running, or lost. `stamps` saves a listing."""
         names = self.stamps() if stamps is None else stamps
         open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
         return list(self._read(open_, AttemptStart))
@@ -96,7 +96,7 @@ class Ledger:
 
 
 def end_from_commit(commit: Commit, started: str) -> LedgerEntry:
-    """How the attempt of a commit ended, at the commit's cost; `started` is "" where nobody knows it."""
+    """The end record of a committed attempt, with the commit's cost; `started` is "" where unknown."""
     return LedgerEntry(
         attempt=commit.attempt,
         shard=commit.shard,
@@ -109,9 +109,9 @@ def end_from_commit(commit: Commit, started: str) -> LedgerEntry:
 
 
 def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> LedgerEntry:
-    """The end of an attempt that left none, at a cost that nobody knows.
+    """The end record of an attempt that left none, with unknown cost.
 
-    It is a guess, good once the shard is decided: whoever still runs the attempt may tell the truth.
+    It is a guess, made once the shard is decided: the attempt, if still running, may replace it.
     """
     return LedgerEntry(
         attempt=start.attempt,
@@ -124,16 +124,16 @@ def lost_end(start: AttemptStart, ended: str = "", cause: str = LOST_CAUSE) -> L
 
 
 def start_from_end(end: LedgerEntry) -> AttemptStart:
-    """The start record of an attempt as far as its end tells it."""
+    """The start record of an attempt, reconstructed from its end."""
     host = end.host.name if end.host else ""
     return AttemptStart(attempt=end.attempt, shard=end.shard, started=end.started, host=host)
 
 
 def start_key(attempt: str) -> str:
-    """Key of the record that an attempt began."""
+    """Key of the start record of an attempt."""
     return f"ledger/{attempt}.start.json"
 
 
 def end_key(attempt: str) -> str:
-    """Key of the record of how an attempt ended."""
+    """Key of the end record of an attempt."""
     return f"ledger/{attempt}.json"

@@ -1,6 +1,6 @@
-"""Where the shards of a merged run come from: `lineage.json`, which names the runs that made them.
+"""The origins of the shards of a merged run: `lineage.json` names the runs that made them.
 
-Sources are named transitively: a run that was itself merged is passed through to those that it names.
+Origins are resolved: for a source that was itself merged, the runs that it names are recorded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _Shard = Annotated[int, Field(ge=0, le=10**18)]
 
 
 class ShardOrigin(NamedTuple):
-    """A run that made shards: where it lay when it was merged, and what made it. Sorted in this order."""
+    """A run that made shards: its address when it was merged, and its manifest. Sorted in this order."""
 
     address: str
     created: str
@@ -30,7 +30,7 @@ class ShardOrigin(NamedTuple):
 
 
 class LineageSource(StoredRecord):
-    """One origin and the shards that come from it, as ranges of first and last."""
+    """One origin and its shards, as ranges of first and last."""
 
     address: str
     created: str
@@ -47,7 +47,7 @@ class Lineage(StoredRecord):
 
 
 class Origins:
-    """What is known of the origins of one run's shards."""
+    """The origins of one run's shards."""
 
     def __init__(self, run: Run) -> None:
         manifest = run.manifest
@@ -74,7 +74,7 @@ class Origins:
         return bool(self.named)
 
     def of(self, shard: int) -> ShardOrigin:
-        """Where a shard comes from; the run itself where no lineage says otherwise."""
+        """The origin of a shard; the run itself where the lineage names none."""
         k = bisect_right(self._firsts, shard) - 1
         if k >= 0 and shard <= self._ranges[k][1]:
             return self._ranges[k][2]
@@ -82,13 +82,13 @@ class Origins:
 
 
 def encode_lineage(shards: Mapping[ShardOrigin, Iterable[int]]) -> bytes:
-    """The record's bytes from the shards of each origin."""
+    """The bytes of the record from the shards of each origin."""
     sources = [LineageSource(**origin._asdict(), shards=_ranges(shards[origin])) for origin in sorted(shards)]
     return encode_record(Lineage(sources=tuple(sources)))
 
 
 def lineage_summary(run: Run) -> list[dict[str, Any]]:
-    """The origins of a run's committed shards, their number and ranges; empty where it was not merged."""
+    """The origins of a run's committed shards with counts and ranges; empty where it was not merged."""
     origins = Origins(run)
     if not origins.is_merged:
         return []

@@ -1,4 +1,4 @@
-"""Temporary folders that only this user can enter, each locked by the process that made it while it lives."""
+"""Private temporary folders of this user, each locked by its process while that runs."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ def _remove_tree(folder: Path) -> None:
 def locked_folder(kind: str, parent: Path, remove: Callable[[Path], None] = _remove_tree) -> Generator[Path]:
     """Give a new folder of mode 0700, whose name begins with `kind`; `remove` removes it after the block.
 
-    First removes those that killed processes of this user left. A lock that the kernel releases when its
-    owner dies tells them from those of living ones.
+    First removes folders of killed processes of this user, whose locks the kernel has released.
     """
     for left in parent.glob(f"{kind}*"):
         if (held := _lock(left, fcntl.LOCK_EX)) is not None:
             remove(left)
             os.close(held)
     folder, held = parent, None
-    while held is None:  # unless another process took it for a dead one's before it was locked
+    while held is None:  # another process may have removed it before it was locked
         folder = Path(tempfile.mkdtemp(prefix=kind, dir=parent))
         held = _lock(folder, fcntl.LOCK_SH)
     try:
@@ -38,12 +37,12 @@ def locked_folder(kind: str, parent: Path, remove: Callable[[Path], None] = _rem
 
 
 def is_private(status: os.stat_result) -> bool:
-    """Whether a file or folder is this user's, and nobody else can write to it."""
+    """Whether a file or folder belongs to this user, and no other user can write to it."""
     return status.st_uid == os.getuid() and not status.st_mode & 0o022
 
 
 def _lock(folder: Path, kind: int) -> int | None:
-    """A descriptor that holds the lock of this user's folder until the process ends; None where it cannot."""
+    """A descriptor that locks this user's folder until the process ends; None where it is locked."""
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:

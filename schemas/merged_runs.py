@@ -1,4 +1,4 @@
-"""A place that holds one run, or several that were merged: the parts of a merged one are runs themselves."""
+"""Open a run, or merged runs, whose parts are runs themselves."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from datagen.schemas.storage import Storage, open_storage
 
 
 def open_runs(place: Storage | Path | str) -> list[Run]:
-    """The run at `place`, or the parts of a merged one, in the order of their rows in its store.
+    """Return the run at `place`, or the parts of merged runs in the order of their rows in the store.
 
-    InputError when there is no run, or it is damaged or of another format.
+    InputError where there is no run, or one that is damaged or of another format.
     """
     storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
     merged = read_record(storage, MERGED, Merged)
@@ -27,19 +27,19 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
         raise InputError(
             f"{storage.url}/{MERGED}",
             "format_version",
-            f"{merged.format_version}, and this program reads {FORMAT_VERSION}",
-            "Use the version of the program that made the run",
+            f"is {merged.format_version}, but this program reads {FORMAT_VERSION}",
+            "Use the version of datagen that made the run",
         )
     runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
     for run, spec_hash in zip(runs, merged.parts, strict=True):
         if found := other_value(run.manifest, spec_hash=spec_hash):
-            raise InputError(f"{run.storage.url}/manifest.json", *found, "Mend it with `datagen repair`")
+            raise InputError(f"{run.storage.url}/manifest.json", *found, "Repair it with `datagen repair`")
     return runs
 
 
 @dataclass(frozen=True)
 class LabelCounts:
-    """What runs together want and have: labels, and planned shards without a commit."""
+    """LabelCounts and committed labels of runs, and the number of missing shards."""
 
     n: int
     labels: int
@@ -47,7 +47,7 @@ class LabelCounts:
 
 
 def label_counts(runs: Iterable[Run]) -> LabelCounts:
-    """Sums over the runs of a place. Shards beyond a run's n do not count, and the last one is cut."""
+    """Sums over runs. Shards beyond a run's n do not count, and the last one is cut."""
     n = labels = missing = 0
     for run in runs:
         run_n = run.n
@@ -60,9 +60,9 @@ def label_counts(runs: Iterable[Run]) -> LabelCounts:
 
 
 def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
-    """The run that has scene `scene` of a place, and its index there: runs follow each other in order.
+    """Return the run with scene `scene` of consecutive runs, and the scene's index in it.
 
-    InputError where the place wants fewer scenes.
+    InputError where there are fewer scenes.
     """
     left = scene
     for run in runs:
@@ -72,4 +72,4 @@ def find_scene(runs: Sequence[Run], scene: int) -> tuple[Run, int]:
         left -= scenes
     last = scene - left - 1
     problem = f"{scene} is not in this run" if len(runs) == 1 else f"{scene} is in none of these runs"
-    raise InputError(runs[0].storage.url, "--scene", problem, f"Choose one from 0 to {last}")
+    raise InputError(runs[0].storage.url, "--scene", problem, f"Give one from 0 to {last}")

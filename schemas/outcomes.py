@@ -1,22 +1,22 @@
-"""What may become of a scene that is drawn and of a candidate that is tried."""
+"""Causes of rejected scenes, and outcomes of candidates."""
 
 from __future__ import annotations
 
-# Causes for which a scene is drawn again; their order is part of the data format.
+# Causes for resampling a scene; their order is part of the data format.
 REDRAW_CAUSES = (
     "bad_house",  # the house's record in its source is broken
-    "no_surface",  # the house has no support surface of the asked height and size
+    "no_surface",  # the house has no support surface of the required height and size
     "no_placement",  # target or clutter found no free place on the surface
     "not_at_rest",  # still moving after the last step
     "fell_off",  # an object left its support
     "penetration",  # a body ended inside another
     "not_finite",  # the physics returned NaN or infinite poses
-    "no_viewpoint",  # no free place from which enough of the target is seen
-    "no_base",  # no candidate of the asked kind (clear, in-range) around the target
+    "no_viewpoint",  # no free viewpoint from which enough of the target is visible
+    "no_base",  # no candidate of the required set (clear, in-range) around the target
 )
 
-# How a candidate of `plan` and `sim` ended, and the stage that decided it; the order is part of the
-# data format. Where several grasps failed, the one that came furthest counts.
+# Outcome of a candidate of `plan` and `sim`, and the stage that decided it; the order is part of the data
+# format. Where several grasps failed, the one that came furthest counts.
 OUTCOMES: dict[str, str] = {
     "success": "execute",  # lifted and held; for `plan`: a whole plan was found
     "base_collision": "base",  # the robot's body does not fit where it would stand
@@ -32,5 +32,5 @@ OUTCOMES: dict[str, str] = {
     "missed": "execute",  # closed, with nothing between the fingers
     "slipped": "execute",  # held after closing, not lifted with the hand
     "dropped": "execute",  # lifted, and lost before the end of holding
-    "unstable": "execute",  # the physics left sense: NaN, or speeds no such motion has
+    "unstable": "execute",  # the physics diverged: NaN, or impossible speeds
 }

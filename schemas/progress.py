@@ -1,6 +1,6 @@
-"""How far a command is, on standard error: a bar on a terminal, else lines of text; JSON lines for `--json`.
+"""Progress of a command on standard error: a bar on a terminal, else lines of text; JSON lines with --json.
 
-It lies below `cluster` and `train`, which do not know each other, and needs neither Ray nor torch.
+Used by `cluster` and `train`; needs neither Ray nor torch.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from datagen.schemas.errors import printable
 
 _RATE_OVER_S, _LINE_EVERY_S, _DRAW_EVERY_S = 60.0, 10.0, 0.2
 Clock = Callable[[], float]
-Figures = Callable[[], tuple[str, dict[str, object]]]  # for people, and for programs
+Figures = Callable[[], tuple[str, dict[str, object]]]  # text for people, values for programs
 Step = Callable[[], None]
 Seen = Callable[[int, int], None]
 
 
 class Pace:
-    """How fast totals that begin at 0 grow per second of `clock`, over the last minute."""
+    """Growth rate of totals that begin at 0, per second of `clock`, over the last minute."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -44,23 +44,23 @@ class Pace:
             self._seen.popleft()
 
     def per_s(self, which: int = 0) -> float:
-        """Growth of one of the totals; 0 before it is known."""
+        """Growth of one total per second; 0 while unknown."""
         then_s, before = self._seen[0]
         elapsed_s = self._clock() - then_s
         grown = self._totals[which] - (before[which] if before else 0) if self._totals else 0.0
         return grown / elapsed_s if elapsed_s > 0 else 0.0
 
     def left_s(self, more: float, which: int = 0) -> float | None:
-        """Seconds until one of the totals has grown by `more`; None while its rate is unknown."""
+        """Seconds until one total has grown by `more`; None while its rate is unknown."""
         rate = self.per_s(which)
         return max(0.0, more) / rate if rate > 0 else None
 
 
 class Progress:
-    """Shows phases by their names, and how much of a countable phase is done, with figures.
+    """Shows phases by name and, for countable ones, the progress with figures.
 
-    Off a terminal a phase without numbers is a line when it begins, and the others are a line every ten
-    seconds; their last state follows where a line went before it, so that quick work stays quiet.
+    Without a terminal, a phase without numbers is one line, and the others print a line every ten seconds.
+    The last state is printed only after such a line, so that quick work prints nothing.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Progress:
         self._bar = Bar(
             TextColumn("{task.description}", style="bold", markup=False),
             BarColumn(bar_width=None),
-            # Where the terminal is narrow, the bar gives way and not the figures.
+            # On a narrow terminal the bar shrinks, not the figures.
             TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=True)),
             console=self._console,
             expand=True,
@@ -90,7 +90,7 @@ class Progress:
         self.close()
 
     def phase(self, name: str) -> None:
-        """Name what begins now and has no numbers."""
+        """Show the name of a phase without numbers."""
         self._end_row()
         if self._live:
             self._draw(name)
@@ -98,14 +98,14 @@ class Progress:
             self.say("phase", {"phase": name}, name)
 
     def update(self, what: str, done: int, of: int, figures: Figures) -> None:
-        """`done` things of `of` (0: unknown) are done; `what` names them, in the plural. Cheap to call."""
+        """Show that `done` of `of` (0: unknown) are done; `what` is their plural. Cheap to call."""
         self._state = what, done, of, figures
         if (now_s := self.clock()) >= self._next_s:
             self._next_s, self._told = now_s + self._every_s, True
             self._show()
 
     def say(self, event: str, values: Mapping[str, object], text: str, style: str = "") -> None:
-        """Write a line above the bar: `text`, or as JSON the event with its values."""
+        """Print a line above the bar: `text`, or as JSON the event with its values."""
         self._told = True
         if self._live:
             self._console.print(Text(printable(text), style=style), soft_wrap=True)
@@ -114,7 +114,7 @@ class Progress:
             print(line, file=self._console.file, flush=True)
 
     def close(self) -> None:
-        """Show the last state, and give the terminal back."""
+        """Show the last state, and release the terminal."""
         self._end_row()
         if self._live:
             self._bar.stop()
@@ -145,7 +145,7 @@ class Progress:
 
 @contextmanager
 def counting(what: str, as_json: bool = False, clock: Clock = time.monotonic, of: int = 0) -> Generator[Seen]:
-    """Give a function to call with (done, of how many), which shows that with rate and time left."""
+    """Give a function `seen(done, of)` that shows the progress with rate and time left."""
     with Progress(as_json, clock) as progress:
         pace = Pace(clock)
 
@@ -158,7 +158,7 @@ def counting(what: str, as_json: bool = False, clock: Clock = time.monotonic, of
             pace.see(done)
             progress.update(what, done, of, figures)
 
-        seen(0, of)  # a terminal names it from the beginning
+        seen(0, of)  # a terminal shows it from the start
         yield seen
 
 

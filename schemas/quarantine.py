@@ -1,4 +1,4 @@
-"""Giving shards that were given up another chance: the record steps aside and stays as history."""
+"""Release quarantined shards, so that they are tried again; their records are kept."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ _LIFTED = re.compile(r"quarantine/([0-9]{6,18})\.lifted-([1-9][0-9]{0,8})\.json"
 
 
 def lift_quarantine(run: Run) -> list[int]:
-    """Let every shard in quarantine be tried again; their numbers.
+    """Release every quarantined shard; return their numbers.
 
-    A record moves to `quarantine/<shard>.lifted-<k>.json`. It is written there first, so that a kill
-    in between leaves the shard in quarantine and nothing doubled.
+    A record moves to `quarantine/<shard>.lifted-<k>.json`. It is written there first, so that after a kill in
+    between the shard is still quarantined.
     """
     shards = sorted(run.quarantined())
     for shard in shards:
         key = f"quarantine/{shard:06d}.json"
         data = run.storage.get(key, MAX_RECORD_BYTES)
         if data is None:
-            continue  # somebody else lifted it
-        # A store of these very bytes is one that was cut short: it succeeds.
+            continue  # another process released it
+        # An existing record with these bytes is from an interrupted call: a success.
         next(k for k in count(1) if run.storage.put_new(_lifted_key(shard, k), data))
         run.storage.delete([key])
     return shards
 
 
 def lifted_records(run: Run) -> list[QuarantineRecord]:
-    """Records of quarantines that were lifted, in order of shards and time. InputError as `read_record`."""
+    """Records of released shards, in order of shard and time. InputError as `read_record`."""
     found: list[tuple[int, int]] = []
     for file in run.storage.list("quarantine"):
         if name := _LIFTED.fullmatch(file.key):
@@ -42,14 +42,14 @@ def lifted_records(run: Run) -> list[QuarantineRecord]:
         record = read_record(run.storage, _lifted_key(shard, k), QuarantineRecord)
         if record is not None and record.shard != shard:
             place = f"{run.storage.url}/{_lifted_key(shard, k)}"
-            raise InputError(place, "shard", f"{record.shard}, not {shard}", "Remove this foreign file")
+            raise InputError(place, "shard", f"is {record.shard}, not {shard}", "Remove this foreign file")
         if record is not None:
             records.append(record)
     return records
 
 
 def name_before(name: str) -> str:
-    """The file name that a record in `quarantine/` had before it was lifted; its own where it was not."""
+    """The file name of a record in `quarantine/` before its shard was released."""
     lifted = _LIFTED.fullmatch(f"quarantine/{name}")
     return f"{lifted[1]}.json" if lifted else name
 

@@ -1,4 +1,4 @@
-"""The JSON records of a run as files: written readably with their own digest, read back with suspicion."""
+"""JSON records of a run as files: indented, with their own digest, and validated when read."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.storage import Storage
 
 MAX_RECORD_BYTES = 16 * 2**20
-_MEND = "Mend it with `datagen repair`, or restore the file from a copy"
-# The last line of a record: the sha256 of every byte before it. What is left of it is JSON but for a brace.
+_MEND = "Repair it with `datagen repair`, or restore the file from a copy"
+# The last line of a record: the sha256 of every byte before it. The rest is JSON without its closing brace.
 _TRAILER = re.compile(rb',\n "sha256": "([0-9a-f]{64})"\n}\n\Z')
 _TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64
 
@@ -34,9 +34,9 @@ def encode_record(record: BaseModel) -> bytes:
 
 
 def signed_json(fields: Mapping[str, Any]) -> bytes:
-    """A record's file from its fields, as `encode_record` writes it."""
+    """The bytes of a record from its fields, as `encode_record` writes them."""
     text = json.dumps(fields, indent=1, allow_nan=False)
-    if "\\ud" in text:  # half characters, of a file's name in an error or of a host, which no reader takes
+    if "\\ud" in text:  # lone surrogates, from file names or host names, are invalid JSON
         text = json.dumps(fields, indent=1, ensure_ascii=False).encode(errors="replace").decode()
         text = json.dumps(json.loads(text), indent=1)
     body = text.encode().removesuffix(b"\n}")
@@ -44,14 +44,14 @@ def signed_json(fields: Mapping[str, Any]) -> bytes:
 
 
 def decode_record(place: str, data: bytes, model: type[Record]) -> Record:
-    """The validated record of a file at `place`.
+    """Return the validated record of a file at `place`.
 
-    InputError names the file and the field when its bytes are not those that were written, when it is
-    not JSON, or has unknown or missing fields or values out of range.
+    InputError where its bytes were changed, where it is not JSON, and for unknown or missing fields and
+    values out of range.
     """
     trailer = _TRAILER.search(data, max(0, len(data) - _TRAILER_BYTES))
     if trailer is None:
-        raise InputError(place, "sha256", "not a whole record: it does not end with its sha256", _MEND)
+        raise InputError(place, "sha256", "is missing at the end: the record is incomplete", _MEND)
     body = data[: trailer.start()]
     if sha256(body).hexdigest().encode() != trailer[1]:
         raise InputError(place, "sha256", "does not match: the file is damaged or was edited", _MEND)
@@ -66,13 +66,13 @@ def decode_record(place: str, data: bytes, model: type[Record]) -> Record:
 
 
 def read_record(storage: Storage, key: str, model: type[Record]) -> Record | None:
-    """The validated record, or None when there is no such file. InputError as `decode_record`."""
+    """Read the validated record, or None when there is no such file. InputError as `decode_record`."""
     data = storage.get(key, MAX_RECORD_BYTES)
     return None if data is None else decode_record(f"{storage.url}/{key}", data, model)
 
 
 def different_fields(ours: object, theirs: object, path: str = "") -> list[tuple[str, object, object]]:
-    """(path, ours, theirs) of every leaf in which two JSON values differ; None where one lacks it."""
+    """(path, ours, theirs) of every leaf that differs between two JSON values; None where one lacks it."""
     if isinstance(ours, dict) and isinstance(theirs, dict):
         rows: list[tuple[str, object, object]] = []
         for key in sorted({*ours, *theirs}, key=str):

@@ -1,4 +1,4 @@
-"""Records at a run's root: each is written once, with a second copy; what else is there is refused."""
+"""Records at a run's root, each written once with a second copy, and checks of foreign files."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ def copy_key(key: str) -> str:
 
 
 def publish(storage: Storage, key: str, record: bytes) -> None:
-    """Write a record of the run's root once: its copy first, then the record with the copy's bytes.
+    """Write a record at the run's root once: its copy first, then the record with the copy's bytes.
 
-    The copy decides races, so that both are always equal; one that was killed in between is completed
-    by the next.
+    The copy decides races, so that both are equal; after a kill in between, the next call completes it.
     """
     storage.put_new(copy_key(key), record)
     kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
@@ -26,9 +25,9 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
 
 
 def refuse_foreign(storage: Storage, *also: str) -> None:
-    """Refuse a place without a run that holds files of something else; `also` begin further names of ours."""
+    """Raise InputError for a folder with other files than a run's; `also` are further allowed prefixes."""
     ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
-    problem, mend = "the folder holds files of something else", "Choose a new --out"
+    problem, mend = "holds other files than those of a run", "Choose a new --out"
     try:
         for file in storage.list(""):
             if not file.key.startswith(ours):
@@ -38,18 +37,18 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
 
 
 def refuse_other(place: str, there: Manifest, asked: Manifest) -> None:
-    """Refuse to go on with a run of another specification, naming every field that differs."""
-    # Not the schema's version: a run goes on in the one it was begun with.
+    """Raise InputError for a run of another specification, with every field that differs."""
+    # Without the schema version: a run keeps the one it was started with.
     ours, theirs = (
         {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (asked, there)
     )
     rows = different_fields(ours, theirs)
     where, each = f"{place}/manifest.json", there.layout.candidates_per_scene
     if each != asked.layout.candidates_per_scene:
-        problem = f"{each}, not the {asked.layout.candidates_per_scene} asked"
+        problem = f"is {each}, not {asked.layout.candidates_per_scene}"
         raise InputError(where, "layout.candidates_per_scene", problem, "Choose another --out")
     if rows:
-        shown = [f"{path.removeprefix('spec.')}: it has {b!r}, asked {a!r}" for path, a, b in rows[:20]]
+        shown = [f"{path.removeprefix('spec.')}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
         more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
-        problem = "another specification lives here (" + "; ".join(shown) + more + ")"
-        raise InputError(where, "", problem, "Choose another --out, or ask for what it has")
+        problem = "has another specification (" + "; ".join(shown) + more + ")"
+        raise InputError(where, "", problem, "Choose another --out, or give the same options")

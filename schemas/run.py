@@ -1,7 +1,7 @@
 """A run on disk: manifest, plans, shards, commits, ledger and quarantine (docs/reference/data-format.md).
 
-Readers, resume, seal and audit trust commit records alone: a commit is written last and
-create-only, so that of two racing attempts one wins and the other is waste.
+Readers, resume, seal and audit trust only commit records: a commit is written last and create-only, so that
+of two racing attempts one wins and the other is waste.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from datagen.schemas.storage import Storage, open_storage
 from datagen.schemas.storage.errors import StoreUnavailable
 
 _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
-# What became of an attempt that was to be removed. `damaged`: it was committed while its files went.
+# Result of removing an attempt. `damaged`: it was committed while its files were removed.
 Removal = Literal["removed", "spared", "damaged"]
 _MOST_PLANS = 10**9
-AGAIN = "Run the same command again once `datagen gc` has ended: it makes what is missing"
+AGAIN = "Run the same command again after `datagen gc` has ended: it makes the missing shards"
 # A commit with its file entries takes some 30 kB of memory.
 _COMMITS_KEPT = 1000
 
@@ -56,30 +56,30 @@ class Run:
         self.storage = storage
         self.manifest = manifest
         self.ledger = Ledger(storage)
-        self._commits: dict[int, Commit] = {}  # those read last; immutable once written
+        self._commits: dict[int, Commit] = {}  # the most recently read; immutable once written
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
 
     @classmethod
     def create_or_open(cls, storage: Storage, manifest: Manifest, n: int) -> Run:
-        """A new run of n samples, or the one that is there, grown to n if it is shorter.
+        """Create a run of n samples, or open the existing one and grow it to n if it is shorter.
 
-        An existing run keeps its layout. InputError when it has another specification or format,
-        naming every field that differs, or when the place holds files of something else.
+        An existing run keeps its layout. InputError when it has another specification or format, with every
+        field that differs, or when the folder holds other files.
         """
         if not storage.exists("manifest.json"):
             refuse_foreign(storage)
             publish(storage, "manifest.json", encode_record(manifest))
         run = cls.open(storage)
-        _ = run.schema  # refuses a version that this program does not know
+        _ = run.schema  # InputError for an unknown version
         refuse_other(storage.url, run.manifest, manifest)
         run.grow(n)
         return run
 
     @classmethod
     def open(cls, place: Storage | Path | str) -> Run:
-        """An existing run. InputError when there is none, or it is damaged or of another format."""
+        """Open an existing run. InputError where there is none, or it is damaged or of another format."""
         storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
         manifest = read_record(storage, "manifest.json", Manifest)
         if manifest is None:
@@ -87,7 +87,7 @@ class Run:
             if merged is not None:
                 parts = ", ".join(f"{storage.url}/{part_folder(part)}" for part in merged.parts[:3])
                 more = f" or another of {len(merged.parts)}" if len(merged.parts) > 3 else ""
-                problem = f"holds {len(merged.parts)} merged runs, and one is needed here"
+                problem = f"holds {len(merged.parts)} merged runs, but one run is needed"
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
             raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
         where = f"{storage.url}/manifest.json"
@@ -95,14 +95,14 @@ class Run:
             raise InputError(
                 where,
                 "format_version",
-                f"{manifest.format_version}, and this program reads {FORMAT_VERSION}",
-                "Use the version of the program that made the run",
+                f"is {manifest.format_version}, but this program reads {FORMAT_VERSION}",
+                "Use the version of datagen that made the run",
             )
         if manifest.spec.hash() != manifest.spec_hash:
             raise InputError(
                 where,
                 "spec_hash",
-                "not the hash of the specification beside it",
+                "is not the hash of the specification in the record",
                 "The manifest was edited: restore it from a copy",
             )
         return cls(storage, manifest)
@@ -116,7 +116,7 @@ class Run:
     def schema(self) -> RecordSchema:
         """The record schema of this run's version, with its axis lengths.
 
-        A run keeps the version it was begun with. InputError for one that this program does not know.
+        A run keeps the version it was started with. InputError for an unknown one.
         """
         manifest = self.manifest
         try:
@@ -124,31 +124,34 @@ class Run:
         except InputError as e:
             raise InputError(f"{self.storage.url}/manifest.json", e.field, e.problem, e.mend) from e
 
-    # Plans: how far to go.
+    # Plans: the number of samples wanted.
 
     @property
     def n(self) -> int:
-        """Samples wanted by the newest plan."""
+        """Number of samples in the newest plan."""
         return self._newest_plan()[1]
 
     def grow(self, n: int, created: str | None = None) -> None:
-        """Want at least n samples; a run never shrinks. `created` is when that was said, now by default."""
+        """Raise the wanted samples to n; a run never shrinks. `created` is the plan's time [now]."""
         if not 1 <= n <= 10**12:
-            raise InputError("--n", "", f"{n} samples", "Ask for 1 to 10^12 samples")
+            raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of samples wanted")
         while True:
             number, wanted = self._newest_plan()
             if wanted >= n:
                 return
-            if number >= _MOST_PLANS:  # its next would have a name that is no plan's
-                place, problem = f"{self.storage.url}/plans/{number}.json", "no run has so many plans"
-                raise InputError(place, "", problem, "Move it away")
+            if number >= _MOST_PLANS:  # the next name would be invalid
+                place, problem = (
+                    f"{self.storage.url}/plans/{number}.json",
+                    "is beyond the largest number of plans",
+                )
+                raise InputError(place, "", problem, "Move it out of the run")
             number, spec_hash = number + 1, self.manifest.spec_hash
             plan = Plan(n=n, created=created or utc_now(), spec_hash=spec_hash, number=number)
-            # Losing this race means that another plan appeared: look again.
+            # Where another plan appeared meanwhile, read the newest again.
             publish(self.storage, f"plans/{number}.json", encode_record(plan))
 
     def plan(self) -> Plan | None:
-        """The newest plan; None where a run was made and its first plan not yet."""
+        """The newest plan; None where the first one is not written yet."""
         number, _ = self._newest_plan()
         return read_record(self.storage, f"plans/{number}.json", Plan) if number else None
 
@@ -159,7 +162,7 @@ class Run:
         number = max(numbers)
         plan = read_record(self.storage, key := f"plans/{number}.json", Plan)
         if plan and (found := other_value(plan, spec_hash=self.manifest.spec_hash, number=number)):
-            raise InputError(f"{self.storage.url}/{key}", *found, "Mend it with `datagen repair`")
+            raise InputError(f"{self.storage.url}/{key}", *found, "Repair it with `datagen repair`")
         return (number, plan.n) if plan else self._newest_plan()
 
     # Shards and commits.
@@ -177,7 +180,7 @@ class Run:
         return dict(self._numbered("commits"))
 
     def missing(self) -> ShardRanges:
-        """Planned shards that are neither committed nor in quarantine, in order."""
+        """Planned shards that are neither committed nor quarantined, in order."""
         decided = (int(name) for folder in ("commits", "quarantine") for name, _ in self._numbered(folder))
         return ShardRanges.of(self.planned()).without(ShardRanges.of(decided))
 
@@ -188,7 +191,7 @@ class Run:
             data = self.storage.get(key, MAX_RECORD_BYTES)
             if data is None:
                 place = f"{self.storage.url}/{key}"
-                raise InputError(place, "", "no such commit", "Make it with `datagen resume`")
+                raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
             while len(self._commits) >= _COMMITS_KEPT:
                 del self._commits[next(iter(self._commits))]
             self._commits[shard] = self.decode_commit(shard, data)
@@ -208,15 +211,15 @@ class Run:
         for shard, (_, data) in zip(
             shards, self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES), strict=True
         ):
-            if data is not None:  # else it was withdrawn since the listing
+            if data is not None:  # else it was removed since the listing
                 yield self.decode_commit(shard, data)
 
     def write_shard(
         self, shard: int, attempt: str, files: Mapping[str, bytes], ours: bool = False
     ) -> tuple[FileEntry, ...]:
-        """Write an attempt's files durably; its entries for the commit. Nothing counts before it.
+        """Write an attempt's files durably; return the entries for its commit.
 
-        `ours`: nobody else can commit an attempt of this name.
+        `ours`: no other process can commit an attempt of this name.
         """
         folder = shard_folder(shard, attempt)
         entries = tuple(
@@ -230,16 +233,16 @@ class Run:
 
     @contextmanager
     def nothing_left_behind(self, shard: int, attempt: str, ours: bool = False) -> Generator[None]:
-        """Remove what the block wrote of an attempt where the disk refuses: a full one gets its room back.
+        """Remove the files of an attempt that the block wrote where the disk fails, to free a full disk.
 
-        An attempt that is `ours` goes at once; another one by a mark, for which a full disk may lack
-        room, so that its files may stay until `gc`.
+        An attempt that is `ours` is removed at once; another one needs a mark, for which a full disk may lack
+        space, so that its files may stay until `gc`.
         """
         folder = shard_folder(shard, attempt)
         try:
             yield
         except StoreUnavailable:
-            raise  # it would not delete either
+            raise  # deleting would fail too
         except InputError as error:
             with suppress(InputError):
                 if ours:
@@ -247,7 +250,7 @@ class Run:
                     self.storage.remove_empty(folder)
                 else:
                     self.remove_attempt(shard, attempt)
-            if error.problem == os.strerror(errno.ENOENT):  # `gc` took it
+            if error.problem == os.strerror(errno.ENOENT):  # `gc` removed it
                 raise InputError(error.place, error.field, error.problem, AGAIN) from error
             raise
 
@@ -267,7 +270,7 @@ class Run:
         return "damaged" if broken else "removed"
 
     def _is_committed(self, shard: int, attempt: str) -> bool | None:
-        """Whether a shard's commit, as it is now, names the attempt; None where it cannot be read."""
+        """Whether a shard's current commit names the attempt; None where it cannot be read."""
         data = self.storage.get(commit_key(shard), MAX_RECORD_BYTES)
         try:
             return data is not None and self.decode_commit(shard, data).attempt == attempt
@@ -275,7 +278,7 @@ class Run:
             return None
 
     def commit(self, commit: Commit) -> bool:
-        """Publish a shard. False when another attempt has won; its files then are garbage.
+        """Commit a shard. False where another attempt is committed; the files are then garbage.
 
         The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit of
         an attempt whose files are removed as garbage meanwhile is withdrawn (as `garbage_collection` says).
@@ -290,19 +293,19 @@ class Run:
         if not won:
             self.storage.delete([copy])
         elif (problem := self._lack(commit, committing=True)) is not None:
-            # With its copy, which would stand for a commit whose record was lost.
+            # With its copy, which would restore the commit.
             self.storage.delete([commit_key(commit.shard), copy])
             raise problem
         return won
 
     def check_files(self, commit: Commit) -> None:
-        """Refuse a commit whose files are absent or of another size (bytes are not read)."""
+        """Raise InputError for a commit whose files are missing or of another size (bytes are not read)."""
         if (problem := self._lack(commit)) is not None:
             raise problem
 
     def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
-        mend = AGAIN if committing else "Restore the file from a copy, or mend the run with `datagen repair`"
+        mend = AGAIN if committing else "Restore the file from a copy, or run `datagen repair`"
         sizes = {f.key: f.size for f in self.storage.list(folder)}
         if committing and (mark := f"{folder}/{REMOVING}") in sizes:
             place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
@@ -313,7 +316,7 @@ class Run:
                 return InputError(
                     f"{self.storage.url}/{folder}/{entry.path}",
                     "",
-                    "missing" if size is None else f"{size} bytes, where the commit has {entry.size}",
+                    "is missing" if size is None else f"has {size} bytes, but {entry.size} were committed",
                     mend,
                 )
         return None
@@ -321,17 +324,17 @@ class Run:
     # Quarantine.
 
     def quarantine(self, record: QuarantineRecord) -> bool:
-        """Give a shard up; False when it was before."""
+        """Quarantine a shard; False where it already was."""
         cut = tuple(stack[-MAX_STACK_CHARS:] for stack in record.stacks)
         kept = record.model_copy(update={"stacks": cut})
         return self.storage.put_new(f"quarantine/{record.shard:06d}.json", encode_record(kept))
 
     def quarantined(self) -> set[int]:
-        """Shards that were given up, by listing. One that was committed later counts as committed."""
+        """Quarantined shards, by listing. A shard that was committed later counts as committed."""
         return self._numbers("quarantine") - self.committed()
 
     def quarantine_records(self) -> list[QuarantineRecord]:
-        """Records of the shards in quarantine, in order."""
+        """Records of the quarantined shards, in order."""
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
         found = (read_record(self.storage, key, QuarantineRecord) for key in keys)
         return [record for record in found if record is not None]
@@ -340,9 +343,9 @@ class Run:
         return {int(name) for name, _ in self._numbered(folder, width)}
 
     def _numbered(self, folder: str, width: int = 6) -> Iterator[tuple[str, str]]:
-        """(name, change stamp) of a folder's records that have a number for a name."""
+        """(name, change stamp) of a folder's records whose name is a number."""
         for file in self.storage.list(folder):
             name = file.key.removeprefix(f"{folder}/")
-            # Only names that this program gives: not drafts, and not "7.json" for "000007.json".
+            # Only names in the form that is written: no drafts, and not "7.json" for "000007.json".
             if (found := _NUMBERED.fullmatch(name)) and name == f"{int(found.group(1)):0{width}d}.json":
                 yield found.group(1), file.stamp

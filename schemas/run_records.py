@@ -1,6 +1,6 @@
-"""The JSON records of a run: manifest, plan, commit, ledger entry, quarantine.
+"""The JSON records of a run: manifest, plan, commit, ledger entries, quarantine.
 
-They are read back from disk and so are validated like any input.
+They are validated when read from disk.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from datagen.schemas.specification import Specification
 
 FORMAT_VERSION = 2
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-# One file name without folders, and a path of such names: neither can leave the run.
+# A file name without folders, and a path of such names: neither can lead outside the run.
 AttemptName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
 FilePath = Annotated[
     str, Field(max_length=300, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*$")
@@ -31,13 +31,13 @@ Outcome = Literal[
 
 
 class StoredRecord(BaseModel):
-    """What is read back from disk: it never changes in memory, and what it does not know is refused."""
+    """Base of records on disk: immutable, and without unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Layout(StoredRecord):
-    """How scenes are cut into shards. Fixed for a run, and without influence on any sample."""
+    """Division of scenes into shards. Fixed for a run; no sample depends on it."""
 
     scenes_per_shard: int = Field(ge=1, le=100_000)
     candidates_per_scene: int = Field(ge=1, le=1_000_000)
@@ -57,7 +57,7 @@ class Layout(StoredRecord):
 
 
 class Manifest(StoredRecord):
-    """manifest.json: what the run is. Written once, create-only."""
+    """manifest.json: specification, layout and origin of a run. Written once, create-only."""
 
     format_version: int = FORMAT_VERSION
     spec: Specification
@@ -69,27 +69,27 @@ class Manifest(StoredRecord):
     libraries: dict[str, str]
     platform: str
     created: str
-    # Where the sources were found and under which licences; information, not identity.
+    # Addresses and numbers of houses and objects; not part of the run's identity.
     sources: dict[str, str] = Field(default_factory=dict)
 
     @field_serializer("spec")
     def _as_stored(self, spec: Specification) -> dict[str, Any]:
-        """A manifest that is written again, by a merge, keeps what its hash is over."""
+        """Keeps the fields under the hash when a merge writes the manifest again."""
         return spec.document()
 
 
 class Plan(StoredRecord):
-    """plans/<k>.json: how many samples are wanted. The newest counts; a run only grows."""
+    """plans/<k>.json: the number of samples wanted. The newest counts; a run only grows."""
 
     n: int = Field(ge=1, le=10**12)
     created: str
-    # Whose it is, and which; None in older records.
+    # The run and the plan's own number; None in older records.
     spec_hash: Digest | None = None
     number: int | None = Field(default=None, ge=1)
 
 
 class Merged(StoredRecord):
-    """merged.json: a run made of others, each whole below parts/, in the order of their rows."""
+    """merged.json: merged runs, each complete below parts/, in the order of their rows."""
 
     format_version: int = FORMAT_VERSION
     parts: tuple[Digest, ...] = Field(min_length=2)  # specification hashes, ascending
@@ -104,10 +104,10 @@ class FileEntry(StoredRecord):
 
 
 class Cost(StoredRecord):
-    """What one attempt cost. No stage measures `stage_gpu_s`: stored records have the field.
+    """Cost of one attempt. `stage_gpu_s` is never measured; stored records have the field.
 
-    `source_s` is in none of the other numbers: what was paid before for the labels of another run, by wall
-    and CPU seconds, where this attempt only judged them by another rule.
+    `source_s` is in no other number: wall and CPU seconds of the relabelled attempt, where this attempt only
+    applied another rule.
     """
 
     wall_s: float = Field(ge=0)
@@ -123,12 +123,12 @@ class Cost(StoredRecord):
 
     @model_serializer(mode="wrap")
     def _without_empty_source(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Left out where there is none: records have the bytes that they had before there was the field."""
+        """Omitted where empty, so that records keep the bytes from before the field existed."""
         return {name: value for name, value in plain(self).items() if name != "source_s" or value}
 
     @property
     def all_s(self) -> dict[Literal["wall", "cpu"], float]:
-        """Seconds by clock that the attempt took, and those before it."""
+        """Seconds by clock of the attempt, and of the one that it relabelled."""
         before = self.source_s
         return {"wall": self.wall_s + before.get("wall", 0.0), "cpu": self.cpu_s + before.get("cpu", 0.0)}
 
@@ -140,7 +140,7 @@ class Host(StoredRecord):
     cpu: str
     cores: int
     memory_bytes: int
-    gpu: str = ""  # read from stored records; no machine fills it
+    gpu: str = ""  # in stored records; never filled
     pid: int = 0
 
 
@@ -162,16 +162,16 @@ class Commit(StoredRecord):
 
 
 def foreign_field(manifest: Manifest, shard: int, commit: Commit) -> tuple[str, str] | None:
-    """(field, problem) where a commit cannot be that of this shard of the run; None where it can."""
+    """(field, problem) where a commit cannot belong to this shard of the run; else None."""
     scenes, samples = manifest.layout.scenes_per_shard, manifest.layout.samples_per_shard
     return other_value(commit, shard=shard, spec_hash=manifest.spec_hash, scenes=scenes, samples=samples)
 
 
 def other_value(record: StoredRecord, **expected: object) -> tuple[str, str] | None:
-    """(field, problem) of the first field that has another value; None where each has its own or none."""
+    """(field, problem) of the first field with another value; None where there is none."""
     for field, value in expected.items():
         if (given := getattr(record, field)) not in (None, value):
-            return field, f"{given}, where this run has {value}"
+            return field, f"is {given}, but {value} in this run"
     return None
 
 
@@ -183,12 +183,12 @@ class AttemptStart(StoredRecord):
     shard: int = Field(ge=0)
     started: str
     host: str = ""
-    # Drawn anew for each begin: a create-only put that finds its own bytes counts as its own.
+    # Random for each start: a create-only put that finds its own bytes counts as its own.
     writer: str = ""
 
 
 class LedgerEntry(StoredRecord):
-    """ledger/<attempt>.json: how one attempt ended, and what it cost."""
+    """ledger/<attempt>.json: outcome and cost of one attempt."""
 
     format_version: int = FORMAT_VERSION
     attempt: AttemptName
@@ -198,12 +198,12 @@ class LedgerEntry(StoredRecord):
     stack: str = ""
     started: str = ""
     ended: str = ""
-    cost: Cost | None = None  # None where the attempt left no account of itself
+    cost: Cost | None = None  # None where unknown
     host: Host | None = None
 
 
 class QuarantineRecord(StoredRecord):
-    """quarantine/<shard>.json: a shard given up, with all that is needed to run it alone."""
+    """quarantine/<shard>.json: a quarantined shard, with all that is needed to run it alone."""
 
     format_version: int = FORMAT_VERSION
     shard: int = Field(ge=0)

@@ -1,4 +1,4 @@
-"""Scenes of a run, read from its committed shards: their records and their samples."""
+"""Read scenes of a run from its committed shards: records and samples."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from datagen.schemas.shard_reading import Array, read_committed
 
 
 def read_scene(run: Run, scene: int) -> SceneRows:
-    """Scene `scene` of a run. InputError where it is not planned or its shard is not committed."""
+    """Read scene `scene` of a run. InputError where it is not planned or its shard is not committed."""
     scenes = -(-run.n // run.layout.candidates_per_scene)
     if not 0 <= scene < scenes:
         raise InputError(
-            run.storage.url, "--scene", f"{scene} is not in this run", f"Choose one from 0 to {scenes - 1}"
+            run.storage.url, "--scene", f"{scene} is not in this run", f"Give one from 0 to {scenes - 1}"
         )
     shard = scene // run.layout.scenes_per_shard
     if shard not in run.committed():
         raise InputError(
             run.storage.url,
             "--scene",
-            f"{scene} lies in shard {shard}, which is not committed",
+            f"{scene} is in shard {shard}, which is not committed",
             "Resume the run, or choose another scene",
         )
     return next(read_scenes(run, [scene]))
 
 
 def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
-    """The scenes of these indices, in their order; neighbours of one shard are read together.
+    """Read the scenes of these indices, in order; consecutive ones of a shard are read together.
 
-    Scenes beyond the run's n are there too where their shard is. InputError for one whose shard is
-    not committed, or whose files are damaged.
+    Scenes beyond the run's n are included where their shard is committed. InputError for a scene whose shard
+    is not committed or damaged.
     """
     per_shard, per_scene = run.layout.scenes_per_shard, run.layout.candidates_per_scene
     loaded, arrays = -1, dict[str, Array]()
@@ -50,13 +50,13 @@ def read_scenes(run: Run, scenes: Iterable[int]) -> Iterator[SceneRows]:
 
 
 def committed_scenes(run: Run) -> int:
-    """Scenes from the first on that are all committed, also those beyond n that fill the last shard."""
+    """Number of scenes before the first missing shard, including those beyond n in the last shard."""
     committed = run.committed()
     shards = next(k for k in range(len(committed) + 1) if k not in committed)
     return shards * run.layout.scenes_per_shard
 
 
 def read_shard(run: Run, shard: int) -> dict[str, Array]:
-    """Every array of a committed shard, all of its rows. InputError for a missing or damaged file."""
+    """Read all rows of every array of a committed shard. InputError for a missing or damaged file."""
     names = [f.name for f in (*run.schema.scene_fields, *run.schema.sample_fields)]
     return read_committed(run.storage, run.commit_of(shard), names)

@@ -1,10 +1,10 @@
-"""A shard as files: one immutable, flat Zarr v3 group, made in memory.
+"""Encode a shard as files: one immutable, flat Zarr v3 group, made in memory.
 
-All arrays of both tables lie at the group's root; their first dimension is "scene" or "sample".
-Chunks are bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no
-folders ("c.0.0"), so that a shard is one folder an array. The metadata is made by zarr-python once
-per layout; chunks are encoded directly, because creating 50 arrays through zarr-python costs more
-than a tenth of a second per shard. Tests hold the bytes equal to what zarr-python writes.
+All arrays of both tables are at the group's root; their first dimension is "scene" or "sample". Chunks are
+bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no folders ("c.0.0"), so
+that a shard has one folder per array. zarr-python makes the metadata once per layout; chunks are encoded
+directly, because creating 50 arrays with zarr-python takes more than 0.1 s per shard. Tests compare the
+bytes with those that zarr-python writes.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.run_records import Layout
 
 Array = npt.NDArray[Any]
-# A schema's name, version and fields; its axis lengths; scenes a shard and candidates a scene.
+# Name, version and fields of a schema; its axis lengths; scenes per shard and candidates per scene.
 _Key = tuple[str, int, tuple[Field, ...], tuple[Field, ...]]
 _Sizes = tuple[tuple[str, int], ...]
 _Cut = tuple[int, int]
 
 ZSTD_LEVEL = 3
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
-MAX_TEXT_BYTES = 4096  # one name; a longer one is not a name
+MAX_TEXT_BYTES = 4096  # of one name
 TABLES: tuple[Table, Table] = ("scene", "sample")
 
 
@@ -46,9 +46,9 @@ def rows_per_shard(layout: Layout, table: Table) -> int:
 
 
 def chunk_rows(schema: RecordSchema, field: Field, rows: int) -> int:
-    """Rows of one chunk: the largest divisor of a shard's rows that keeps a chunk small.
+    """Rows per chunk: the largest divisor of a shard's rows within the chunk size.
 
-    A divisor, because the sealed store is a regular grid over equal shards.
+    A divisor, because the sealed store is a regular grid of chunks.
     """
     if field.is_text:
         return rows
@@ -63,7 +63,7 @@ def chunk_key(field: Field, index: int) -> str:
 
 
 def fill_value(field: Field) -> Any:
-    """What a missing chunk would read as: never a plausible value."""
+    """Fill value of missing chunks: never a plausible value."""
     if field.is_text:
         return ""
     dtype = np.dtype(field.dtype)
@@ -81,7 +81,7 @@ def encode_shard(
     scene_arrays: Mapping[str, Array],
     sample_arrays: Mapping[str, Array],
 ) -> dict[str, bytes]:
-    """The files of one full shard, by path within the attempt's folder.
+    """Return the files of one full shard, by path within the attempt's folder.
 
     `scene_arrays` have `layout.scenes_per_shard` rows, `sample_arrays` `samples_per_shard`, sorted
     by scene. InputError when an array breaks the schema.
@@ -99,7 +99,7 @@ def encode_shard(
 
 
 def encode_chunk(field: Field, values: Array) -> bytes:
-    """One chunk's bytes as zarr's codecs write them."""
+    """Encode a chunk as Zarr's codecs do."""
     if field.is_text:
         raw = VLenUTF8().encode(_checked_text(field, values))
     else:
@@ -109,7 +109,7 @@ def encode_chunk(field: Field, values: Array) -> bytes:
 
 
 def group_metadata(schema: RecordSchema, layout: Layout, spec_hash: str) -> Mapping[str, bytes]:
-    """Every zarr.json of a shard, by path: the root's with the schema's name, and each array's."""
+    """Every zarr.json of a shard by path: the root's, with the schema's name, and each array's."""
     return _group_metadata(*_key(schema, layout), spec_hash)
 
 
@@ -121,7 +121,7 @@ def _group_metadata(key: _Key, sizes: _Sizes, cut: _Cut, spec_hash: str) -> Mapp
 
 
 def root_attributes(schema: RecordSchema, layout: Layout, spec_hash: str) -> dict[str, Any]:
-    """Attributes of a shard's group and, with more, of the sealed store."""
+    """Common attributes of a shard's group and of the sealed store."""
     return {
         "schema": schema.name,
         "schema_version": schema.version,
@@ -135,9 +135,9 @@ def root_attributes(schema: RecordSchema, layout: Layout, spec_hash: str) -> dic
 def zarr_metadata(
     schema: RecordSchema, layout: Layout, rows: Mapping[str, int], attributes: Mapping[str, Any]
 ) -> dict[str, bytes]:
-    """zarr.json files of a group with so many rows a table; chunks are those of the layout's shards.
+    """Return the zarr.json files of a group with `rows` per table, chunked like the layout's shards.
 
-    zarr-python takes 3 ms an array, so it is asked once a layout; rows and attributes are put in after.
+    zarr-python takes 3 ms per array, so it is called once per layout; rows and attributes are filled in.
     """
     files: dict[str, bytes] = {}
     for path, data in _made_by_zarr(*_key(schema, layout)).items():
@@ -152,7 +152,7 @@ def zarr_metadata(
 
 @lru_cache(maxsize=16)
 def _made_by_zarr(key: _Key, sizes: _Sizes, cut: _Cut) -> Mapping[str, bytes]:
-    """What zarr-python writes for a group of one shard's rows."""
+    """Metadata by zarr-python for a group with one shard's rows."""
     schema, layout = _from_key(key, sizes, cut)
     store: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes={"": ""})
@@ -178,7 +178,7 @@ def _made_by_zarr(key: _Key, sizes: _Sizes, cut: _Cut) -> Mapping[str, bytes]:
 
 
 def _key(schema: RecordSchema, layout: Layout) -> tuple[_Key, _Sizes, _Cut]:
-    """What metadata depend on, as values that can be looked up."""
+    """Cache key of metadata."""
     fields = (schema.name, schema.version, schema.scene_fields, schema.sample_fields)
     return fields, tuple(sorted(schema.sizes.items())), (layout.scenes_per_shard, layout.candidates_per_scene)
 
@@ -189,10 +189,10 @@ def _from_key(key: _Key, sizes: _Sizes, cut: _Cut) -> tuple[RecordSchema, Layout
 
 
 def field_attributes(field: Field) -> dict[str, Any]:
-    """An array's attributes: CF names where they exist."""
+    """An array's attributes, with CF names where they exist."""
     attributes: dict[str, Any] = {"long_name": field.doc, "units": field.unit, "frame": field.frame}
     bounds = {"valid_min": field.low, "valid_max": field.high}
-    # CF's way to say what integer codes mean; their values are 0, 1, ...
+    # CF attribute for the meaning of the codes 0, 1, ...
     codes = {"flag_meanings": " ".join(field.codes)}
     return {k: v for k, v in {**attributes, **bounds, **codes}.items() if v not in (None, "")}
 
@@ -208,7 +208,7 @@ def _checked_text(field: Field, values: Array) -> Array:
             raise InputError(
                 "batch",
                 field.name,
-                f"{text!r:.60} is not text of at most {MAX_TEXT_BYTES} bytes",
+                f"{text!r:.60} is not valid text of at most {MAX_TEXT_BYTES} bytes",
                 "Give the house or object a short name in valid Unicode",
             )
     return texts

@@ -1,4 +1,4 @@
-"""Sets of shards as ranges: a run of a million shards costs as much as its gaps."""
+"""Sets of shards as ranges: memory grows with the number of gaps."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Bounds = np.ndarray[Any, np.dtype[np.int64]]
 
 
 class ShardRanges(Sequence[int]):
-    """Shard numbers in ascending order, each once. Immutable; 16 bytes a range of neighbours.
+    """An immutable set of shard numbers, 16 bytes per range of consecutive ones.
 
-    `bounds` is an int64 array (ranges, 2): first and one past the last shard of each, ascending, apart.
+    `bounds` is an int64 array (ranges, 2): first and one past the last shard of each, ascending, disjoint.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -45,7 +45,7 @@ class ShardRanges(Sequence[int]):
         return self._where(others, +1, +1)
 
     def _where(self, others: ShardRanges, ours: int, theirs: int) -> ShardRanges:
-        # Sweep over all bounds: a stretch counts where the depth is that of what is wanted.
+        # Sweep over all bounds: an interval counts where its depth has the wanted value.
         wanted = ours + max(theirs, 0)
         places = np.concatenate(
             [self.bounds[:, 0], self.bounds[:, 1], others.bounds[:, 0], others.bounds[:, 1]]

@@ -1,9 +1,9 @@
-"""Arrays read straight from a run's chunk files: a whole shard at a time, every byte checked.
+"""Read arrays directly from a run's chunk files, one shard at a time, with checksums.
 
-A committed file is held against its sha256 when a process first reads it, and against its own crc32c always.
-Works on committed shards and on a sealed store, on any storage, and needs no array library to open
-fifty arrays a shard. What the files hold is taken from their own zarr.json, so that runs of older
-schema versions read on.
+A committed file is checked against its sha256 when a process first reads it, and against its crc32c always.
+Works for committed shards and sealed stores, on any storage, without opening fifty arrays per shard by an
+array library. Types and shapes come from the files' own zarr.json, so that runs of older schema versions
+stay readable.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from datagen.schemas.storage import Storage
 Array = npt.NDArray[Any]
 
 MAX_META_BYTES = 2**20
-MAX_DECODED_BYTES = 2**30  # no chunk of ours comes near; a larger one is hostile
+MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _CHECKED = b""
-_MEND = "Restore the file from a copy, or mend the run with `datagen repair`"
+_MEND = "Restore the file from a copy, or repair the run with `datagen repair`"
 
 
 @dataclass(frozen=True)
 class StoredArray:
-    """What an array's zarr.json says: rows and chunk rows lie along the first axis, `dims[0]`."""
+    """Metadata of an array; rows and chunk rows are along the first axis, `dims[0]`."""
 
     name: str
     dtype: str
@@ -49,12 +49,12 @@ class StoredArray:
 
     @property
     def is_text(self) -> bool:
-        """Whether it holds names instead of numbers."""
+        """Whether it holds text instead of numbers."""
         return self.dtype == "string"
 
 
 def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
-    """The array described by a zarr.json. InputError unless it is one that this program writes."""
+    """Parse a zarr.json. InputError for metadata that datagen does not write."""
     try:
         meta = json.loads(data)
         dtype, shape, dims = meta["data_type"], tuple(meta["shape"]), tuple(meta["dimension_names"])
@@ -69,21 +69,21 @@ def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
         if meta["zarr_format"] != 3 or codecs != (first, "zstd", "crc32c"):
             raise ValueError(f"codecs {codecs}")
         if meta["chunk_key_encoding"] != {"name": "default", "configuration": {"separator": "."}}:
-            raise ValueError("chunk keys of another form")
+            raise ValueError("unknown form of chunk keys")
         if dims[0] not in ("scene", "sample") or not len(dims) == len(shape) == len(chunk):
-            raise ValueError("dimensions that do not fit")
+            raise ValueError("dimensions do not match the shape")
         if not all(isinstance(x, int) and x > 0 for x in (*shape, *chunk)) or chunk[1:] != shape[1:]:
             raise ValueError(f"chunks {chunk} of shape {shape}")
         if math.prod(chunk) * item_bytes > MAX_DECODED_BYTES:
             raise ValueError(f"chunks of {chunk}")
         return StoredArray(name, dtype, shape, chunk[0], dims, dict(meta.get("attributes") or {}))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as e:
-        problem = f"not the metadata of an array of a run ({type(e).__name__}: {e})"
+        problem = f"is not the metadata of a run's array ({type(e).__name__}: {e})"
         raise InputError(place, "", problem, _MEND) from e
 
 
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
-    """A chunk's values, (chunk_rows, ...). InputError naming `place` when the bytes are damaged."""
+    """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
     packed = data[:-4]
     if len(data) < 5 or google_crc32c.value(packed) != int.from_bytes(data[-4:], "little"):
         raise InputError(place, array.name, "the crc32c does not match: the file is damaged", _MEND)
@@ -92,9 +92,9 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
     try:
         if array.is_text:
             if _content_bytes(packed) > min(4 + count * (4 + MAX_TEXT_BYTES), MAX_DECODED_BYTES):
-                raise ValueError("more text than names can have")
+                raise ValueError("too much text")
             raw = Zstd().decode(packed)
-            if int.from_bytes(raw[:4], "little") != count:  # before that many places are set aside
+            if int.from_bytes(raw[:4], "little") != count:  # before memory is allocated for them
                 raise ValueError("another number of names")
             return VLenUTF8().decode(raw).reshape(shape)
         out = np.empty(shape, np.dtype(array.dtype).newbyteorder("<"))
@@ -108,11 +108,11 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
 
 @dataclass(frozen=True)
 class ShardPlace:
-    """Where one shard's rows lie: in a committed attempt's folder, or as a slice of a sealed store.
+    """Location of one shard's rows: a committed attempt's folder, or a slice of a sealed store.
 
-    `ordinal` is the shard's place in the folder's arrays: 0 in its own folder. `scenes` and
-    `samples` are the rows wanted of it. `digests` are the committed files' sha256 by path, "" once they were
-    checked; None where no commit came along.
+    `ordinal` is the shard's position in the folder's arrays: 0 in its own folder. `scenes` and `samples` are
+    the rows wanted of it. `digests` has the sha256 of committed files by path, "" once checked; None without
+    commit.
     """
 
     storage: Storage
@@ -125,7 +125,7 @@ class ShardPlace:
     digests: dict[str, bytes] | None = None
 
     def metadata(self, names: Iterable[str]) -> dict[str, StoredArray]:
-        """The named arrays' metadata. InputError names a missing, foreign or damaged file."""
+        """Read the metadata of the named arrays. InputError for a missing, foreign or damaged file."""
         found: dict[str, StoredArray] = {}
         paths = [f"{name}/zarr.json" for name in names]
         for path, place, data in self._files(paths, MAX_META_BYTES):
@@ -134,7 +134,7 @@ class ShardPlace:
         return found
 
     def read(self, arrays: Iterable[StoredArray]) -> dict[str, Array]:
-        """The shard's rows of each array. InputError names a missing, foreign or damaged file."""
+        """Read the shard's rows of each array. InputError for a missing, foreign or damaged file."""
         wanted = {array.name: array for array in arrays}
         paths = [path for array in wanted.values() for path in self._paths(array)]
         parts: dict[str, list[Array]] = {name: [] for name in wanted}
@@ -144,7 +144,7 @@ class ShardPlace:
         return {name: self._joined(array, parts[name]) for name, array in wanted.items()}
 
     def _files(self, paths: Sequence[str], most: int) -> Iterator[tuple[str, str, bytes]]:
-        """(path, where it lies, bytes) of files, those of a commit held against it."""
+        """Yield (path, address, bytes) of files, checked against the commit if there is one."""
         keys = (f"{self.folder}/{path}" if self.folder else path for path in paths)
         for path, (key, data) in zip(paths, self.storage.get_many(keys, most), strict=True):
             place, name = f"{self.storage.url}/{key}", path.partition("/")[0]
@@ -152,7 +152,7 @@ class ShardPlace:
                 raise InputError(place, name, "no such file", _MEND)
             if self.digests is not None and (digest := self.digests.get(path)) != _CHECKED:
                 if sha256(data).digest() != digest:
-                    problem = f"{len(data)} bytes whose sha256 is not that of the commit"
+                    problem = f"has {len(data)} bytes with another sha256 than the commit"
                     raise InputError(place, name, problem, _MEND)
                 self.digests[path] = _CHECKED
             yield path, place, data
@@ -168,7 +168,7 @@ class ShardPlace:
 
     def _joined(self, array: StoredArray, parts: list[Array]) -> Array:
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        # Half floats are clouds, slow to look through; what is wrong in one shows in a loss or a score.
+        # Half floats are point clouds, slow to check; an error in them shows in a loss or a score.
         if whole.dtype.kind == "f" and whole.itemsize > 2 and not np.isfinite(whole).all():
             place = f"{self.storage.url}/{self.folder}"
             raise InputError(place, array.name, "holds NaN or infinite numbers", _MEND)
@@ -178,9 +178,9 @@ class ShardPlace:
 def committed_place(
     storage: Storage, commit: Commit, names: Iterable[str], scenes: int, samples: int
 ) -> ShardPlace:
-    """Where the wanted rows of a committed shard lie, for reading these arrays."""
+    """Location of the wanted rows of a committed shard, for these arrays."""
     wanted, folder = set(names), shard_folder(commit.shard, commit.attempt)
-    # Interned: every shard of a run has files of the same names, and readers hold all shards.
+    # Interned: all shards of a run have files of the same names.
     digests = {
         sys.intern(entry.path): bytes.fromhex(entry.sha256)
         for entry in commit.files
@@ -190,7 +190,7 @@ def committed_place(
 
 
 def read_committed(storage: Storage, commit: Commit, names: Sequence[str]) -> dict[str, Array]:
-    """The named arrays of a committed shard, all of its rows. InputError as `ShardPlace.read`."""
+    """Read all rows of the named arrays of a committed shard. InputError as `ShardPlace.read`."""
     place = committed_place(storage, commit, names, commit.scenes, commit.samples)
     return place.read(place.metadata(names).values())
 
@@ -204,6 +204,6 @@ def _content_bytes(frame: bytes) -> int:
     start = 5 + (0 if single_segment else 1) + (0, 1, 2, 4)[flags & 3]
     width = (1 if single_segment else 0, 2, 4, 8)[flags >> 6]
     if width == 0 or len(frame) < start + width:
-        raise ValueError("a zstd frame without its content size")
+        raise ValueError("a zstd frame without content size")
     size = int.from_bytes(frame[start : start + width], "little")
     return size + 256 if width == 2 else size

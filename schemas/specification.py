@@ -1,7 +1,7 @@
-"""What a run computes: a frozen, validated model whose hash covers all that changes a sample.
+"""The specification of a run: a frozen, validated model whose hash covers all that changes a sample.
 
-Paths, worker counts, shard size and n are not here: they say where, how fast and how far, not
-what. A specification defines an endless sequence of scenes; n only says how far to go.
+Paths, worker counts, shard size and n are not part of it. A specification defines an infinite sequence of
+scenes, of which a run makes the first n samples.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ class _Frozen(BaseModel):
 
     @model_validator(mode="after")
     def _all_set(self, info: ValidationInfo) -> Self:
-        # Unset is then only what a stored record lacks: a field that came with a later version.
+        # Then only fields of later versions, which a stored record lacks, are unset.
         if info.mode != "json":
             self.model_fields_set.update(type(self).model_fields)
         return self
 
 
 class Source(_Frozen):
-    """Where houses or objects come from: the registry name and a digest of the content."""
+    """The source of houses or objects: the registry name and a digest of the content."""
 
     kind: str
     digest: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
 class Range(_Frozen):
-    """A closed interval, in metres, from which a length is drawn uniformly."""
+    """A closed interval in metres, from which a length is sampled uniformly."""
 
     low: Metres
     high: Metres
@@ -52,7 +52,7 @@ class SceneParams(_Frozen):
 
     n_clutter: int = Field(default=6, ge=0, le=30)
     support_height_m: Range = Range(low=0.3, high=1.2)
-    # Clutter is dropped within this distance of the target, so that it hides it now and then.
+    # Clutter is dropped within this distance of the target, so that it sometimes occludes it.
     clutter_radius_m: Metres = 0.22
     drop_height_m: Metres = 0.01
     edge_margin_m: Metres = 0.02
@@ -104,13 +104,13 @@ class ObservationParams(_Frozen):
 
 
 class CandidateParams(_Frozen):
-    """Base positions around the target and the robots that stand there (paper, Sec. IV-A)."""
+    """Base positions around the target and their robots (paper, Sec. IV-A)."""
 
     per_scene: Annotated[int, Field(ge=1, le=625)] | Literal["grid"] = 60
     grid_cells: int = Field(default=25, ge=2, le=200)
     grid_half_width_m: Metres = 1.0
     jitter: bool = True
-    # Only where the base is clear, or also within the arm's reach; None takes all cells.
+    # Only where the base is clear, or also within the arm's reach; None: all cells.
     within: Literal["clear", "in-range"] | None = None
     robots_per_scene: int = Field(default=4, ge=1, le=625)
     robot_per_candidate: bool = False
@@ -127,11 +127,11 @@ class CandidateParams(_Frozen):
 
 
 class GraspParams(_Frozen):
-    """Grasps of the target: how many are looked for, and how many a scene keeps."""
+    """Grasps of the target: the number to search, and the number to keep per scene."""
 
     per_object: int = Field(default=300, ge=1, le=10_000)
     per_scene: int = Field(default=40, ge=1, le=1000)
-    # A grasp below this share of held floating-hand trials is not offered to the arm.
+    # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
 
 
@@ -141,14 +141,14 @@ class MotionParams(_Frozen):
     ik_seeds: int = Field(default=3, ge=1, le=100)
     pregrasp_m: float = Field(default=0.08, ge=0, le=0.5)
     lift_m: float = Field(default=0.10, ge=0.01, le=0.5)
-    # Between neighbouring points of a straight line no joint may move further.
+    # Largest joint motion between neighbouring points of a straight line.
     max_joint_jump_rad: float = Field(default=0.6, gt=0, le=6.3)
-    # Spacing of the configurations at which a path is checked against the scene.
+    # Spacing of the configurations at which a path is checked for collisions.
     check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
-    # Counts, never a time: labels must not depend on how fast a machine is. Both are of one candidate.
+    # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
     max_grasps_tried: int = Field(default=24, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
-    # Distance that the arm keeps from everything, and the hand up to the pregrasp.
+    # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)
 
 
@@ -167,7 +167,7 @@ class TrialParams(_Frozen):
     hold_s: float = Field(default=0.5, gt=0, le=60)
     # Allowed motion of the object in the hand from the end of closing to the end of holding.
     max_slip_m: Metres = 0.03
-    # Grasps tried one after the other, each in a fresh scene, until one lifts the target.
+    # Grasps to execute one after the other, each in a new scene, until one lifts the target.
     max_attempts: int = Field(default=3, ge=1, le=100)
 
     @model_validator(mode="after")
@@ -180,13 +180,13 @@ class TrialParams(_Frozen):
 
 
 class Interval(Range):
-    """A closed interval from which a number without a unit is drawn uniformly."""
+    """A closed interval, without unit, from which a number is sampled uniformly."""
 
 
 class DisturbanceParams(_Frozen):
-    """A robot sent to a candidate `repeats` times: it arrives nearby and plans from there.
+    """Disturbed trials: the robot arrives near a candidate `repeats` times and plans from there.
 
-    Where it stands it knows; the target's error, friction and mass it does not.
+    It knows its pose, but not the errors of the target's pose, friction and mass.
     """
 
     repeats: int = Field(default=5, ge=1, le=1000)
@@ -199,14 +199,14 @@ class DisturbanceParams(_Frozen):
 
     @model_validator(mode="after")
     def _heavy(self) -> DisturbanceParams:
-        # An engine takes no mass for one that nothing moves.
+        # An engine treats mass 0 as immovable.
         if self.mass_scale.low < 0.001:
             raise ValueError(f"mass_scale.low {self.mass_scale.low} is below 0.001")
         return self
 
 
 class ArmParams(_Frozen):
-    """What the label sources `plan` and `sim` do with an arm; `trial` is None for `plan`."""
+    """The arm of the label sources `plan` and `sim`; `trial` is None for `plan`."""
 
     robot: str = "panda-scaled"
     grasps: GraspParams = GraspParams()
@@ -216,7 +216,7 @@ class ArmParams(_Frozen):
 
 
 class ScenesFrom(_Frozen):
-    """The run that drew the scenes and candidates which are labelled again."""
+    """The run whose scenes and candidates are labelled again."""
 
     spec_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -230,9 +230,8 @@ class VisibilityParams(_Frozen):
 class HeuristicParams(_Frozen):
     """The distance-visibility label (paper, Sec. III-B).
 
-    The paper gives the weights, the threshold, the distance bounds and the visibility score, but
-    not a, mu, sigma_l and sigma_r. The defaults put mu in the middle of the stated bounds, with
-    the bounds at two sigma.
+    The paper gives the weights, the threshold, the distance bounds and the visibility score, but not a, mu,
+    sigma_l and sigma_r. By default mu is the middle of the stated bounds, which are at two sigma.
     """
 
     distance: Literal["planar", "planar-over-reach", "mount-over-reach"] = "planar"
@@ -253,7 +252,7 @@ class HeuristicParams(_Frozen):
 
 
 class Specification(_Frozen):
-    """Everything that decides what the samples of a run are."""
+    """All that decides the samples of a run."""
 
     label_source: str = "heuristic"
     seed: int = Field(default=0, ge=0, lt=2**63)
@@ -268,21 +267,22 @@ class Specification(_Frozen):
     heuristic: HeuristicParams = HeuristicParams()
     arm: ArmParams | None = None
     scenes_from: ScenesFrom | None = None
-    # Versions of the label code and of the engines that move bits, by name.
+    # Versions of the label code and of the engines that can change bits, by name.
     engines: dict[str, str] = Field(default_factory=dict)
 
     def document(self, without_none: bool = False) -> dict[str, Any]:
-        """The fields as they are stored; one read from a record has those of the record alone."""
+        """The fields as stored; for a specification from a record, only those of the record."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=without_none)
 
     def hash(self) -> str:
-        """sha256 of the canonical JSON: the identity of the endless sequence of samples.
+        """sha256 of the canonical JSON: the identity of the sequence of samples.
 
-        What is None is left out, and so is what its record lacks: later fields leave older hashes alone.
+        Fields that are None or missing in the record are omitted, so that later fields do not change older
+        hashes.
         """
         return digest_of(self.document(without_none=True))
 
     @property
     def scenes_hash(self) -> str:
-        """What names the scenes and candidates: equal for runs that label the same ones."""
+        """Hash of the scenes and candidates: equal for runs that label the same ones."""
         return self.scenes_from.spec_hash if self.scenes_from else self.hash()

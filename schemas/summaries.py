@@ -1,9 +1,9 @@
-"""Summaries of a run's settled records, many in a file, so that few small files are read.
+"""Summaries of a run's final records, many in one file, so that few files are read.
 
-`index/<digest>.json.gz` is a cache. A summary counts only while its record still has the change stamp under
-which the summary was made, as listed now; a record that is new, changed or came back is read itself, and one
-that vanished is gone. The answers are those of the records alone, whatever becomes of the index: it may be
-removed at any time. (`verify` does not use it: what changes bytes without changing the stamp is for digests.)
+`index/<digest>.json.gz` is a cache. A summary is used only while its record has the change stamp for which
+it was made; new or changed records are read themselves, and removed ones are dropped. Results depend only
+on the records: the index may be removed at any time. (`verify` does not use it, since bytes may change
+without the stamp.)
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from datagen.schemas.run_records import (
     other_value,
 )
 
-# Files of the former format have names of this form too: `refresh` and `gc` remove them.
+# Files of the former format have such names too: `refresh` and `gc` remove them.
 _FILE = re.compile(r"index/[0-9a-f]{1,16}\.json\.gz")
-# Rows of a full file. One below half of it is joined with others when the index grows.
+# Rows of a full file. Files with fewer than half of it are joined when the index grows.
 ROWS_PER_FILE = 16_384
-# A longer summary stays in its record alone, so that a file of our own unpacks to far less than the limit.
+# A longer summary is not cached, so that a file unpacks to far less than the limit.
 _MAX_SUMMARY_BYTES = 1500
 _MAX_FILE_BYTES = 64 * 2**20
 
 
 class CommitSummary(StoredRecord):
-    """What a commit record says of its shard, without its files."""
+    """A commit record without its files."""
 
     shard: int = Field(ge=0)
     attempt: AttemptName
@@ -55,13 +55,13 @@ class CommitSummary(StoredRecord):
 
 
 class EndSummary(StoredRecord):
-    """How an attempt ended, without its stack."""
+    """The end record of an attempt without its stack."""
 
     attempt: AttemptName
     shard: int = Field(ge=0)
     outcome: Outcome
     cause: str
-    cost: Cost | None  # None where the attempt left no account of itself
+    cost: Cost | None  # None where unknown
 
 
 Summary = CommitSummary | EndSummary
@@ -70,9 +70,9 @@ Rows = dict[str, tuple[str, str]]
 
 
 class Summaries:
-    """The summaries of one run as listed when this is made: the ledger first, then the commits.
+    """The summaries of one run as listed on creation: the ledger first, then the commits.
 
-    So whatever the ledger calls committed has its commit, also while a job goes on.
+    Every attempt that the ledger calls committed therefore has its commit, also while a job runs.
     """
 
     def __init__(self, run: Run) -> None:
@@ -82,7 +82,7 @@ class Summaries:
 
     @cached_property
     def _indexed(self) -> dict[str, str]:
-        """Summaries as JSON of the records that have the stamp under which theirs was made, by keys."""
+        """Valid cached summaries as JSON, by keys."""
         stamps = _stamps_by_key(self._ledger, self._committed)
         return {
             key: text
@@ -102,12 +102,12 @@ class Summaries:
         return (found for found in self._in_order(keys) if isinstance(found, CommitSummary))
 
     def ends(self) -> Iterator[EndSummary]:
-        """Summaries of closed attempts, in order of their names. InputError as `Ledger.end_of`."""
+        """Summaries of ended attempts, in order of their names. InputError as `Ledger.end_of`."""
         keys = [f"ledger/{name}.json" for name in sorted(self._ledger) if not name.endswith(".start")]
         return (found for found in self._in_order(keys) if isinstance(found, EndSummary))
 
     def unfinished(self) -> list[AttemptStart]:
-        """Attempts that began and left no end: running elsewhere, or lost."""
+        """Start records of attempts without an end: running, or lost."""
         return self._run.ledger.unfinished(self._ledger)
 
     def _in_order(self, keys: Sequence[str]) -> Iterator[Summary]:
@@ -116,20 +116,20 @@ class Summaries:
         read = run.storage.concurrent_map(partial(_read, run), absent)
         for key in keys:
             text = indexed.get(key)
-            # A row that cannot be of its record does not count: the record says what is true.
+            # A row that does not match its record's key is ignored, and the record is read.
             found = next(read) if text is None else _decode(run, key, text) or _read(run, key)
             if isinstance(found, InputError):
                 raise found
-            if found is not None:  # else its record vanished since it was listed
+            if found is not None:  # else its record was removed since the listing
                 yield found
 
 
 def refresh(run: Run) -> int:
-    """Bring the index up to date with the run's records; return how many were added.
+    """Update the index with the run's records; return the number of added ones.
 
-    Records that cannot be read are left out. Small files, and those most of whose rows are stale, are joined
-    to full ones, so that the index has few files and no more rows than the run has records. Several may do
-    this at once: each then adds a file, and the next one joins them.
+    Unreadable records are omitted. Small files, and those with mostly stale rows, are joined, so that the
+    index has few files and at most one row per record. Of several concurrent updates each adds a file, and
+    the next update joins them.
     """
     stamps = _stamps_by_key(run.ledger.stamps(), run.commit_stamps())
     known, kept, replaced = set[str](), Rows(), set(index_files(run))
@@ -142,7 +142,7 @@ def refresh(run: Run) -> int:
             replaced.discard(file)
     missing = [key for key in stamps if key not in known]
     if not missing and len(replaced) <= bool(kept):
-        return 0  # what is there would only be written again
+        return 0  # the files are up to date
     read = zip(missing, run.storage.concurrent_map(partial(_read, run), missing), strict=True)
     new = ((key, (stamps[key], text)) for key, found in read if (text := _encode(run, key, found)))
     todo, written, count = chain(kept.items(), new), set[str](), -len(kept)
@@ -159,37 +159,35 @@ def index_files(run: Run) -> list[str]:
 
 
 def unreadable_files(run: Run) -> list[str]:
-    """Keys of files of the index that are damaged, of another run or of a former format."""
+    """Keys of index files that are damaged, of another run or of a former format."""
     readable = {key for key, _ in _read_files(run)}
     return [key for key in index_files(run) if key not in readable]
 
 
 def _stamps_by_key(ledger: dict[str, str], committed: dict[str, str]) -> dict[str, str]:
-    """Change stamps of settled records, by their keys."""
+    """Change stamps of final records, by their keys."""
     ends = {f"ledger/{name}.json": stamp for name, stamp in ledger.items() if not name.endswith(".start")}
     return ends | {f"commits/{name}.json": stamp for name, stamp in committed.items()}
 
 
 def _write(run: Run, rows: Rows) -> str:
-    """Write a file of the index; its key. Its name is of its bytes, so that no two drivers can be at odds.
+    """Write an index file, named by the digest of its bytes; return its key.
 
-    Lines: the sha256 of all that follows, format and run, and the rows, whose parts are between tabs.
+    Lines: the sha256 of the rest, format and run, and the rows, with tab-separated parts.
     """
     lines = (f"{key}\t{stamp}\t{text}" for key, (stamp, text) in rows.items())
     body = "\n".join([_first_line(run), *lines]).encode()
     packer = zlib.compressobj(1, wbits=31)
     data = packer.compress(sha256(body).hexdigest().encode() + b"\n" + body) + packer.flush()
     key = f"index/{sha256(data).hexdigest()[:16]}.json.gz"
-    run.storage.put(
-        key, data
-    )  # not made durable: it is a cache, and another driver may have removed it by now
+    run.storage.put(key, data)  # without fsync: it is a cache, and another driver may have removed it already
     return key
 
 
 def _read_files(run: Run) -> Iterator[tuple[str, Rows]]:
     """(key, rows) of the index's readable files, one at a time."""
     for key in index_files(run):
-        # A file that holds nothing costs time: its records are read themselves.
+        # A damaged file only costs time: its records are read themselves.
         with suppress(InputError, ValueError, zlib.error):
             packed = run.storage.get(key, _MAX_FILE_BYTES) or b""
             data = zlib.decompressobj(wbits=31).decompress(packed, _MAX_FILE_BYTES)
@@ -205,7 +203,7 @@ def _first_line(run: Run) -> str:
 
 
 def _encode(run: Run, key: str, found: Summary | InputError | None) -> str | None:
-    """The summary as JSON; None where there is none, or it cannot be had from JSON again."""
+    """The summary as JSON; None where there is none, or JSON cannot represent it."""
     if found is None or isinstance(found, InputError):
         return None
     text = found.model_dump_json(exclude_defaults=True)
@@ -213,7 +211,7 @@ def _encode(run: Run, key: str, found: Summary | InputError | None) -> str | Non
 
 
 def _decode(run: Run, key: str, text: str) -> Summary | None:
-    """The summary in a row of the index; None where it is not of the record of this key."""
+    """The summary in a row of the index; None where it does not match the key."""
     folder, _, name = key.removesuffix(".json").partition("/")
     try:
         if folder == "ledger":
@@ -227,7 +225,7 @@ def _decode(run: Run, key: str, text: str) -> Summary | None:
 
 
 def _read(run: Run, key: str) -> Summary | InputError | None:
-    """The summary from the record itself: None where it vanished, the error where it is damaged."""
+    """The summary from the record itself: None where it was removed, the error where it is damaged."""
     data = run.storage.get(key, MAX_RECORD_BYTES)
     folder, _, name = key.removesuffix(".json").partition("/")
     try:

@@ -1,4 +1,4 @@
-"""Files that a user or another file names: regular ones alone, of at most the expected size."""
+"""Read untrusted files: only regular ones, of a bounded size."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from datagen.schemas.errors import InputError
 
 
 def open_regular(path: Path, most_bytes: int, mend: str) -> BufferedReader:
-    """The file, open for reading.
+    """Open the file for reading.
 
-    Raises InputError, with `mend`, for one that is missing, cannot be read or is larger, and for a folder, a
-    pipe or a device: the opening of a pipe waits for a writer, and a device has no end.
+    Raises InputError, with `mend`, where it is missing, unreadable or too large, or a folder, a pipe or a
+    device: opening a pipe waits for a writer, and a device has no end.
     """
     try:
-        # Looked at before it is opened, which some devices act on, and after, as it may be replaced between.
+        # Checked before it is opened, since opening a device may have effects, and after, against races.
         if not stat.S_ISREG(path.stat().st_mode):
             raise InputError(path, "", "is not a file", mend)
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
@@ -25,7 +25,7 @@ def open_regular(path: Path, most_bytes: int, mend: str) -> BufferedReader:
         raise InputError(path, "", f"cannot be read: {error.strerror or error}", mend) from None
     except InputError:
         raise
-    except ValueError:  # a NUL, or a character that no file name holds
+    except ValueError:  # a NUL, or an invalid character
         raise InputError(repr(str(path)), "", "is not a file", mend) from None
     status = os.fstat(file.fileno())
     if stat.S_ISREG(status.st_mode) and status.st_size <= most_bytes:
@@ -36,9 +36,9 @@ def open_regular(path: Path, most_bytes: int, mend: str) -> BufferedReader:
 
 
 def read_regular(path: Path, most_bytes: int, mend: str) -> bytes:
-    """The bytes of a file. Raises InputError as `open_regular` does."""
+    """Return the bytes of a file. Raises InputError as `open_regular` does."""
     with open_regular(path, most_bytes, mend) as file:
         data = file.read(most_bytes + 1)
-    if len(data) > most_bytes:  # it grew, or is one of /proc, whose sizes are 0
+    if len(data) > most_bytes:  # it grew, or is in /proc, where sizes are 0
         raise InputError(path, "", f"has more than {most_bytes:,} bytes", mend)
     return data

@@ -1,6 +1,6 @@
-"""Files that are written aside and renamed: whoever reads one sees nothing, the old one or the new one.
+"""Write files atomically by renaming: readers see no file, the old one or the new one.
 
-Files of runs are written by `datagen.schemas.storage`, which also counts on what a crash leaves.
+Files of runs are written by `datagen.schemas.storage`, which also handles crashes.
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from uuid import uuid4
 def whole_file(
     path: Path, *, mode: int = 0o666, durable: bool = False, alone: bool = False
 ) -> Generator[IO[bytes]]:
-    """A file that appears under its name when the block ends, or not at all; folders are made.
+    """Give a temporary file that is renamed when the block succeeds; folders are created.
 
-    Several processes may write one name at once. `alone` is for a name that one process writes at a time:
-    what a killed one left half written is then replaced by the next. `durable` files are on the disk when
-    the block ends, whatever happens to the machine. Raises OSError.
+    Several processes may write one name concurrently. `alone` is for a name with one writer at a time, whose
+    leftover draft the next one replaces. `durable` files are on the disk when the block ends. Raises OSError.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.new" if alone else f".{path.name}.{uuid4().hex}.tmp")

@@ -1,2 +1,2 @@
-if __name__ != "datagen.train":  # in a checkout's folder the other name would make every class twice
+if __name__ != "datagen.train":  # a second name, from a checkout's folder, would define every class twice
     raise ImportError("import it as datagen.train")

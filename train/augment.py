@@ -1,13 +1,11 @@
-"""Changes of a scene as it is read, so that no epoch shows a model the same cloud twice.
+"""Data augmentation of scenes, random for each epoch.
 
-Labels and ids never change. Each effect is a frozen dataclass of numbers, left out while it is None, and
-draws from a generator of its own: switching one off changes nothing of what the others draw. Extra
-columns stay as they are stored, also where the cloud was turned.
+Labels and ids never change. Each effect is a frozen dataclass of numbers, None to disable it, with a random
+generator of its own, so that disabling one does not change the others. Extra columns stay as stored, also
+where the cloud is rotated.
 
-What becomes of the farthest-point order (train/inputs.py): rotation and colour keep it. Points that
-vanish leave the others in their order, so that the first m of them lie at least as far from each other
-as the stored rows up to the last of these; random points then follow sooner. Noise moves points and not
-rows.
+The farthest-point order (train/inputs.py): rotation and colour keep it. Removed points leave the others in
+order, so that a prefix is still well spread, with random points earlier. Noise moves points, not rows.
 """
 
 from __future__ import annotations
@@ -28,10 +26,10 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Points moved along the camera's ray by a normal error of std_at_1m_m times depth squared (metres).
+    """Depth noise: points move along the camera's ray by a normal error of std_at_1m_m * depth^2 (metres).
 
-    That is how the depth of a stereo camera errs: sigma_z = depth^2 sigma_d / (fx baseline) (Khoshelham
-    and Elberink 2012, Sensors 12(2), eq. 10). The default is 0.08 px over 5 cm at fx = 615 px.
+    This is the error of a stereo camera: sigma_z = depth^2 sigma_d / (fx baseline) (Khoshelham and Elberink
+    2012, Sensors 12(2), eq. 10). The default is 0.08 px over 5 cm at fx = 615 px.
     """
 
     std_at_1m_m: float = 0.0026
@@ -43,7 +41,7 @@ class SensorNoise:
         n = view.n_points
         camera_m, sight_m = _sight_lines(view)
         depth_m = sight_m @ view.scene.record["T_world_camera"][:3, 2]
-        # Along the ray, an error of depth in proportion to depth is one of the whole length.
+        # Along the ray, a relative error of depth is the same relative error of the distance.
         scale = np.maximum(1 + self.std_at_1m_m * depth_m * rng.standard_normal(n), 0)
         points_m = view.points_m.copy()
         points_m[:n] = camera_m + sight_m * scale[:, None]
@@ -52,10 +50,10 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class DepthHoles:
-    """Round holes in the depth image, as a camera leaves them: all points behind one vanish.
+    """Round holes in the depth image: all points in one are removed.
 
-    0 to `most` holes around points of the cloud, of half-angles up to `largest_rad` as the camera sees
-    them. A hole that would leave less than `target_kept` of the target's points, or none, is not made.
+    0 to `most` holes around points of the cloud, with half-angles up to `largest_rad` from the camera. A hole
+    that would leave less than `target_kept` of the target's points, or none, is skipped.
     """
 
     most: int = 4
@@ -84,7 +82,7 @@ class DepthHoles:
 
 @dataclass(frozen=True)
 class PointDropout:
-    """A share of the points, uniform in [0, largest_share], vanishes; one of the target always stays."""
+    """A share of the points, uniform in [0, largest_share], is removed; one target point is always kept."""
 
     largest_share: float = 0.3
 
@@ -96,13 +94,13 @@ class PointDropout:
         kept = rng.random(n) >= rng.uniform(0, self.largest_share)
         target = view.target_mask[:n]
         if not (kept & target).any():
-            kept[np.argmax(target)] = True  # its first row, or the cloud's where none is the target's
+            kept[np.argmax(target)] = True  # the first target row, or the first row without one
         return _with_rows(view, kept)
 
 
 @dataclass(frozen=True)
 class ColourJitter:
-    """Colours times a gain for all channels and a gain for each, uniform in 1 +- these shares."""
+    """Colours are multiplied by a common gain and one per channel, uniform in 1 +- these shares."""
 
     brightness: float = 0.2
     channel: float = 0.1
@@ -119,7 +117,7 @@ class ColourJitter:
 
 @dataclass(frozen=True)
 class Rotation:
-    """The cloud turned about the vertical axis through the target, and the candidates with it.
+    """Rotation of cloud and candidates about the vertical axis through the target.
 
     The angle is uniform in [-largest_rad, largest_rad].
     """
@@ -139,7 +137,7 @@ class Rotation:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is done to a scene, in this order; None leaves it out."""
+    """The effects in order of application; None disables one."""
 
     noise: SensorNoise | None = None
     holes: DepthHoles | None = None
@@ -149,11 +147,11 @@ class Augmentation:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Scene fields that it needs besides a batch's own."""
+        """Further scene fields that the effects need."""
         return ("T_world_camera",) if self.noise or self.holes else ()
 
     def apply(self, view: View, seed: Sequence[int]) -> View:
-        """The view after all chosen effects; the given one stays as it is. `seed` names scene and epoch."""
+        """Return the view after all effects; the given one is unchanged. `seed`: of scene and epoch."""
         if not view.n_points:
             return view
         effects = (self.noise, self.holes, self.dropout, self.colour, self.rotation)
@@ -164,13 +162,13 @@ class Augmentation:
 
 
 def _sight_lines(view: View) -> tuple[F64, F64]:
-    """The camera's position (3,), and the ways from it to the points (n, 3); target frame."""
+    """The camera's position (3,), and vectors from it to the points (n, 3); target frame."""
     camera_m = view.scene.record["T_world_camera"][:3, 3] - view.scene.record["target_center_m"]
     return camera_m, view.points_m[: view.n_points] - camera_m
 
 
 def _with_rows(view: View, kept: Mask) -> View:
-    """The cloud with these of its points (n,), moved up in their order; zeros follow."""
+    """The cloud with only these points (n,), in order, padded with zeros."""
     rows = np.flatnonzero(kept)
     if len(rows) == view.n_points:
         return view
@@ -183,4 +181,4 @@ def _with_rows(view: View, kept: Mask) -> View:
 
 def _refuse_outside(field: str, value: float, most: float) -> None:
     if not 0 <= value <= most:
-        raise InputError("augmentation", field, f"{value} lies outside 0 to {most:.4g}", "Correct the value")
+        raise InputError("augmentation", field, f"{value} is not between 0 and {most:.4g}", "Correct it")

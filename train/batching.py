@@ -1,4 +1,4 @@
-"""Scenes to batches: clouds held once, robots told apart, candidates in the target's frame."""
+"""Make batches from scenes: one cloud per scene, rows per robot, candidates in the target's frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInp
 
 Rows = npt.NDArray[np.intp]
 
-# What a batch is made of, by table.
+# Fields of a batch, by table.
 SCENE_FIELDS = ("points_m", "rgb", "target_mask", "n_points", "target_center_m", "target_radius_m")
 ROBOT_FIELDS = ("camera_height_m", "base_height_m", "arm_reach_m")
 SAMPLE_FIELDS = ("sample_id", "robot_index", "base_xy_m", *ROBOT_FIELDS, "label")
@@ -29,15 +29,15 @@ class StoredScene:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """What names the scene in a seed: its first sample's id, as four numbers."""
+        """Seed of the scene: its first sample's id, as four numbers."""
         return tuple(np.ascontiguousarray(self.samples["sample_id"][0]).view("<u4").tolist())
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A scene as one epoch shows it: the cloud and the candidates that are given of it.
+    """A scene in one epoch: the cloud and the selected candidates.
 
-    `rows` are the candidates' rows among the scene's samples, those of one robot together.
+    `rows` are the candidates' rows among the scene's samples, grouped by robot.
     """
 
     scene: StoredScene
@@ -56,20 +56,20 @@ def stored_scenes(
     bounds: npt.NDArray[np.int64],
     rows: npt.NDArray[np.int64],
 ) -> list[StoredScene]:
-    """The wanted scenes of a shard. InputError where a robot's samples disagree about its numbers."""
+    """The wanted scenes of a shard. InputError where samples of one robot have different robot values."""
     robots = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), columns["robot_index"]
     order = np.lexsort(robots[::-1])
     same = (np.diff(robots[0][order]) == 0) & (np.diff(robots[1][order]) == 0)
     for name in ROBOT_FIELDS:
         if (np.diff(columns[name][order])[same] != 0).any():
-            problem = "samples of one robot differ in it"
-            raise InputError(place, name, problem, "Mend the run with `datagen repair`")
+            problem = "differs between samples of one robot"
+            raise InputError(place, name, problem, "Repair the run with `datagen repair`")
     if not np.isin(columns["n_points"], np.arange(columns["points_m"].shape[1] + 1)).all():
-        problem = "not a number of points that a cloud can hold"
-        raise InputError(place, "n_points", problem, "Mend the run with `datagen repair`")
+        problem = "is not between 0 and the size of the cloud"
+        raise InputError(place, "n_points", problem, "Repair the run with `datagen repair`")
     scene_columns = {name: columns[name] for name, dim in dims.items() if dim == "scene"}
     sample_columns = {name: columns[name] for name, dim in dims.items() if dim == "sample"}
-    if 2 * len(rows) < len(bounds) - 1:  # few are wanted: let the shard's arrays go
+    if 2 * len(rows) < len(bounds) - 1:  # few are wanted: copy them, to free the shard's arrays
         scene_columns = {name: a[rows] for name, a in scene_columns.items()}
         places = range(len(rows))
     else:
@@ -84,7 +84,7 @@ def stored_scenes(
 
 
 def stored_view(scene: StoredScene, rows: Rows) -> View:
-    """The scene as it is stored."""
+    """The scene as stored."""
     record = scene.record
     n_points = int(record["n_points"])
     return View(
@@ -101,7 +101,7 @@ def stored_view(scene: StoredScene, rows: Rows) -> View:
 def candidate_rows(
     robot_index: npt.NDArray[np.integer[Any]], per_robot: int | None, rng: np.random.Generator
 ) -> Rows:
-    """Rows of the candidates, robot by robot in ascending order; of each robot a random `per_robot` at most.
+    """Rows of the candidates by ascending robot; of each robot at most `per_robot`, at random.
 
     Candidates of one robot keep their stored order.
     """
@@ -117,7 +117,7 @@ def candidate_rows(
 def make_batch(
     views: Sequence[View], extra_scene: Sequence[str] = (), extra_sample: Sequence[str] = ()
 ) -> Batch[Array]:
-    """The scenes as one batch, in their order. Extra columns are given as they are stored."""
+    """Join the scenes into one batch, in order. Extra columns are as stored."""
 
     def sampled(name: str) -> Array:
         return _native(np.concatenate([v.scene.samples[name][v.rows] for v in views]))

@@ -1,4 +1,4 @@
-"""Samples streamed from runs as batches of whole scenes, the same for one seed and epoch."""
+"""Stream samples from runs as batches of whole scenes, reproducible by seed and epoch."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class _Draw(IntEnum):
 
 
 class DataOrigin(TypedDict):
-    """What a run is known by, in values that JSON can hold.
+    """Description of a run's data as JSON values.
 
-    `samples_sha256` is over the ids and labels of the samples that count, in stored order: the same for a
-    run, its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run, or is None for
-    a sealed store that came alone.
+    `samples_sha256` is over the ids and labels of the selected samples, in stored order: the same for a run,
+    its copy and its sealed store. `cost` has the wall and CPU seconds of the whole run; None for a sealed
+    store without its run.
     """
 
     spec_hashes: list[str]
@@ -109,7 +109,7 @@ class SampleStream:
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
         self._scenes = read_scene_table(parts, candidates_per_robot, houses)
         if len(self._scenes) < world:
-            problem = f"{len(self._scenes)} scenes for {world} ranks"
+            problem = f"has {len(self._scenes)} scenes for {world} processes"
             raise InputError(parts[0].place, "", problem, "Name more runs, or train on fewer processes")
 
     @property
@@ -129,7 +129,7 @@ class SampleStream:
 
     @property
     def parts(self) -> Sequence[PartSummary]:
-        """The runs that it reads, with what counts of each."""
+        """The runs, with the selected samples of each."""
         return self._scenes.parts
 
     def class_counts(self) -> tuple[int, int]:
@@ -149,7 +149,7 @@ class SampleStream:
         return set(self._scenes.object_digests)
 
     def origin(self) -> list[DataOrigin]:
-        """What a checkpoint says of its data, a run at a time."""
+        """Records of the data for a checkpoint, one per run."""
         return [
             {
                 "spec_hashes": list(summary.part.spec_hashes),
@@ -227,4 +227,4 @@ class SampleStream:
 
 def _refuse_below(field: str, value: int, least: int) -> None:
     if value < least:
-        raise InputError("training data", field, f"{value} is below {least}", f"Ask for {least} or more")
+        raise InputError("training data", field, f"{value} is below {least}", f"Give {least} or more")

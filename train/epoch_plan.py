@@ -1,4 +1,4 @@
-"""In which order an epoch gives its scenes: known before anything is read, so that any batch can be first."""
+"""The order of an epoch's scenes, known before reading, so that any batch can be the first."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class EpochPlan:
 
 
 def batches_of(n_scenes: int, scenes_per_batch: int, world: int) -> int:
-    """Batches of each rank: enough that none is larger than asked, and never so many that one is empty.
+    """Number of batches per rank, so that none is larger than requested and none is empty.
 
-    The latter wins where every batch is of one scene: then some have two.
+    Where every batch has one scene, the latter overrides: some then have two.
     """
     largest_rank = -(-n_scenes // world)
     return max(1, min(-(-largest_rank // scenes_per_batch), n_scenes // world))

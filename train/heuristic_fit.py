@@ -1,4 +1,4 @@
-"""The distance-visibility rule fitted to labels of grasp trials: parameters that the paper leaves open.
+"""Fit the distance-visibility rule to labels of grasp trials: the parameters that the paper does not give.
 
 With H = alpha vis(rho) + (1 - alpha) dist(d), a candidate is good where its distance is at most k(rho) sigmas
 from mu (`reach_in_sigmas`). Given mu, tau and alpha, a candidate nearer than mu thus depends on sigma_l alone
@@ -29,12 +29,12 @@ I64 = npt.NDArray[np.int64]
 
 FORMS: tuple[Form, ...] = get_args(Form)
 FOLDS = 5
-# An interval by resampling fewer scenes says nothing.
+# Fewer scenes give no meaningful interval.
 MIN_SCENES = 10
-# A parameter is written with so many decimals: a tenth of a millimetre.
+# Decimals of parameters: a tenth of a millimetre.
 DECIMALS = 4
 
-# The grid that the search begins with, and how many of its best points it follows for how many rounds.
+# The initial grid of the search, the number of best points to refine, and of rounds.
 _MUS = 49
 _ALPHAS = np.linspace(0.0, 0.9, 10)
 # k at rho = 1, in place of tau: from 0.1, where nothing less visible is good, to where dist hardly counts.
@@ -78,16 +78,16 @@ class Trials:
         )
 
     def said(self, params: HeuristicParams) -> Bools:
-        """The rule's labels (N,), by the code that labels runs."""
+        """The rule's labels (N,), by the code of the label source."""
         inputs = (self.distance_m, self.mount_distance_m, self.arm_reach_m, self.visibility)
         return heuristic(*inputs, params)[1] == 1
 
 
 def begin_from(before: HeuristicParams, form: Form) -> HeuristicParams:
-    """The parameters that a fit in this form starts from: those that it does not fit stay.
+    """Initial parameters of a fit with this distance; those that are not fitted stay.
 
-    Bounds in metres mean nothing in shares of the reach. There they are 0 and 1: nothing beyond the
-    reach can be taken, and what is too near is left to sigma_l.
+    For shares of the reach the bounds are 0 and 1: targets beyond the reach cannot be grasped, and sigma_l
+    covers those that are too near.
     """
     if form == before.distance:
         return before
@@ -114,7 +114,7 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What rules say of candidates (N,) in houses that they were not fitted on, and the rule of each fold."""
+    """Labels (N,) by rules fitted on other houses, and the rule of each fold."""
 
     said: Bools
     params: tuple[HeuristicParams, ...]
@@ -126,9 +126,9 @@ def fit_leaving_houses_out(
     seed: int,
     step: Callable[[], None] = lambda: None,
 ) -> LeftOut:
-    """Houses dealt out to `FOLDS` folds, and the candidates of each labelled by a rule fitted on the others.
+    """Divide houses into `FOLDS` folds, and label the candidates of each by a rule fitted on the others.
 
-    Needs at least two houses (`refuse_too_little`). InputError where all of a class lie in one fold.
+    Needs at least two houses (`refuse_too_little`). InputError where one fold has all candidates of a class.
     """
     houses, house = np.unique(trials.house.astype(str), return_inverse=True)
     folds = min(FOLDS, len(houses))
@@ -139,7 +139,7 @@ def fit_leaving_houses_out(
     for k in range(folds):
         inside = fold != k
         if trials.label[inside].all() or not trials.label[inside].any():
-            problem = f"those of label {int(not trials.label[inside].any())} lie in too few houses"
+            problem = f"those of label {int(not trials.label[inside].any())} are in too few houses"
             raise InputError("labels", "house_id", problem, "Name runs of more houses")
         params.append(refit(trials.at(inside)))
         said[~inside] = trials.at(~inside).said(params[-1])
@@ -148,24 +148,24 @@ def fit_leaving_houses_out(
 
 
 def refuse_too_little(trials: Trials, place: str) -> None:
-    """InputError where nothing can be fitted, or not said how well: one class, few scenes, one house."""
+    """Raise InputError for labels of one class, few scenes or one house."""
     mend = "Name more runs, or make more labels with `datagen extend`"
     if not len(trials):
-        raise InputError(place, "--candidates", "no candidate is of this set", "Choose another set")
+        raise InputError(place, "--candidates", "selects no candidate", "Choose another set")
     if trials.label.all() or not trials.label.any():
         problem = f"all {len(trials):,} labels are {int(trials.label[0])}"
         raise InputError(place, "label", problem, "Choose other --candidates, or name more runs")
     if trials.n_scenes < MIN_SCENES:
-        problem = f"{trials.n_scenes} scenes, and intervals need {MIN_SCENES}; 100 and more are sensible"
+        problem = f"{trials.n_scenes} scenes, but intervals need {MIN_SCENES}; 100 or more are sensible"
         raise InputError(place, "scenes", problem, mend)
     if len(set(trials.house)) < 2:
-        problem = "all scenes are in one house, and none is left to score on"
+        problem = "all scenes are in one house, so none is left for validation"
         raise InputError(place, "house_id", problem, mend)
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How a rule's labels stand to those of trials: true and false positives, false and true negatives."""
+    """Agreement of a rule's labels with those of trials: true/false positives, false/true negatives."""
 
     confusion: F64  # (4,)
     accuracy: Estimate
@@ -261,7 +261,7 @@ def _best_cut(needed: F64, gains: I64, otherwise: float) -> tuple[int, float]:
 def _beam_search(
     at: Callable[[Sequence[float]], tuple[int, HeuristicParams]], axes: Sequence[F64]
 ) -> HeuristicParams:
-    """The best of a grid, then of ever finer neighbourhoods of its best points."""
+    """The best of a grid, then of finer neighbourhoods of its best points."""
     lows, highs = [axis[0] for axis in axes], [axis[-1] for axis in axes]
     steps = [(axis[-1] - axis[0]) / max(len(axis) - 1, 1) for axis in axes]
     points = [tuple(map(float, point)) for point in product(*axes)]

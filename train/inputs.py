@@ -1,8 +1,8 @@
-"""What every model, baseline and metric is given: clouds, the robots that look at them, and candidates.
+"""Inputs of models, baselines and metrics: clouds, robots and candidates.
 
-Three tables joined by rows, so that a cloud is held once whatever the number of robots and candidates:
-a candidate names its robot, a robot its cloud. Arrays are numpy's as they come from a store, or torch's
-on a model's device (`to_torch`); shapes, units and frames are the same.
+Three tables joined by rows, so that a cloud is stored once: a candidate has the row of its robot, and a
+robot that of its cloud. Arrays are numpy's as read from a store, or torch's on a model's device
+(`to_torch`), with equal shapes, units and frames.
 
 Frame "target": world axes (z up) with the origin at the target's centre.
 """
@@ -95,7 +95,7 @@ def mount_distance_m(
 def column(batch: Batch[Array], name: str) -> Array:
     """A further column of the store. InputError where the batch was read without it."""
     if name not in batch.extra:
-        raise InputError("batch", name, "it was read without this column", f"Read it with extra=({name!r},)")
+        raise InputError("batch", name, "was not read", f"Read the batch with extra=({name!r},)")
     return batch.extra[name]
 
 

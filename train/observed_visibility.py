@@ -1,4 +1,4 @@
-"""rho as far as the observed cloud tells it: a small z-buffer from each candidate's camera.
+"""Estimate rho from the observed cloud: a small z-buffer from each candidate's camera.
 
 The window is that of the true rho (`workers/rendering/visibility.py`): it looks at the target's centre and
 touches its bounding sphere. Points are few (of a table about one every 3 cm), so each stands for a disc in

@@ -1,4 +1,4 @@
-"""Columns of runs as they are stored, a shard at a time: whatever fields are asked for, in stored order.
+"""Read columns of runs, one shard at a time, in stored order.
 
 Training reads through `datagen.train.dataset`, which builds batches on the shards that are loaded here.
 """
@@ -57,8 +57,8 @@ class SampleReader:
         for dim, names in (("scene", scene_fields), ("sample", sample_fields)):
             for name in names:
                 if arrays[name].dims[0] != dim:
-                    problem = f"not a field of {dim}s"
-                    raise InputError(parts[0].place, name, problem, "Ask for it in the other table")
+                    problem = f"is not a field of {dim}s"
+                    raise InputError(parts[0].place, name, problem, "Request it in the other table")
         self._shards = [(shard, part.arrays) for part in parts for shard in part.shards]
         self._fields = {name: arrays[name] for name in (*scene_fields, *sample_fields)}
 
@@ -92,8 +92,8 @@ def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Co
         raise InputError(
             f"{place.storage.url}/{place.folder}",
             "sample_scene_index",
-            "a sample names a scene that its shard lacks, or not in the order of the scenes",
-            "Mend it with `datagen repair`",
+            "has a sample of a scene outside its shard, or in another order",
+            "Repair it with `datagen repair`",
         )
     return columns, bounds
 

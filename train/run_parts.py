@@ -1,4 +1,4 @@
-"""Places opened for reading: which runs lie there, the shards that they have, and what their arrays are."""
+"""Open runs and sealed stores for reading: shards and arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from datagen.train.sealed import is_sealed_store, open_sealed
 
 @dataclass(frozen=True, eq=False)
 class RunPart:
-    """One run's shards and arrays, or those of a sealed store that came without its run.
+    """One run's shards and arrays, or those of a sealed store without its run.
 
     `spec_hashes` has several where such a store was merged. `cost` adds up the commits' wall and CPU
     seconds, with those of the labels that a run was relabelled from; None where no commit came along.
@@ -42,7 +42,7 @@ def open_parts(
     field differently.
     """
     if not places:
-        raise InputError("training data", "", "no run is named", "Name at least one run's folder")
+        raise InputError("training data", "", "no run is given", "Name at least one run folder")
     parts = [part for place in places for part in _open(place, names, allow_incomplete)]
     for part in parts[1:]:
         for name, ours in part.arrays.items():
@@ -104,8 +104,8 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
             cost[f"{kind}_s"] += commit.cost.all_s[kind]
     missing = n - sum(place.samples for place in shards)
     if missing and not allow_incomplete:
-        problem = f"{missing:,} of the {n:,} planned samples are not committed"
-        mend = f"Make them with `datagen resume {url}`, or accept a part of the run with --allow-incomplete"
+        problem = f"{missing:,} of the {n:,} planned samples are missing"
+        mend = f"Make them with `datagen resume {url}`, or accept an incomplete run with --allow-incomplete"
         raise InputError(url, "commits", problem, mend)
     if not shards:
         return None
@@ -118,7 +118,7 @@ def _refuse_unknown(url: str, names: Sequence[str], commit: Commit) -> None:
     stored = [e.path.removesuffix("/zarr.json") for e in commit.files if e.path.endswith("/zarr.json")]
     for name in names:
         if name not in stored:
-            raise InputError(url, name, "the run stores no such field", choices(stored))
+            raise InputError(url, name, "is not a field of the run", choices(stored, name))
 
 
 def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> None:
@@ -128,5 +128,5 @@ def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -
                 f"{place.storage.url}/{place.folder}/{name}/zarr.json",
                 name,
                 "differs from the other shards' metadata",
-                "Mend it with `datagen repair`",
+                "Repair it with `datagen repair`",
             )

@@ -1,4 +1,4 @@
-"""What a stream knows of every scene before it reads a cloud: where it lies, its house, its labels.
+"""Table of all scenes of a stream, made before a cloud is read: location, house, labels.
 
 Read once, from a few short columns, so that sizes, splits and the order of an epoch need no cloud.
 """
@@ -85,7 +85,10 @@ def read_scene_table(
                     continue
                 label = columns["label"][first:past]
                 if label.max() > 1:
-                    where, mend = f"{place.storage.url}/{place.folder}", "Mend the run with `datagen repair`"
+                    where, mend = (
+                        f"{place.storage.url}/{place.folder}",
+                        "Repair the run with `datagen repair`",
+                    )
                     raise InputError(where, "label", f"a label of {label.max()}", mend)
                 digest.update(columns["sample_id"][first:past].tobytes())
                 digest.update(label.tobytes())
@@ -101,7 +104,7 @@ def read_scene_table(
         summaries.append(PartSummary(part, len(shard) - begun, negatives, positives, digest.hexdigest()))
     if not shard:
         place = ", ".join(dict.fromkeys(part.place for part in parts))
-        problem = "no scene of a house that counts"
+        problem = "has no scene in the selected houses"
         raise InputError(place, "house_id", problem, "Name more runs, or runs of more houses")
     return SceneTable(
         np.array(shard, np.int64),
@@ -131,6 +134,6 @@ def _refuse_twins(parts: Sequence[RunPart]) -> None:
     for part in parts:
         for spec_hash in part.spec_hashes:
             if spec_hash in seen:
-                problem = f"of one specification with {seen[spec_hash]}, so that samples would come twice"
+                problem = f"has the specification of {seen[spec_hash]}, so samples would occur twice"
                 raise InputError(part.place, "", problem, "Name it once, or merge them with `datagen merge`")
             seen[spec_hash] = part.place

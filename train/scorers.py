@@ -1,4 +1,4 @@
-"""What judges candidates, model or baseline: one score each, and the score from which on it says good."""
+"""Scorers of candidates, models or baselines: a score per candidate and a threshold."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Scorer(Protocol):
-    """A method that can be held against labels.
+    """A method that can be evaluated.
 
     From `threshold` on a score says label 1. A threshold of nan belongs to a method that only picks: it
     calls the best-scored of a robot's candidates good, and all others bad.
@@ -73,8 +73,8 @@ def scored(scorer: Scorer, batch: Batch[Array]) -> npt.NDArray[np.float64]:
     score = np.asarray(scorer.score(batch), np.float64)
     if score.shape != (len(batch),) or not np.isfinite(score).all():
         row = int(np.argmin(np.isfinite(score))) if score.shape == (len(batch),) else 0
-        problem = f"no finite score for sample {batch.sample_id[row].tobytes().hex()}"
-        raise InputError(scorer.name, "score", problem, "Train the model again, or leave this method out")
+        problem = f"is not finite for sample {batch.sample_id[row].tobytes().hex()}"
+        raise InputError(scorer.name, "score", problem, "Train the model again, or omit this method")
     return score
 
 

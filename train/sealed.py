@@ -1,4 +1,4 @@
-"""A sealed store that travels without its run: read as slices of shards by its own attributes."""
+"""Read a sealed store without its run, as slices of shards, by its own attributes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datagen.schemas.keys import MERGED
 from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray
 from datagen.schemas.storage import open_storage
 
-_MEND = "Seal the run again, and copy its data.zarr whole"
+_MEND = "Seal the run again, and copy the whole data.zarr"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,23 +55,23 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
         schema, version = str(attributes["schema"]), int(attributes["schema_version"])
         spec_hashes = tuple(str(part["spec_hash"]) for part in attributes.get("parts", [attributes]))
     except (ValueError, KeyError, TypeError, RecursionError) as e:
-        raise InputError(where, "", f"not the root of a sealed store ({e})", _MEND) from e
+        raise InputError(where, "", f"is not the root of a sealed store ({e})", _MEND) from e
     if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
         known = ", ".join(f"{s.name} {OLDEST_SCHEMA_VERSION} to {s.version}" for s in SCHEMAS.values())
-        problem = f"{schema!r} {version}, and this program knows {known}"
-        raise InputError(where, "schema_version", problem, "Use the version of the program that made the run")
+        problem = f"is {schema!r} {version}, but this program reads {known}"
+        raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
     for name in names:
         if name not in stored:
-            raise InputError(storage.url, name, "the store has no such field", choices(stored))
+            raise InputError(storage.url, name, "is not a field of the store", choices(stored, name))
     arrays = ShardPlace(storage, "", 0, 0, 0, 0, 0).metadata(names)
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
     if len(scenes) != 1 or len(samples) != 1 or per_shard < 1 or per_scene < 1:
-        raise InputError(where, "shape", "arrays of one table differ in length", _MEND)
+        raise InputError(where, "shape", "differs between arrays of one table", _MEND)
     n_scenes, n_samples = scenes.pop(), samples.pop()
     full = per_shard * per_scene
     if (shards := -(-n_scenes // per_shard)) != -(-n_samples // full):
-        raise InputError(where, "shape", f"{n_scenes} scenes, and {n_samples} samples of other scenes", _MEND)
+        raise InputError(where, "shape", f"{n_scenes} scenes do not match {n_samples} samples", _MEND)
     for array in arrays.values():
         if (per_shard if array.dims[0] == "scene" else full) % array.chunk_rows:
             raise InputError(where, array.name, "chunks that do not divide a shard", _MEND)

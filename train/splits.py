@@ -1,4 +1,4 @@
-"""Sides of training data that share no house: what a model is judged on it was never trained on."""
+"""Split training data into training and validation sides without common houses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SHARE_SALT = b"share-of-houses-1:"
 
 @dataclass(frozen=True)
 class HouseSide:
-    """Which houses one side has, by id alone: adding or removing houses moves no other house."""
+    """The houses of one side, by id only: adding or removing houses moves no other house."""
 
     held_out: bool
 
@@ -59,29 +59,29 @@ def split_by_house(
     except InputError as error:
         if error.field != "house_id":
             raise
-        mend = "Name a run of other houses for validation, or train on runs of more houses"
-        problem = "a tenth of the houses by their ids leaves one side without any"
+        mend = "Name a run of other houses with --val, or train on runs of more houses"
+        problem = "has too few houses to hold out a tenth for validation"
         raise InputError(error.place, "house_id", problem, mend) from error
     refuse_shared_houses(train, validation)
     return train, validation
 
 
 def refuse_shared_houses(train: SampleStream, other: SampleStream) -> None:
-    """InputError that names a house of which both have scenes: one of equal id or of equal content."""
+    """Raise InputError where both sides have scenes of a house, by id or by content."""
     ours, theirs = train.house_digests(), other.house_digests()
     shared = {house: house for house in train.house_ids() & other.house_ids()}
     shared |= {ours[digest]: theirs[digest] for digest in ours.keys() & theirs.keys() if digest}
     if not shared:
         return
     house, twin = min(shared.items())
-    also = "" if house == twin else f" (as {twin!r} there, of equal content)"
+    also = "" if house == twin else f" (there as {twin!r}, with equal content)"
     places = ", ".join(dict.fromkeys(part.part.place for part in other.parts))
-    problem = f"house {house!r} is trained on too{also}, one of {len(shared)} such houses"
+    problem = f"house {house!r} is also in the training data{also}, one of {len(shared)} such houses"
     raise InputError(places, "house_id", problem, "Use runs of other houses, as `submit --split` makes them")
 
 
 def refuse_one_class(stream: SampleStream) -> None:
-    """InputError that names the runs and the class where all labels are alike: nothing can be learned."""
+    """Raise InputError where all labels are equal."""
     counts = stream.class_counts()
     if all(counts):
         return

@@ -1,4 +1,4 @@
-"""What one shard is: pure geometry and labels, and simulators behind small functions. No Ray, no store."""
+"""Computation of shards: geometry, labels and simulators, without Ray and storage."""
 
-if __name__ != "datagen.workers":  # in a checkout's folder the other name would make every class twice
+if __name__ != "datagen.workers":  # a second name, from a checkout's folder, would define every class twice
     raise ImportError("import it as datagen.workers")

@@ -1,7 +1,7 @@
-"""What was worked out once, on disk: files that are whole or absent, the longest unused dropped.
+"""A cache of computed arrays on disk, with atomic writes and least-recently-used removal.
 
-A cache saves time and decides nothing. What is broken, foreign or too large reads as absent, and a
-folder that is read-only or full keeps nothing.
+No result depends on it. Damaged, foreign or too large files count as absent, and a read-only or full folder
+stores nothing.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 # Type and shape of every array; lengths with one name are equal.
 Layout = Mapping[str, tuple[type[np.generic], tuple[int | str, ...]]]
 
-_ABANDONED_S = 3600.0  # a half written file this old is of a process that was killed
+_ABANDONED_S = 3600.0  # an incomplete file of this age belongs to a killed process
 
 
 def cache_folder() -> Path:
@@ -51,7 +51,7 @@ class CacheFolder:
 
     folder: str  # below the cache folder
     layout: Layout
-    most_files: int  # beyond it the longest unused are dropped
+    most_files: int  # beyond it the least recently used are removed
     most_bytes: int  # a larger file is not read
 
     def load(self, key: str) -> dict[str, npt.NDArray[Any]] | None:

@@ -33,7 +33,7 @@ class JsonNode:
         """The member of an object; it must be there."""
         members = self._members()
         if key not in members:
-            raise self.error(f"key {key!r} is missing")
+            raise self.error(f"has no key {key!r}")
         return JsonNode(self.place, f"{self.path}.{key}", members[key])
 
     def find(self, key: str) -> JsonNode | None:
@@ -44,10 +44,10 @@ class JsonNode:
     def items(self, limit: int) -> Iterator[JsonNode]:
         """The elements of a list of at most `limit`."""
         if not isinstance(self.value, list):
-            raise self.error(f"{_kind(self.value)} where a list belongs")
+            raise self.error(f"is {_kind(self.value)}, not a list")
         values = cast(list[Any], self.value)
         if len(values) > limit:
-            raise self.error(f"{len(values)} entries, more than the {limit} allowed")
+            raise self.error(f"has {len(values)} entries, more than the {limit} allowed")
         for i, value in enumerate(values):
             yield JsonNode(self.place, f"{self.path}[{i}]", value)
 
@@ -55,7 +55,7 @@ class JsonNode:
         """A finite number within [low, high]."""
         value = self.value
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(f"{_kind(value)} where a number belongs")
+            raise self.error(f"is {_kind(value)}, not a number")
         if not low <= value <= high:  # also false for NaN; an int of any size compares exactly
             shown = f"{value:g}" if isinstance(value, float) or abs(value) < 1e15 else "a huge number"
             raise self.error(f"{shown} is not within [{low:g}, {high:g}]")
@@ -64,12 +64,12 @@ class JsonNode:
     def text(self) -> str:
         """A string of at most 500 printable characters: records and arrays of a run repeat it."""
         if not isinstance(self.value, str):
-            raise self.error(f"{_kind(self.value)} where a text belongs")
+            raise self.error(f"is {_kind(self.value)}, not a text")
         if len(self.value) > _LONGEST_TEXT:
-            raise self.error(f"a text of {len(self.value)} characters, more than {_LONGEST_TEXT}")
+            raise self.error(f"has {len(self.value)} characters, more than {_LONGEST_TEXT}")
         if not self.value.isprintable():
             bad = printable(next(c for c in self.value if not c.isprintable()))
-            raise self.error(f"a text with the unprintable character {bad}")
+            raise self.error(f"has the unprintable character {bad}")
         return self.value
 
     def point(self) -> tuple[float, float, float]:
@@ -82,7 +82,7 @@ class JsonNode:
 
     def _members(self) -> dict[str, Any]:
         if not isinstance(self.value, dict):
-            raise self.error(f"{_kind(self.value)} where an object belongs")
+            raise self.error(f"is {_kind(self.value)}, not an object")
         return cast(dict[str, Any], self.value)
 
 

@@ -1,7 +1,7 @@
-"""Registries: plain dictionaries from a name to `module:attribute`, imported when it is asked for.
+"""Registries: dictionaries from a name to `module:attribute`, imported on first use.
 
-So `datagen --help` waits for no simulator, and a machine that lacks one engine's system libraries
-uses another.
+`datagen --help` therefore imports no simulator, and a machine without the system libraries of one engine
+can use another.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from datagen.schemas.errors import InputError, choices
 
-# What extras bring, by the names that are imported: what pip calls it, and the extra. The core works without.
+# Optional libraries by extra: name of the import -> name for pip.
 SIM_MODULES = {"pinocchio": "pin", "coal": "coal", "mani_skill": "mani-skill"}
 _EXTRAS = {
     "train": {"torch": "torch", "tensorboard": "tensorboard", "plotly": "plotly"},
@@ -22,7 +22,7 @@ _EXTRAS = {
 
 
 def install_line(*modules: str) -> str:
-    """How to install these modules of one extra, for an error's mend."""
+    """How to install these modules of one extra, for the fix of an error."""
     extra = next(name for name, brings in _EXTRAS.items() if modules[0] in brings)
     packages = " ".join(_EXTRAS[extra][name] for name in modules)
     source = "of the folder or URL that datagen was installed from"
@@ -33,39 +33,39 @@ SIM_MEND = install_line(*SIM_MODULES)
 
 
 def missing_library(error: Exception) -> InputError | None:
-    """The one line for a library of an extra that is not installed; None for any other error."""
+    """The InputError for a library of an extra that is not installed; None for any other error."""
     name = (error.name or "").split(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     found = [module for brings in _EXTRAS.values() for module in brings]
     return InputError(name, "", "is not installed", install_line(name)) if name in found else None
 
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
-    """What a registry holds under a name. `option` is where the name was given, for the error.
+    """Return the entry of a registry. `option` is where the name was given, for the error.
 
     Raises InputError for an unknown name, listing the valid ones, and for an engine that cannot be
     imported on this machine.
     """
     if name not in registry:
-        raise InputError(option, name or "''", "no such entry", choices(registry))
+        raise InputError(option, name or "''", "is unknown", choices(registry, name))
     module, attribute = registry[name].split(":")
     try:
         return getattr(import_module(module), attribute)
     except ImportError as error:
-        mend = f"Run `datagen doctor`, or take another one: {', '.join(sorted(registry))}"
+        mend = f"Run `datagen doctor`, or use another one: {', '.join(sorted(registry))}"
         if missing_library(error) is not None:
             mend = SIM_MEND
         raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
 
 
 def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
-    """The source that a reference `kind` or `kind:text` names, opened with its text.
+    """Open the source of a reference `kind` or `kind:text`.
 
-    Raises InputError as `entry` does, and where a folder is named without its kind.
+    Raises InputError as `entry` does, and for a folder without its kind.
     """
     kind, _, text = ref.partition(":")
     if kind not in registry and "/" in kind:
         mend = f"Write KIND:{ref}, where KIND is one of {', '.join(sorted(registry))}"
-        raise InputError(option, ref, "is a folder without its kind", mend)
+        raise InputError(option, ref, "is a folder without the kind of its content", mend)
     return entry(registry, kind, option)(text)
 
 

@@ -1,4 +1,4 @@
-"""One shard, from its place in the sequence to checked arrays. Read this first.
+"""Compute one shard, from scene indices to checked arrays. Read this first.
 
 draw a house, a support, a target and clutter   (resampled until it works)
 settle them by physics
@@ -37,7 +37,7 @@ Columns = dict[str, np.ndarray[Any, Any]]
 
 @dataclass(frozen=True, eq=False)
 class ShardResult:
-    """Arrays by field name, one row a scene and one row a sample, and what they cost."""
+    """Arrays by field name, one row per scene and one per sample, with their cost."""
 
     scene: Columns
     sample: Columns
@@ -47,7 +47,7 @@ class ShardResult:
 
 @dataclass(frozen=True, eq=False)
 class _UnlabelledScene:
-    """A scene that waits for labels: what is looked at, and the rows that no label decides."""
+    """A scene before labelling: its stage, and the rows that do not depend on labels."""
 
     scene: SettledScene
     candidates: SceneCandidates

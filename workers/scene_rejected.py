@@ -1,4 +1,4 @@
-"""Why a try at a scene was given up."""
+"""The exception for a rejected scene."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from datagen.schemas.outcomes import REDRAW_CAUSES
 
 
 class SceneRejected(Exception):
-    """This try gives no scene; `cause` is one of REDRAW_CAUSES, `detail` says more where there is more."""
+    """The scene is rejected and resampled; `cause` is one of REDRAW_CAUSES, `detail` optional text."""
 
     def __init__(self, cause: str, detail: str = "") -> None:
         if cause not in REDRAW_CAUSES:

@@ -1,4 +1,4 @@
-"""What a worker keeps between scenes: sources, geometry and hierarchies, each built once."""
+"""Data that a worker keeps between scenes: sources, geometry and ray meshes, each built once."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class World:
             "--objects",
             self.objects.kind,
             f"none of {len(self.object_names)} objects can be grasped by {self.spec.arm.robot}",
-            "Add smaller or lighter objects, or take another robot",
+            "Add smaller or lighter objects, or choose another robot",
         )
 
     @cached_property
@@ -136,12 +136,12 @@ def open_world(spec: Specification, houses: str, objects: str) -> World:
         ("--objects", objects, object_source, spec.objects),
     ):
         if (source.kind, source.digest) != (wanted.kind, wanted.digest):
-            found = f"{source.kind} with digest {source.digest[:12]}"
+            found = f"{source.kind} {source.digest[:12]}"
             raise InputError(
                 option,
                 ref,
                 f"holds {found}, but the run was made with {wanted.kind} {wanted.digest[:12]}",
-                "Give the folder the run was started with, or start a new run",
+                "Give the folder that the run was started with, or start a new run",
             )
     return assemble_world(spec, house_source, object_source, houses, objects)
 
@@ -159,13 +159,13 @@ def assemble_world(
     targets = [n for n in names if objects.load(n).can_be_target]
     if not targets:
         raise InputError(
-            "--objects", objects_ref, "has no object that a gripper could take", "Add smaller objects"
+            "--objects", objects_ref, "has no object that a gripper can grasp", "Add smaller objects"
         )
     if len(names) <= spec.scene.n_clutter:
         raise InputError(
             "--objects",
             objects_ref,
             f"has {len(names)} objects, too few for one target and {spec.scene.n_clutter} clutter objects",
-            "Add objects, or ask for less clutter (scene.n_clutter)",
+            "Add objects, or reduce the clutter (scene.n_clutter)",
         )
     return World(spec, houses, objects, house_ids, names, targets)

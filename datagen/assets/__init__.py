@@ -1,1 +1,1 @@
-"""Houses and objects on disk: where they come from, what they must be, and getting them safely."""
+"""Houses and objects on disk: catalogue, downloads, checksums and licences."""

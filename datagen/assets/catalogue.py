@@ -1,8 +1,8 @@
-"""What `datagen assets fetch` knows to bring, and from where.
+"""The catalogue of `datagen assets fetch`.
 
-Digests are the publishers' own where they state one: ProcTHOR-10K's are the object ids of its
-Git LFS pointers at the pinned commit, that of the YCB archive is the one ManiSkill 3.0.1 checks.
-The others are trusted on first use and recorded in the folder's lock file.
+Digests are those of the publisher, where there is one: ProcTHOR-10K's are the object ids of its Git LFS
+pointers at the pinned commit, and the YCB archive's is the one that ManiSkill 3.0.1 checks. The others are
+trusted on first use and recorded in the folder's lock file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class CatalogueEntry:
     file: str
     url: str
     licence: str
-    into: str  # folder below the target, "" for the target itself
+    into: str  # subfolder of the target, "" for the target itself
     about: str
     sha256: str | None = None
     size: int | None = None
@@ -46,7 +46,7 @@ def _houses(split: str, sha256: str, size: int) -> CatalogueEntry:
     )
 
 
-# The objects of the set that were scanned at 16k triangles.
+# Objects with a scan of 16k triangles.
 _SCANNED = [
     "001_chips_can", "002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can",
     "006_mustard_bottle", "007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can",
@@ -68,7 +68,7 @@ _ALL = (
         url=f"{_MANISKILL}/ManiSkill2/resolve/main/data/mani_skill2_ycb.zip",
         licence="CC-BY-4.0",
         into="",
-        about="YCB objects with convex parts, from ManiSkill: use with --objects ycb:DIR/mani_skill2_ycb",
+        about="YCB objects with convex parts, from ManiSkill; use: --objects ycb:DIR/mani_skill2_ycb",
         sha256="1551724fd1ac7bad9807ebcf46dd4a788caed5c9499c1225b9bfa080ffbefcb3",
         archive=True,
         max_bytes=4 * _GB,
@@ -82,7 +82,7 @@ _ALL = (
         url=f"https://raw.githubusercontent.com/allenai/procthor/{_PROCTHOR}/procthor/databases/asset-database.json",
         licence="Apache-2.0",
         into="procthor",
-        about="sizes of the AI2-THOR assets that ProcTHOR houses are furnished with",
+        about="sizes of the AI2-THOR furniture in ProcTHOR houses",
     ),
     CatalogueEntry(
         name="ai2thor",
@@ -90,7 +90,7 @@ _ALL = (
         url=f"{_MANISKILL}/AI2THOR/resolve/main/ai2thor.zip",
         licence="Apache-2.0",
         into="",
-        about="AI2-THOR scenes and furniture meshes, from ManiSkill: use with --houses ai2thor:DIR/ai2thor",
+        about="AI2-THOR scenes and furniture meshes, from ManiSkill; use: --houses ai2thor:DIR/ai2thor",
         archive=True,
         max_bytes=60 * _GB,
         max_unpacked_bytes=200 * _GB,
@@ -102,7 +102,7 @@ _ALL = (
             url=f"{_YCB_SCANS}/{key}_google_16k.tgz",
             licence="CC-BY-4.0",
             into="ycb-scans",
-            about="the set's own laser scan (16k triangles), without convex parts",
+            about="YCB laser scan (16k triangles), without convex parts",
             archive=True,
             max_bytes=200 * 10**6,
             max_unpacked_bytes=_GB,

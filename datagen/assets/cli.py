@@ -26,33 +26,31 @@ from datagen.console.printing import print_json, print_rows, size
 from datagen.schemas.errors import InputError, choices
 from datagen.workers.content_cache import cache_folder
 
-Folder = Annotated[Path, Parameter(help="The folder of assets.")]
+Folder = Annotated[Path, Parameter(help="Folder of assets.")]
 
 app = App(name="assets", help="List, fetch, lock and verify houses and objects.")
 
 
 @app.command(name="list")
 def list_assets(
-    folder: Annotated[Path | None, Parameter(help="List what this folder's lock file holds.")] = None,
+    folder: Annotated[Path | None, Parameter(help="List the files in the lock file of this folder.")] = None,
     *,
     json: AsJson = False,
 ) -> int:
-    """What can be fetched, or, with a folder, what its lock file lists."""
+    """List the assets that can be fetched or, with a folder, the files in its lock file."""
     if folder is None:
         rows = [{k: v for k, v in asdict(asset).items() if k != "archive"} for asset in CATALOGUE.values()]
         if json:
             print_json({"assets": rows})
         else:
             print_rows(
-                "assets that `datagen assets fetch` knows",
+                "assets for `datagen assets fetch`",
                 [(a.name, size(a.size) if a.size else "?", _trust(a), a.licence, a.about) for a in _shown()],
             )
         return 0
     locked = locks.read_lock(folder)
     if locked is None:
-        raise InputError(
-            folder, locks.LOCK_NAME, "there is no lock file", "Write one: datagen assets lock DIR"
-        )
+        raise InputError(folder, locks.LOCK_NAME, "does not exist", "Write it: datagen assets lock DIR")
     if json:
         print_json(locked.model_dump())
         return 0
@@ -70,13 +68,11 @@ def list_assets(
 def lock(
     folder: Folder,
     *,
-    licence: Annotated[
-        str | None, Parameter(help="Licence of all files; kept as it was if not given.")
-    ] = None,
-    source: Annotated[str | None, Parameter(help="Where all files come from; kept if not given.")] = None,
+    licence: Annotated[str | None, Parameter(help="Licence of all files [unchanged].")] = None,
+    source: Annotated[str | None, Parameter(help="Origin of all files [unchanged].")] = None,
     json: AsJson = False,
 ) -> int:
-    """Record every file's sha256, size, licence and source in assets.lock.json."""
+    """Write the sha256, size, licence and source of every file to assets.lock.json."""
     written = locks.lock(folder, licence, source)
     total = sum(entry.size for entry in written.files)
     if json:
@@ -88,7 +84,7 @@ def lock(
 
 @app.command
 def verify(folder: Folder, *, json: AsJson = False) -> int:
-    """Compare every file with assets.lock.json; exits with 2 if any is missing or changed."""
+    """Compare every file with assets.lock.json. Exit code 2 when a file is missing or changed."""
     result = locks.verify(folder)
     if json:
         print_json({"folder": str(folder), "good": result.good, **asdict(result)})
@@ -99,7 +95,7 @@ def verify(folder: Folder, *, json: AsJson = False) -> int:
             folder,
             first,
             f"{len(result.missing)} files missing and {len(result.changed)} changed of {result.checked}",
-            "Fetch them again, or lock the folder anew if the change is wanted",
+            "Fetch them again, or lock the folder again if the change is intended",
         )
     rows = [("files as locked", str(result.checked)), ("not in the lock", str(len(result.unlisted)))]
     print_rows(f"verified {folder}", rows)
@@ -108,27 +104,28 @@ def verify(folder: Folder, *, json: AsJson = False) -> int:
 
 @app.command(name="fetch")
 def fetch_assets(
-    *names: Annotated[str, Parameter(help="Assets or groups, see `datagen assets list`.")],
-    out: Annotated[Path, Parameter(help="Folder to put them in.")] = Path("assets"),
-    mirror: Annotated[
-        str | None, Parameter(help="http(s) address of a folder with the same file names.")
-    ] = None,
-    offline: Annotated[bool, Parameter(negative=(), help="Use the cache only.")] = False,
-    cache: Annotated[Path | None, Parameter(help="Folder that keeps downloads.")] = None,
+    *names: Annotated[str, Parameter(help="Assets or groups of `datagen assets list`.")],
+    out: Annotated[Path, Parameter(help="Folder for the assets.")] = Path("assets"),
+    mirror: Annotated[str | None, Parameter(help="http(s) address of a folder with the same files.")] = None,
+    offline: Annotated[bool, Parameter(negative=(), help="Use only the cache.")] = False,
+    cache: Annotated[Path | None, Parameter(help="Folder of kept downloads.")] = None,
     json: AsJson = False,
 ) -> int:
     """Download, check and unpack assets, and record them in the folder's lock file.
 
-    A broken download continues where it stopped. Files without a published digest are trusted on
-    first use: their digest goes into the lock file, and later downloads must match it.
+    An interrupted download continues where it stopped. Files without a published digest are trusted on first
+    use: their digest is recorded in the lock file, and later downloads must match it.
     """
     if not names:
-        raise InputError("assets fetch", "", "no asset is named", choices(groups()))
+        raise InputError("datagen assets fetch", "NAME", "is missing", choices(groups()))
     try:
         chosen = select(names)
     except KeyError as error:
         raise InputError(
-            "assets fetch", str(error.args[0]), "there is no such asset", choices(groups())
+            "datagen assets fetch",
+            str(error.args[0]),
+            "is not an asset",
+            choices(groups(), str(error.args[0])),
         ) from None
     kept = cache or cache_folder() / "downloads"
     console = Console(stderr=True, quiet=json)
@@ -170,6 +167,6 @@ def _trust(asset: CatalogueEntry) -> str:
 
 
 def _shown() -> list[CatalogueEntry]:
-    """The catalogue with only the first of the many scans, to keep the table short."""
+    """The catalogue with only the first of its many scans."""
     scans = [asset for asset in CATALOGUE.values() if asset.name.startswith("ycb-scans/")]
     return [asset for asset in CATALOGUE.values() if asset not in scans[1:]]

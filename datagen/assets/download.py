@@ -1,4 +1,4 @@
-"""One download over HTTP: resumed, bounded, checked, and in place only when it is whole."""
+"""One download over HTTP: resumed, limited in size, checked, and renamed only when complete."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from datagen.schemas.untrusted_files import read_regular
 
 _CHUNK_BYTES = 2**18
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
-# Answers that a later try may better; other 4xx are final.
+# Responses worth a retry; other 4xx are final.
 _PASSING = {408, 425, 429, 500, 502, 503, 504}
 
 # (bytes here so far, total or None). Also called when a download starts over.
@@ -31,7 +31,7 @@ Progress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True)
 class DownloadPolicy:
-    """How patient a download is. `pause` waits between tries."""
+    """Timeouts and retries of a download. `pause` waits between tries."""
 
     tries: int = 6  # in a row without a new byte
     first_pause_s: float = 0.5
@@ -67,18 +67,17 @@ def download(
     progress: Progress,
     policy: DownloadPolicy | None = None,
 ) -> str:
-    """Brings `url` to the file `target` and returns its sha256.
+    """Download `url` to the file `target` and return its sha256.
 
-    An earlier broken attempt (`<target>.part`) is continued by a range request, tied to the same
-    content by If-Range; where the server knows no ranges or the content changed, it starts over.
-    Bytes beyond `max_bytes` are refused, dropped connections and 5xx answers are tried again with
-    growing pauses, and only a whole file whose digest is `sha256` (where given) gets its name, by
-    an atomic rename. Raises InputError naming the address: final answers such as 404, too large,
-    wrong size or digest, no more tries.
+    An interrupted download (`<target>.part`) continues with a range request, tied to the same content by
+    If-Range; where the server supports no ranges or the content changed, it starts over. Dropped connections
+    and 5xx responses are retried with growing pauses. A complete file with the digest `sha256` (where given)
+    is renamed atomically. Raises InputError for final responses such as 404, more than `max_bytes`, a wrong
+    size or digest, and after the last try.
     """
     policy = policy or DownloadPolicy()
     if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
-        raise InputError(url, "", "not an http or https address", "Give one with --mirror")
+        raise InputError(url, "", "is not an http(s) address", "Give one with --mirror")
     target.parent.mkdir(parents=True, exist_ok=True)
     part = _PartialFile(target, url)
     failures = 0
@@ -104,7 +103,7 @@ def download(
             return digest
         got = part.length
         part.discard()
-        # The two halves of a resumed file can come from two editions; a fresh one tells.
+        # The two parts of a resumed file may come from two versions: download it again.
         if not resumed:
             wrong = (
                 f"{got:,} bytes, not {size:,}"
@@ -112,12 +111,12 @@ def download(
                 else f"sha256 {digest}, not {sha256}"
             )
             raise InputError(
-                url, "", f"not the expected file: {wrong}", "Use another --mirror, or report the change"
+                url, "", f"is not the expected file: {wrong}", "Use another --mirror, or report the change"
             )
 
 
 class _PartialFile:
-    """The unfinished file and what its content is tied to."""
+    """The unfinished file and the validator of its content."""
 
     def __init__(self, target: Path, url: str) -> None:
         self._target, self._url = target, url
@@ -168,7 +167,7 @@ def _transfer(
 ) -> None:
     """One request that appends to the part until the body ends. Raises _TransientFailure or InputError."""
     start = part.length
-    # Without a validator only a known digest can tell whether the halves belong together.
+    # Without a validator, only a known digest can show that both parts belong together.
     if start and not (part.validator or has_digest):
         part.discard()
         start = 0
@@ -205,8 +204,8 @@ def _transfer(
         raise InputError(
             url,
             "",
-            f"the server answers HTTP {error.code} {error.reason}",
-            "Use --mirror with a server that has it",
+            f"the server responds HTTP {error.code} {error.reason}",
+            "Give --mirror with a server that has it",
         ) from error
     except (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError) as error:
         raise _TransientFailure(str(getattr(error, "reason", "") or error) or type(error).__name__) from error

@@ -1,4 +1,4 @@
-"""Bringing assets of the catalogue into a folder, with a lock that says what they are."""
+"""Download assets of the catalogue into a folder with a lock file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from datagen.schemas.whole_files import whole_file
 
 @dataclass(frozen=True)
 class Fetched:
-    """What became of one asset."""
+    """The result for one asset."""
 
     name: str
     sha256: str
@@ -37,11 +37,11 @@ def fetch(
     progress: Progress = lambda here, total: None,
     policy: DownloadPolicy | None = None,
 ) -> Fetched:
-    """Downloads one asset (or takes it from the cache), unpacks it and records it in the lock.
+    """Download one asset, or take it from the cache, unpack it and record it in the lock file.
 
-    Where the publisher states no digest, the first download is trusted and its digest recorded;
-    from then on the asset must match it. `mirror` replaces everything before the file name.
-    Raises InputError: see `download` and `unpack`; with `offline`, where the cache lacks the file.
+    Where the publisher states no digest, the first download is trusted and its digest recorded; later ones
+    must match it. `mirror` replaces the address before the file name. Raises InputError as `download` and
+    `unpack` do and, with `offline`, where the cache lacks the file.
     """
     lock = (read_lock(folder) if folder.is_dir() else None) or Lock()
     recorded = next((d.sha256 for d in lock.downloads if d.name == asset.name), None)
@@ -52,8 +52,8 @@ def fetch(
     from_cache = digest is not None and expected in (None, digest)
     if digest is None or not from_cache:
         if offline:
-            problem = "not in the cache" if digest is None else f"sha256 {digest}, not {expected}"
-            raise InputError(kept, "", problem, f"Put the file of {url} there, or run without --offline")
+            problem = "is not in the cache" if digest is None else f"has sha256 {digest}, not {expected}"
+            raise InputError(kept, "", problem, f"Put the file of {url} there, or omit --offline")
         digest = download(
             url,
             kept,
@@ -77,7 +77,7 @@ def fetch_all(
     fetch_one: Callable[[CatalogueEntry], Fetched],
     report: Callable[[Fetched], None],
 ) -> list[Fetched]:
-    """Fetches in order after checking that the disk can hold what is known of the sizes."""
+    """Fetch assets in order, after a check that the disk has room for the known sizes."""
     known = sum(asset.size or 0 for asset in assets)
     place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
     free = shutil.disk_usage(place).free
@@ -86,7 +86,7 @@ def fetch_all(
             folder,
             "",
             f"{known:,} bytes are needed and {free:,} are free",
-            "Free some space or use another disk",
+            "Free some space, or use another disk",
         )
     done: list[Fetched] = []
     for asset in assets:
@@ -96,7 +96,7 @@ def fetch_all(
 
 
 def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
-    """Puts the download in its place; returns the files relative to `folder`."""
+    """Move or unpack the download; return its files relative to `folder`."""
     home = folder / asset.into
     if asset.archive:
         unpacked = unpack(kept, home, Limits(asset.max_unpacked_bytes))
@@ -128,5 +128,5 @@ def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEnt
 
 
 def groups() -> list[str]:
-    """Names that `fetch` takes: single assets and groups, without the members of groups."""
+    """Names for `fetch`: single assets and groups, without the members of groups."""
     return sorted({name.split("/")[0] for name in CATALOGUE})

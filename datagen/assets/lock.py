@@ -1,8 +1,8 @@
-"""The lock file of an asset folder: what every file must be, and whence it came.
+"""The lock file of an asset folder: digests, licences and origins of its files.
 
-`assets.lock.json` lies in the folder itself and lists each file's relative path, sha256, size,
-licence and source, and each download's address and digest. A download whose publisher states no
-digest is trusted on first use: its digest is recorded here, and later fetches must match it.
+`assets.lock.json` is in the folder itself and lists each file's relative path, sha256, size, licence and
+source, and each download's address and digest. A download whose publisher states no digest is trusted on
+first use: its digest is recorded here, and later fetches must match it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class LockedFile(StoredRecord):
 
 
 class LockedDownload(StoredRecord):
-    """One fetched file or archive. `trust` says who vouched for the digest."""
+    """One fetched file or archive. `trust` is the origin of the digest."""
 
     name: str
     url: str
@@ -58,7 +58,7 @@ class Lock(StoredRecord):
 
 @dataclass(frozen=True)
 class Verification:
-    """What differs from the lock: relative paths, sorted."""
+    """Differences from the lock file: relative paths, sorted."""
 
     checked: int
     missing: tuple[str, ...]
@@ -67,29 +67,29 @@ class Verification:
 
     @property
     def good(self) -> bool:
-        """Whether every listed file is there unchanged; unlisted files do no harm."""
+        """Whether every listed file exists unchanged; unlisted files are allowed."""
         return not self.missing and not self.changed
 
 
 def sha256_of(path: Path) -> str:
     """The sha256 of a file's bytes, 64 hexadecimal digits."""
-    with open_regular(path, _MAX_FILE_BYTES, "Put the file back, or fetch it again") as file:
+    with open_regular(path, _MAX_FILE_BYTES, "Restore the file, or fetch it again") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_lock(folder: Path) -> Lock | None:
-    """The folder's lock, or None where there is none. Raises InputError for a broken one."""
+    """The folder's lock file, or None where there is none. Raises InputError for a damaged one."""
     path = folder / LOCK_NAME
     if not path.exists():
         return None
-    data = read_regular(path, _MAX_LOCK_BYTES, "Remove it and write it anew: datagen assets lock")
+    data = read_regular(path, _MAX_LOCK_BYTES, "Remove it and write it again: datagen assets lock DIR")
     try:
         lock = Lock.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(step) for step in first["loc"])
         raise InputError(
-            path, field, first["msg"], "Restore it or write it anew: datagen assets lock"
+            path, field, first["msg"], "Restore it, or write it again: datagen assets lock DIR"
         ) from error
     for number, entry in enumerate(lock.files):
         pure = PurePosixPath(entry.path)
@@ -97,14 +97,14 @@ def read_lock(folder: Path) -> Lock | None:
             raise InputError(
                 path,
                 f"files.{number}.path",
-                f"{entry.path[:80]!r} leaves the folder",
+                f"{entry.path[:80]!r} is outside the folder",
                 "Restore the lock file",
             )
     return lock
 
 
 def write_lock(folder: Path, lock: Lock) -> Path:
-    """Replaces the folder's lock file atomically."""
+    """Replace the folder's lock file atomically."""
     path = folder / LOCK_NAME
     with whole_file(path, durable=True) as file:
         file.write(json.dumps(lock.model_dump(), indent=1, sort_keys=True).encode() + b"\n")
@@ -112,9 +112,9 @@ def write_lock(folder: Path, lock: Lock) -> Path:
 
 
 def lock(folder: Path, licence: str | None = None, source: str | None = None) -> Lock:
-    """Writes a lock of all files as they are now and returns it.
+    """Write a lock file of all files as they are now and return it.
 
-    Licence and source of files known before are kept, unless given; downloads are kept too.
+    Licence and source of known files are kept, unless given; downloads are kept too.
     """
     before = read_lock(_folder(folder)) or Lock()
     known = {entry.path: entry for entry in before.files}
@@ -132,17 +132,17 @@ def lock(folder: Path, licence: str | None = None, source: str | None = None) ->
             )
         )
     if not files:
-        raise InputError(folder, "", "there are no files to lock", "Name the folder of assets")
+        raise InputError(folder, "", "has no files to lock", "Name the folder of assets")
     after = Lock(files=tuple(files), downloads=before.downloads)
     write_lock(folder, after)
     return after
 
 
 def verify(folder: Path) -> Verification:
-    """Compares every listed file's size and sha256 with the folder. Raises InputError without a lock."""
+    """Compare every listed file's size and sha256 with the folder. InputError without a lock file."""
     locked = read_lock(_folder(folder))
     if locked is None:
-        raise InputError(folder, LOCK_NAME, "there is no lock file", "Write one: datagen assets lock DIR")
+        raise InputError(folder, LOCK_NAME, "does not exist", "Write it: datagen assets lock DIR")
     missing: list[str] = []
     changed: list[str] = []
     for entry in locked.files:
@@ -158,12 +158,12 @@ def verify(folder: Path) -> Verification:
 
 def _folder(folder: Path) -> Path:
     if not folder.is_dir():
-        raise InputError(folder, "", "there is no such folder", "Name the folder of assets")
+        raise InputError(folder, "", "does not exist", "Name the folder of assets")
     return folder
 
 
 def _files(folder: Path) -> list[str]:
-    """All files below a folder, relative and sorted; hidden ones and the lock itself left out."""
+    """All files below a folder, relative and sorted, except hidden ones and the lock file."""
     found: list[str] = []
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -172,5 +172,5 @@ def _files(folder: Path) -> list[str]:
             (base / name).as_posix() for name in names if not name.startswith(".") and name != LOCK_NAME
         ]
         if len(found) > _MAX_FILES:
-            raise InputError(folder, "", f"more than {_MAX_FILES:,} files", "Name the folder of assets")
+            raise InputError(folder, "", f"has more than {_MAX_FILES:,} files", "Name the folder of assets")
     return sorted(found)

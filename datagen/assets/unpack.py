@@ -1,4 +1,4 @@
-"""Unpacking archives that may be hostile: nothing lands outside the folder, nothing without end."""
+"""Unpack untrusted archives: no file outside the folder, and bounded sizes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from datagen.schemas.archives import DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
 
 _CHUNK_BYTES = 2**20
-# zipfile reads its list of members in one piece, tarfile a header's extension, which may hold another one.
+# zipfile reads its list of members at once, tarfile a header's extension, which may hold another one.
 _ZIP_LIST = 16 * 2**20
 _ADVICE = "Do not use this archive; fetch it from its publisher"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What an archive may grow to."""
+    """The largest result of an archive."""
 
     total_bytes: int
     files: int = 200_000
@@ -38,12 +38,11 @@ class _Member:
 
 
 def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
-    """Unpacks a zip, tar or gzipped tar into `folder`; returns the files, relative, sorted.
+    """Unpack a zip, tar or gzipped tar into `folder`; return the files, relative and sorted.
 
-    Everything is unpacked beside its place and moved there when the whole archive was good, so a
-    refused archive leaves nothing behind; existing files of the same names are replaced. Only
-    plain files and folders are allowed: absolute names, `..`, links, devices, repeated names and
-    more than `limits` raise InputError naming the archive and the member.
+    Members are unpacked into a temporary folder and moved when the whole archive is good, so a refused
+    archive leaves no file; existing files of the same names are replaced. Only plain files and folders are
+    allowed: absolute names, `..`, links, devices, repeated names and sizes above `limits` raise InputError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".unpack-", dir=folder) as staging_name:
@@ -53,18 +52,18 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
         try:
             for member in _members(archive, limits):
                 relative = _safe_name(archive, member.name)
-                # Names that differ in case alone are one file on some systems.
+                # Names that differ only in case are one file on some systems.
                 if names.setdefault(str(relative).casefold(), relative) is not relative:
-                    raise InputError(archive, str(relative), "the name occurs twice in the archive", _ADVICE)
+                    raise InputError(archive, str(relative), "is in the archive twice", _ADVICE)
                 if len(names) > limits.files:
-                    raise InputError(archive, "", f"more than {limits.files:,} files", _ADVICE)
+                    raise InputError(archive, "", f"has more than {limits.files:,} files", _ADVICE)
                 total += _copy(archive, member, staging / relative, limits.total_bytes - total)
         except InputError:
             raise
         except (tarfile.TarError, gzip.BadGzipFile, RecursionError, *DAMAGED_ZIP) as error:
             raise _damaged(archive, error) from error
         except OSError as error:
-            if error.errno != errno.EINVAL:  # an offset before the archive begins; all else is the disk's
+            if error.errno != errno.EINVAL:  # an offset before the archive's start; else the disk
                 raise
             raise _damaged(archive, error) from error
         files = sorted(names.values())
@@ -78,7 +77,7 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
 
 def _damaged(archive: Path, error: Exception) -> InputError:
     mend = "Remove it from the cache and fetch it again"
-    return InputError(archive, "", f"the archive is damaged ({error})", mend)
+    return InputError(archive, "", f"is damaged ({error})", mend)
 
 
 def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
@@ -93,12 +92,12 @@ def _members(archive: Path, limits: Limits) -> Iterator[_Member]:
         with tarfile.open(fileobj=careful, mode="r:") as tar:
             for count, info in enumerate(tar):
                 if count > 2 * limits.files:
-                    raise InputError(archive, "", f"more than {2 * limits.files:,} entries", _ADVICE)
+                    raise InputError(archive, "", f"has more than {2 * limits.files:,} entries", _ADVICE)
                 if info.isdir():
                     _safe_name(archive, info.name)
                     continue
                 if not info.isreg() or info.issparse():
-                    raise InputError(archive, info.name, "a link, device or special file", _ADVICE)
+                    raise InputError(archive, info.name, "is a link, device or special file", _ADVICE)
                 if info.size > limits.total_bytes:
                     raise InputError(archive, info.name, f"claims {info.size:,} bytes", _ADVICE)
                 stream = tar.extractfile(info)
@@ -117,7 +116,7 @@ def _zip_members(archive: Path, limits: Limits) -> Iterator[_Member]:
         for info in packed.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)
             if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-                raise InputError(archive, info.filename, "a link, device or special file", _ADVICE)
+                raise InputError(archive, info.filename, "is a link, device or special file", _ADVICE)
             _safe_name(archive, info.filename)
             if info.is_dir():
                 continue
@@ -137,27 +136,27 @@ def _safe_name(archive: Path, name: str) -> PurePosixPath:
         or len(name) > 1000
     )
     if hostile:
-        raise InputError(archive, repr(name[:80]), "the name would leave the folder", _ADVICE)
+        raise InputError(archive, repr(name[:80]), "is a path outside the folder", _ADVICE)
     return path
 
 
 def _copy(archive: Path, member: _Member, target: Path, room: int) -> int:
-    """Copies at most `room` bytes, whatever size the archive claims; returns how many there were."""
+    """Copy at most `room` bytes, whatever size the archive claims; return their number."""
     target.parent.mkdir(parents=True, exist_ok=True)
     copied = 0
     with target.open("xb") as out:
         while chunk := member.stream.read(_CHUNK_BYTES):
             copied += len(chunk)
             if copied > room:
-                raise InputError(archive, member.name, "the archive unpacks to more than is allowed", _ADVICE)
+                raise InputError(archive, member.name, "unpacks to more bytes than allowed", _ADVICE)
             out.write(chunk)
     if copied != member.size:
-        raise InputError(archive, member.name, f"{copied:,} of {member.size:,} bytes are there", _ADVICE)
+        raise InputError(archive, member.name, f"has {copied:,} of {member.size:,} bytes", _ADVICE)
     return copied
 
 
 def _refuse_links(archive: Path, folder: Path, relative: PurePosixPath) -> None:
-    """A link that already stands in the folder must not carry a file out of it."""
+    """Raise InputError for an existing link in the folder that leads outside."""
     step = folder
     for part in relative.parts:
         step = step / part
@@ -176,7 +175,7 @@ class _Careful:
     def read(self, size: int = -1) -> bytes:
         data = b"" if size > self._largest else self._stream.read(size if size >= 0 else self._largest + 1)
         if max(size, len(data)) > self._largest:
-            raise InputError(self._archive, "", "a header of absurd size", _ADVICE)
+            raise InputError(self._archive, "", "has a header that is too large", _ADVICE)
         return data
 
     def seek(self, offset: int, whence: int = 0) -> int:

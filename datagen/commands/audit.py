@@ -1,4 +1,4 @@
-"""`datagen audit`: what labels cost, what the paper's schedule would cost here, and how they agree."""
+"""`datagen audit`: the cost of labels, its projection to the paper's 180,000, and their agreement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from datagen.console.printing import print_json
 from datagen.reports.agreement import common_candidates, compare, outcome_report
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
 from datagen.reports.label_arrays import join_labelled, read_labelled
-from datagen.reports.specification_summary import is_disturbed
+from datagen.reports.specification_summary import is_disturbed, made_from
 from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.cost import STAGES
 from datagen.schemas.errors import InputError
@@ -26,32 +26,39 @@ from datagen.schemas.specification import Specification
 PAPER_LABELS = 180_000
 PAPER_DAYS = {"heuristic": 3.0, "sim": 21.0}
 
-# The farther along, the closer to the truth: it is what the others are held against.
+# In ascending fidelity: the later of two is the reference for the earlier.
 _FIDELITY = ("heuristic", "plan", "sim")
 
 
 def audit(
-    runs: Annotated[list[str], Parameter(negative=(), help="Runs, of one label source or of several.")],
+    runs: Annotated[
+        list[str], Parameter(name="RUN...", negative=(), help="Runs of one or several label sources.")
+    ],
+    /,
     *,
     candidates: Annotated[
         Literal["grid", "clear", "in-range"],
-        Parameter(help="Candidates whose outcomes and agreement are counted; grid takes all there are."),
+        Parameter(help="Candidates whose outcomes and agreement are counted; grid: all."),
     ] = "grid",
     json: AsJson = False,
 ) -> int:
-    """What labels cost: seconds per label by stage, waste, and a projection to 180,000; how they agree.
+    """Show the cost of labels by stage, the waste, and a projection to 180,000 labels.
 
-    Seconds are summed over workers: two workers that are busy for a minute cost two minutes. Runs that
-    labelled the same candidates (--scenes-from) are compared pair by pair.
+    Seconds are summed over workers: two workers that are busy for a minute cost two minutes. Runs with
+    labels of the same candidates (--scenes-from) are compared pair by pair.
+
+    For example: datagen audit runs/first
     """
     if not runs:
-        raise InputError("datagen audit", "RUN", "no run is named", "Name one or more run folders")
+        raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")
     opened = [run for place in runs for run in open_runs(place)]
     by_source: dict[str, list[Run]] = {}
     for run in sorted(opened, key=lambda run: _fidelity(run.manifest.spec)):
         by_source.setdefault(run.manifest.spec.label_source, []).append(run)
     sources = [
-        audit_report(account_for(group), source) | _outcomes(group, candidates)
+        audit_report(account_for(group), source)
+        | {"made_from": made_from(run.manifest for run in group)}
+        | _outcomes(group, candidates)
         for source, group in by_source.items()
     ]
     costs = ratios(sources)
@@ -69,7 +76,7 @@ def audit(
 
 
 def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For every two label sources, how many times as much a label of the second costs."""
+    """Return, for every two label sources, the cost of a label of the second divided by that of the first."""
     return [
         {
             "source": second["label_source"],
@@ -82,9 +89,9 @@ def ratios(sources: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pairs(runs: Sequence[Run], candidates: str) -> list[dict[str, Any]]:
-    """How every two runs that labelled the same candidates agree; the later one counts as the truth.
+    """Return the agreement of every two runs with labels of the same candidates; the later is the reference.
 
-    A correct label of the first costs its label's time over its accuracy, of the second its own.
+    The cost of a correct label of the first run is its cost per label divided by its accuracy.
     """
     found: list[dict[str, Any]] = []
     for first, second in combinations(runs, 2):
@@ -125,7 +132,7 @@ def _who(run: Run) -> dict[str, Any]:
 
 
 def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:
-    """The outcomes of runs whose labels have a cause; nothing for others."""
+    """Counts of outcomes, for runs whose labels have one; empty for others."""
     if not any(f.name == "outcome" for f in runs[0].schema.sample_fields):
         return {}
     read = [labelled for run in runs if (labelled := read_labelled(run)) is not None]
@@ -136,7 +143,7 @@ def _outcomes(runs: Sequence[Run], candidates: str) -> dict[str, Any]:
 
 
 def audit_report(spending: Spending, source: str) -> dict[str, Any]:
-    """The audit as plain values; times in seconds, sizes in bytes."""
+    """Return the audit as plain values; times in seconds, sizes in bytes."""
     labels = spending.labels
     stages: dict[str, dict[str, float]] = {
         stage: {"wall_s": spending.useful.stage_wall_s[stage], "cpu_s": spending.useful.stage_cpu_s[stage]}

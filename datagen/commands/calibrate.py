@@ -1,4 +1,4 @@
-"""`datagen calibrate`: the heuristic's parameters that agree best with labels of grasp trials."""
+"""`datagen calibrate`: fit the heuristic's parameters to labels of grasp trials."""
 
 from __future__ import annotations
 
@@ -35,50 +35,51 @@ _METRICS = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
 
 @dataclass(frozen=True, eq=False)
 class _Calibrated:
-    """Both rules and how they agree with the labels: the new one also in houses it was not fitted on."""
+    """Parameters before and after the fit, and their agreement with the trial labels."""
 
     before: HeuristicParams
     after: HeuristicParams
     by_fold: tuple[HeuristicParams, ...]
-    agreements: dict[str, Agreement]  # before, after (houses left out), fitted (on these very labels)
+    agreements: dict[str, Agreement]  # before, after (on houses left out), fitted (on the fitted labels)
 
 
 def calibrate(
-    runs: Annotated[list[str], Parameter(negative=(), help="Runs of sim (or plan) labels.")],
+    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs of sim or plan labels.")],
+    /,
     *,
-    out: Annotated[Path, Parameter(help="The configuration to write: a .toml file that is not there yet.")],
-    candidates: Annotated[Sets, Parameter(help="The candidates that are to be labelled alike.")] = "clear",
+    out: Annotated[Path, Parameter(help="The .toml file to write; it must not exist.")],
+    candidates: Annotated[Sets, Parameter(help="The candidates to fit on.")] = "clear",
     distance: Annotated[
-        Literal[Form, "any"], Parameter(help="What the distance score is a function of; any takes the best.")
+        Literal[Form, "any"], Parameter(help="Distance that the score depends on; any: the best.")
     ] = "planar",
     objective: Annotated[
-        Literal["balanced", "accuracy"], Parameter(help="Balanced accuracy, or the share of right labels.")
+        Literal["balanced", "accuracy"], Parameter(help="What is maximised: balanced accuracy or accuracy.")
     ] = "balanced",
     fit_alpha: Annotated[
-        bool, Parameter(negative=(), help="Fit the weight of the visibility score too.")
+        bool, Parameter(negative=(), help="Also fit the weight of the visibility score.")
     ] = False,
     split_check: Annotated[
-        bool, Parameter(negative=(), help="Refuse runs of other houses than --split val, instead of warning.")
+        bool, Parameter(negative=(), help="Fail, instead of warn, where a run is not of --split val.")
     ] = False,
-    bootstrap: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
-    ] = 1000,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of folds and resamples.")] = 0,
+    bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the folds and the resamples.")] = 0,
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
-    """Fit what the paper leaves open in its rule, mu, sigma_l, sigma_r and tau, to labels of grasp trials.
+    """Fit mu, sigma_l, sigma_r and tau of the distance-visibility rule to labels of grasp trials.
 
-    Before and after are told over a named set of candidates, after always in houses that were left out of
-    the fit, with intervals by resampling scenes. FILE has the section [heuristic] that `datagen submit
-    heuristic --config FILE` and `datagen relabel RUN --config FILE` take.
+    The report compares the agreement before and after the fit, the latter on houses left out of the fit, with
+    intervals by resampling scenes. The file has the section [heuristic] that `datagen submit heuristic
+    --config FILE` and `datagen relabel RUN --config FILE` accept.
+
+    For example: datagen calibrate runs/sim-val --out rule.toml
     """
     _refuse_odd(out, bootstrap, seed)
     specs, warnings = _specifications(runs, candidates, split_check)
     from datagen.train.heuristic_fit import FOLDS, FORMS, refuse_too_little
 
     if specs[0].heuristic.alpha == 1 and not fit_alpha:
-        problem = "1 in these runs: distance has no weight, and nothing to fit"
+        problem = "is 1 in these runs, so the distance score has no weight to fit"
         raise InputError(runs[0], "heuristic.alpha", problem, "Give --fit-alpha")
     trials = _read(runs, candidates, allow_incomplete)
     refuse_too_little(trials, ", ".join(runs))
@@ -112,8 +113,8 @@ def calibrate(
     title = (
         f"{len(trials):,} {candidates} candidates of {trials.n_scenes:,} scenes in {report['houses']} houses"
     )
-    print_rows(f"{title}: {out}", list(_rows(report)), ("", "before", "after", "gain", "on the fitted"))
-    print_rows("[heuristic]", list(_parameter_rows(made)), ("", "before", "after", "in the folds"))
+    print_rows(f"{title}: {out}", list(_rows(report)), ("", "before", "after", "gain", "fitted houses"))
+    print_rows("[heuristic]", list(_parameter_rows(made)), ("", "before", "after", "over folds"))
     return 0
 
 
@@ -121,13 +122,13 @@ def _refuse_odd(out: Path, bootstrap: int, seed: int) -> None:
     refuse_odd_draws(bootstrap, seed)
     refuse_output(out, "--out", ".toml")
     if out.exists() or out.is_symlink():
-        raise InputError(out, "--out", "is there already", "Choose another name, or remove it first")
+        raise InputError(out, "--out", "already exists", "Choose another name, or remove it first")
 
 
 def _specifications(
     places: Sequence[str], candidates: Sets, split_check: bool
 ) -> tuple[list[Specification], list[str]]:
-    """Those of all runs, and what is odd about them. InputError where labels do not belong together."""
+    """Specifications of all runs, and warnings. InputError where their labels cannot be fitted together."""
     found: list[tuple[str, Specification]] = [
         (place, run.manifest.spec) for place in places for run in open_runs(place)
     ]
@@ -136,34 +137,34 @@ def _specifications(
     warnings: list[str] = []
     for place, spec in found:
         if spec.label_source == "heuristic":
-            problem = "heuristic labels are the rule itself, and nothing to fit it to"
-            mend = "Name a run of its scenes with trials: datagen submit sim --scenes-from"
+            problem = "heuristic labels come from the rule itself and cannot calibrate it"
+            mend = "Name a run with trials of its scenes: datagen submit sim --scenes-from RUN"
             raise InputError(place, "label_source", problem, mend)
         if spec.label_source != first.label_source:
-            problem = f"{spec.label_source} labels, and those of {first_place} are {first.label_source}"
-            raise InputError(place, "label_source", problem, "Calibrate to one kind of labels")
+            problem = f"is {spec.label_source}, but {first_place} has {first.label_source} labels"
+            raise InputError(place, "label_source", problem, "Name runs of one label source")
         if spec.heuristic != first.heuristic:
-            problem = f"another rule than that of {first_place}, so that there is no one before"
-            raise InputError(place, "heuristic", problem, "Calibrate the two apart")
+            problem = f"differs from that of {first_place}"
+            raise InputError(place, "heuristic", problem, "Calibrate the two runs separately")
         if spec.scenes_hash in scenes:
-            problem = "its scenes are those of another run here"
-            raise InputError(place, "scenes", problem, "Name every run once, and labels of its scenes once")
+            problem = "are also in another run of this command"
+            raise InputError(place, "scenes", problem, "Name each set of scenes once")
         scenes.add(spec.scenes_hash)
         held = spec.candidates.within or "grid"
         if CANDIDATE_SETS.index(candidates) > CANDIDATE_SETS.index(held):
-            problem = f"the run was made of {held} candidates, not of {candidates}"
+            problem = f"the run has {held} candidates, not {candidates}"
             raise InputError(place, "--candidates", problem, f"Give --candidates {held}")
         if spec.split != "val":
-            problem = f"houses of split {spec.split}, and parameters are chosen on val"
+            problem = f"is {spec.split}, but parameters are chosen on val"
             if split_check:
-                mend = "Make a run with `datagen submit --split val`, or leave --split-check out"
+                mend = "Make a run with `datagen submit --split val`, or omit --split-check"
                 raise InputError(place, "split", problem, mend)
-            warnings.append(f"{place}: {problem}: evaluate on other houses")
+            warnings.append(f"{place}: split {problem}: evaluate on other houses")
     return [spec for _, spec in found], warnings
 
 
 def _read(places: Sequence[str], candidates: Sets, allow_incomplete: bool) -> Trials:
-    """The labels of all runs over the named set of candidates."""
+    """The labels of all runs over the chosen set of candidates."""
     import numpy as np
 
     from datagen.train.heuristic_fit import Trials
@@ -204,7 +205,7 @@ def _calibrate(
 
     after = refit(trials)
     if len(set(trials.said(after).tolist())) == 1:
-        problem = f"the best such rule calls all {len(trials):,} candidates alike"
+        problem = f"the best parameters give all {len(trials):,} candidates one label"
         mend = "Choose --objective balanced, another --distance, or other --candidates"
         raise InputError("datagen calibrate", "--objective", problem, mend)
     step()
@@ -268,7 +269,7 @@ def _parameter_rows(made: _Calibrated) -> Iterator[tuple[str, ...]]:
 
 
 def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
-    """The section, complete, below a comment that says where its numbers come from."""
+    """The complete section below a comment with the origin of its numbers."""
     runs = [
         f"{run['spec_hash']}: {run['label_source']}{', disturbed' if run['disturbed'] else ''}, "
         f"split {run['split']}, seed {run['seed']}, {run['candidates']} candidates"
@@ -300,10 +301,10 @@ def _told(report: dict[str, Any], metric: str) -> str:
 
 
 def _write_new(path: Path, text: str) -> None:
-    """Make the file; what came there meanwhile stays."""
+    """Create the file; InputError where another process created it meanwhile."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
         mend = "Choose another name, or remove it first"
-        raise InputError(path, "--out", "is there already", mend) from None
+        raise InputError(path, "--out", "already exists", mend) from None

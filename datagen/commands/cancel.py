@@ -1,4 +1,4 @@
-"""`datagen cancel`: ask the jobs of a run to stop, and wait for their end."""
+"""`datagen cancel`: ask the jobs of a run to stop, and wait until they have ended."""
 
 from __future__ import annotations
 
@@ -22,40 +22,42 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import open_storage
 
 _LOOK_S = 1.0
-# Its driver looks for requests every few seconds; beyond this one of a detached job has not answered.
+# A driver polls for requests every few seconds; a detached one that takes longer does not answer.
 _ANSWER_WITHIN_S = 30.0
-# Longer than a driver is silent that works; one without workers of its own hears between two shards.
+# Longer than a working driver is silent; one without worker processes polls between two shards.
 _GIVE_UP_S = 180.0
 
 
 def cancel(
     run: Annotated[
-        str | None, Parameter(help="The run's folder or s3:// address; also of merged runs.")
+        str | None, Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")
     ] = None,
     *,
     now: Annotated[
-        bool, Parameter(negative=(), help="End what is in flight by force, instead of letting it commit.")
+        bool, Parameter(negative=(), help="Kill the running attempts instead of letting them commit.")
     ] = False,
     head: Annotated[
-        bool, Parameter(negative=(), help="End the Ray that stays on this machine for detached jobs.")
+        bool, Parameter(negative=(), help="Stop the Ray head of this machine that runs detached jobs.")
     ] = False,
     json: AsJson = False,
 ) -> int:
-    """Ask every job at work on a run to stop, and wait until it has: what is committed stays.
+    """Ask every job of a run to stop, and wait until it has. Committed shards are kept.
 
-    A job on another machine is asked in the same way. Detached jobs whose driver does not answer are
-    ended through Ray. A job that is not heard for 3 minutes is waited for no longer. Ctrl-C ends the
-    waiting. Either way the request stands. Exit code: 0 when every job has ended, 1 when one has not.
+    Jobs on other machines are asked in the same way. A detached job whose driver does not answer is stopped
+    through Ray. Waiting ends after 3 minutes without a sign of a job, or with Ctrl-C; the request stays
+    in force. Exit code 0 when every job has ended, 1 when one has not.
+
+    For example: datagen cancel runs/first
     """
     if head:
         if run is not None:
-            problem = "--head is of this machine, and not of a run"
+            problem = "--head concerns this machine and not a run"
             raise InputError("datagen cancel", run, problem, "Give one of the two")
         return _cancel_head(now)
     if run is None:
-        raise InputError("datagen cancel", "RUN", "no run is named", "Name one, or give --head")
+        raise InputError("datagen cancel", "RUN", "is missing", "Name a run, or give --head")
     place = open_storage(run, probe=False, create=False)
-    open_runs(place)  # refuses what is none
+    open_runs(place)  # InputError where there is no run
     jobs = Jobs(place)
     asked = [job for job in jobs.all() if job.health() in ("live", "silent")]
     for job in asked:
@@ -65,22 +67,22 @@ def cancel(
     if json:
         print_json({"run": place.url, "jobs": [job_report(job) for job in ended]})
     elif not ended:
-        print_rows(f"cancel {run}", [("jobs", "none is at work")])
+        print_rows(f"cancel {run}", [("jobs", "none is running")])
     else:
         print_rows(f"cancel {run}", [(job.id, health_line(job)) for job in ended])
         if not living:
-            sys.stdout.write(f"go on with: {command_line(['resume', run])}\n")
+            sys.stdout.write(f"Resume with: {command_line(['resume', run])}\n")
     for job in living:
         _say(
-            f"{run}: job {job.id} was asked to stop and has not ended, heard "
-            f"{seconds(job.silence().total_seconds())} ago. The request stands; to end the job by force: "
+            f"{run}: job {job.id} was asked to stop and has not ended; its last sign was "
+            f"{seconds(job.silence().total_seconds())} ago. To end it by force: "
             f"kill -9 {job.record.pid} on {job.record.host}, then {command_line(['resume', run])}"
         )
     return 1 if living else 0
 
 
 def _await_end(jobs: Jobs, job: StoredJob, say: Callable[[str], None]) -> StoredJob:
-    """The job when it has ended, is dead, or does not answer."""
+    """Return the job once it has ended, is dead, or does not answer."""
     since_s, told, stopped = time.monotonic(), "", False
     while True:
         job = jobs.get(job.id) or job
@@ -108,7 +110,7 @@ def _answers(job: StoredJob) -> bool:
 
 
 def _stop_submission(job: StoredJob) -> None:
-    """End a detached job through Ray; where Ray is gone too, so is the job."""
+    """Stop a detached job through Ray; without Ray the job is gone too."""
     try:
         jobs_api_of(job.record.jobs_api).stop(job.record.submission)
     except InputError as error:
@@ -120,13 +122,13 @@ def _cancel_head(now: bool) -> int:
     if head is not None and not now:
         working = open_ray_jobs(head.jobs_api, head.token).at_work()
         if working:
-            mend = "Cancel them first, or give --now to end them by force"
+            mend = "Cancel them first, or give --now to kill them"
             raise InputError(
-                "--head", "", f"at work: {counted(len(working), 'job')}, first {working[0][:200]}", mend
+                "--head", "", f"{counted(len(working), 'job')} running, first {working[0][:200]}", mend
             )
     began_s = time.monotonic()
     ended = stop_head()
-    said = f"ended after {seconds(time.monotonic() - began_s)}" if ended else "none runs for this user"
+    said = f"stopped after {seconds(time.monotonic() - began_s)}" if ended else "none runs for this user"
     print_rows("Ray for detached jobs", [("head", said)])
     return 0
 

@@ -1,4 +1,4 @@
-"""`datagen evaluate`: models and baselines held against simulated labels, beside the paper's numbers."""
+"""`datagen evaluate`: compare models and baselines on simulated labels, with the paper's numbers."""
 
 from __future__ import annotations
 
@@ -18,49 +18,55 @@ from datagen.schemas.whole_files import whole_file
 def evaluate(
     places: Annotated[
         list[str],
-        Parameter(negative=(), help="Checkpoints of `datagen train`, and runs of sim (or plan) labels."),
+        Parameter(
+            name="PATH...",
+            negative=(),
+            help="Checkpoints of `datagen train`, and runs of sim or plan labels.",
+        ),
     ],
+    /,
     *,
     candidates: Annotated[
         list[Literal["grid", "clear", "in-range"]] | None,
-        Parameter(negative=(), help="A set of candidates to tell of; repeat it for more [all in the runs]."),
+        Parameter(negative=(), help="Candidate set to report; repeat for more [all in the runs]."),
     ] = None,
     fit: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="A run in validation houses, to fit baselines on; repeat it for more."),
+        Parameter(negative=(), help="Run in validation houses to fit baselines on; repeat for more."),
     ] = None,
     baselines: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="A baseline beside the models, or none; repeat it for more [all]."),
+        Parameter(negative=(), help="Baseline to compare with, or none; repeat for more [all]."),
     ] = None,
     detector: Annotated[
-        Path | None, Parameter(help="Folder of a zero-shot object detector, for the baseline with one.")
+        Path | None, Parameter(help="Folder of a zero-shot object detector, for the detector baseline.")
     ] = None,
     heuristic: Annotated[
-        Path | None,
-        Parameter(help="Parameters of the analytic baseline, as `datagen calibrate` writes them."),
+        Path | None, Parameter(help="Parameters of the analytic baseline, from `datagen calibrate`.")
     ] = None,
-    bootstrap: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Resamples of scenes behind each interval.")
-    ] = 1000,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of resamples and of the scenes shown.")] = 0,
+    bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the resamples and example scenes.")] = 0,
     allow_seen_houses: Annotated[
-        bool, Parameter(negative=(), help="Tell apart of houses that were trained on, instead of refusing.")
+        bool, Parameter(negative=(), help="Report training houses separately instead of failing.")
     ] = False,
     allow_incomplete: AllowIncomplete = False,
     threads: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Threads that models compute on [torch's choice].")
+        int | None, WHOLE_NUMBER, Parameter(help="CPU threads of the models [chosen by torch].")
     ] = None,
-    html: Annotated[Path | None, Parameter(help="Write a page with tables, curves and grids.")] = None,
+    html: Annotated[
+        Path | None, Parameter(help="HTML page to write, with tables, curves and example grids.")
+    ] = None,
     json: AsJson = False,
 ) -> int:
-    """How good models are, beside baselines and the paper: accuracy, reach, grid selection, calibration.
+    """Compare models with baselines and the paper: accuracy, reach, grid selection and calibration.
 
-    Methods are compared over named sets of candidates (grid: all cells; clear: where the base fits; in-range:
-    those within the arm's reach too), with intervals by resampling scenes. Files are checkpoints, folders
-    and s3:// addresses runs. A house that a model was trained on is refused.
+    Methods are compared over candidate sets (grid: all cells; clear: where the base fits; in-range: clear and
+    within the arm's reach), with intervals by resampling scenes. Files are checkpoints; folders and s3://
+    addresses are runs. Runs with a house that a model was trained on are refused.
+
+    For example: datagen evaluate model.ckpt runs/sim-test --html report.html
     """
-    # Imported here: other verbs wait neither for these nor for torch.
+    # Imported here, so that other verbs do not wait for them and for torch.
     import numpy as np
 
     from datagen.evaluation_report.baseline_methods import baseline_methods, read_heuristic
@@ -92,8 +98,8 @@ def evaluate(
     )
     evaluated = [*baseline_set.baselines, *models]
     if not evaluated:
-        mend = "Name a checkpoint, or leave --baselines out"
-        raise InputError("datagen evaluate", "CKPT", "there is nobody to evaluate", mend)
+        mend = "Name a checkpoint, or omit --baselines"
+        raise InputError("datagen evaluate", "PATH", "no model or baseline given", mend)
     with counting("scenes", json) as seen:
         total, done = sum(place.stream.n_scenes for place in opened), 0
 
@@ -134,6 +140,6 @@ def evaluate(
 def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:
     refuse_odd_draws(bootstrap, seed)
     if threads is not None and not 1 <= threads <= 1024:
-        raise InputError("--threads", str(threads), "not a usable number of threads", "Give 1 or more")
+        raise InputError("--threads", str(threads), "is below 1", "Give 1 or more")
     if html is not None:
         refuse_output(html, "--html", ".html", ".htm")

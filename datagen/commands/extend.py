@@ -1,4 +1,4 @@
-"""`datagen extend`: want more labels of a run, or of merged runs, and make them."""
+"""`datagen extend`: raise the number of labels of a run, or of merged runs, and make them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,17 @@ from datagen.schemas.storage import open_storage
 
 def extend(
     run: RunPlace,
+    /,
     *,
-    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
+    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in total; not fewer than now.")],
     given: Sources = AS_FOUND,
     job_options: JobOptions = HERE,
 ) -> int:
-    """Want n labels of a run and make those that are missing; shards that exist keep their bytes.
+    """Raise the number of labels of a run to n and make the missing ones; existing shards keep their bytes.
 
-    Merged runs share the further labels evenly, in whole shards.
+    In merged runs, the new labels are divided evenly among the parts, in whole shards.
+
+    For example: datagen extend runs/first --n 360,000
     """
     job_options.refuse_bad()
     refuse_odd_n(n)
@@ -54,22 +57,22 @@ def extend(
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:
-    """How many labels each run shall have so that together they have n. InputError where that is fewer."""
+    """Return the labels of each run for n in total. InputError where n is less than there are now."""
     have = [run.n for run in runs]
     if n < sum(have):
-        problem = f"{place} already wants {sum(have):,}, and a run never shrinks"
+        problem = f"{place} already has {sum(have):,} planned, and a run never shrinks"
         raise InputError("--n", str(n), problem, f"Give {sum(have)} or more")
     return shares(have, [run.layout.samples_per_shard for run in runs], n)
 
 
 def shares(have: Sequence[int], per_shard: Sequence[int], n: int) -> list[int]:
-    """`have` labels grown by whole shards until they are n together: evenly, and what is left to the last.
+    """Grow `have` by whole shards until they sum to n: evenly, and the remainder to the last.
 
-    `per_shard` are the labels of one shard of each. Each further shard goes to whoever was given the
-    fewest labels so far, the first of equals. A store is cut at its end alone, so that only the last may
-    want a part of a shard.
+    `per_shard` holds the labels of one shard of each run. Each new shard goes to the run with the fewest
+    new labels so far, the first of equals. A store is cut only at its end, so only the last run may
+    need a part of a shard.
     """
-    # What everybody gets in any case is given at once: n may be a million shards away.
+    # The common part is added at once: n may be a million shards away.
     missing = n - sum(have)
     step = missing // len(have) - max(per_shard)
     given = [max(0, step // size) * size for size in per_shard]

@@ -1,4 +1,4 @@
-"""`datagen gc`: remove what a run holds and nothing names."""
+"""`datagen gc`: remove files of a run that no commit names."""
 
 from __future__ import annotations
 
@@ -26,30 +26,32 @@ _SHOWN = 100
 
 def gc(
     run: RunPlace,
+    /,
     *,
     older_than: Annotated[
         str,
         Parameter(
-            help="What was written later than this ago stays: 90s, 30m, 24h or 7d. A merge that runs needs "
-            "more than it takes: with 0s it loses files and must be run again."
+            help="Keep files newer than this: 90s, 30m, 24h or 7d. It must exceed the duration of a merge "
+            "that is running: with 0s the merge loses files and must be run again."
         ),
     ] = "24h",
-    dry_run: Annotated[bool, Parameter(negative=(), help="Tell what would go, and remove nothing.")] = False,
+    dry_run: Annotated[bool, Parameter(negative=(), help="List the files, but remove nothing.")] = False,
     json: AsJson = False,
 ) -> int:
-    """Remove files that no commit names: of attempts that lost or never committed, drafts and probes.
+    """Remove files that no commit names: of superseded or unfinished attempts, drafts and probes.
 
-    What is committed stays, and so does what began since the first job that is at work now, whatever its
-    age. It may run beside jobs and be interrupted at any time; called again, it goes on. Records of the
-    ledger are never removed.
+    Committed files and records of the ledger are never removed, nor are files of attempts that began after
+    the first running job. It may run while jobs run; after an interruption, run it again.
+
+    For example: datagen gc runs/first --dry-run
     """
     place = open_storage(run, probe=False, create=False)
     age_s = age_of(older_than)
-    with counting("shards looked at", as_json=json) as seen:
+    with counting("shards searched", as_json=json) as seen:
         garbage = find_garbage(place, age_s, time.time(), seen)
     swept = Swept()
     if not dry_run:
-        with counting("pieces removed", as_json=json) as seen:
+        with counting("items removed", as_json=json) as seen:
             swept = remove(place, garbage, seen)
     report = gc_report(place, garbage, swept, dry_run)
     if json:
@@ -60,15 +62,15 @@ def gc(
 
 
 def age_of(text: str) -> float:
-    """The seconds of an age like 24h. Raises InputError for anything else."""
+    """Return the seconds of an age like 24h. Raises InputError for anything else."""
     found = _AGE.fullmatch(text.strip())
     if found is None:
-        raise InputError("--older-than", text, "not an age", "Give a whole number of s, m, h or d, like 24h")
+        raise InputError("--older-than", text, "is not an age", "Give a number of s, m, h or d, like 24h")
     return int(found[1]) * _UNIT_S[found[2]]
 
 
 def remove(place: Storage, garbage: list[Garbage], seen: Seen = lambda done, of: None) -> Swept:
-    """Remove all of it, and bring the indices of the place's runs up to date."""
+    """Remove all of it, and update the indices of the runs."""
     total = Swept()
     for done, piece in enumerate(garbage):
         seen(done, len(garbage))
@@ -79,7 +81,7 @@ def remove(place: Storage, garbage: list[Garbage], seen: Seen = lambda done, of:
 
 
 def gc_report(place: Storage, garbage: list[Garbage], swept: Swept, dry_run: bool) -> dict[str, Any]:
-    """What was found and removed, as plain values; sizes in bytes."""
+    """Return what was found and removed, as plain values; sizes in bytes."""
     files, sizes, pieces = Counter[str](), Counter[str](), Counter[str]()
     for piece in garbage:
         files[piece.kind] += piece.files
@@ -106,8 +108,8 @@ def _print(place: str, report: dict[str, Any]) -> None:
     done = "would be removed" if report["dry_run"] else "removed"
     print_rows(f"{done} from {place}", rows, ("kind", "pieces", "files", "size"))
     if report["committed_meanwhile"]:
-        print_rows("committed meanwhile, and kept", [("attempts", str(report["committed_meanwhile"]))])
+        print_rows("committed meanwhile and kept", [("attempts", str(report["committed_meanwhile"]))])
     if report["damaged"]:
         mend = f"datagen repair {shlex.quote(place)}"
         rows = [(key, mend) for key in report["damaged"][:_SHOWN]]
-        print_rows("their attempts died in their commit while their files went", rows, ("commit", "mend"))
+        print_rows("committed while their files were removed", rows, ("commit", "fix"))

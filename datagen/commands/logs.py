@@ -1,4 +1,4 @@
-"""`datagen logs`: what happened in a run, in order of time."""
+"""`datagen logs`: events of a run in order of time."""
 
 from __future__ import annotations
 
@@ -24,28 +24,31 @@ _LOOK_S = 2.0
 
 def logs(
     run: RunPlace,
+    /,
     *,
     follow: Annotated[
-        bool, Parameter(negative=(), help="Go on while a job is at work, and say what is new.")
+        bool, Parameter(negative=(), help="Wait for new events while a job is running.")
     ] = False,
     shard: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Tell all of one shard, also what went well.")
+        int | None, WHOLE_NUMBER, Parameter(help="All events of one shard, successful attempts included.")
     ] = None,
-    stacks: Annotated[bool, Parameter(negative=(), help="With the stack of each failure.")] = False,
+    stacks: Annotated[bool, Parameter(negative=(), help="Add the stack of each failure.")] = False,
     driver: Annotated[
-        bool, Parameter(negative=(), help="What the driver of the latest detached job has written.")
+        bool, Parameter(negative=(), help="Output of the driver of the latest detached job.")
     ] = False,
-    json: Annotated[bool, Parameter(negative=(), help="One JSON object a line.")] = False,
+    json: Annotated[bool, Parameter(negative=(), help="Print one JSON object per line.")] = False,
 ) -> int:
-    """What happened: jobs that began and ended, attempts that failed, retries, shards given up.
+    """List events of a run: jobs that began and ended, failed attempts, retries, quarantined shards.
 
-    Attempts that went well are told with --shard; `datagen status` counts them.
+    Successful attempts are listed with --shard only; `datagen status` counts them.
+
+    For example: datagen logs runs/first --follow
     """
     place = open_storage(run, probe=False, create=False)
     runs = open_runs(place)
     if shard is not None and not any(shard in part.planned() for part in runs):
         last = max(len(part.planned()) for part in runs) - 1
-        raise InputError(run, "--shard", f"{shard} is not in this run", f"Choose one from 0 to {last}")
+        raise InputError(run, "--shard", f"{shard} is not in this run", f"Give one from 0 to {last}")
     if driver:
         return _print_driver(place, follow)
     told = 0
@@ -53,15 +56,15 @@ def logs(
         _print(event, stacks, json)
         told += 1
     if not told:
-        what = "no job has begun here, and no attempt has failed" if shard is None else "nobody has begun it"
-        sys.stderr.write(f"nothing to tell: {what}\n")
+        what = "no job has begun and no attempt has failed" if shard is None else "the shard has not begun"
+        sys.stderr.write(f"no events: {what}\n")
     return 0
 
 
 def _growing(place: Storage, shard: int | None, follow: bool) -> Iterator[Event]:
     told, known = set[str](), Known()
     while True:
-        # Whether somebody works is asked first: what is written until then is told below.
+        # Asked before the events are read, so that the last ones are not missed.
         live = follow and any(job.health() == "live" for job in Jobs(place).all())
         for event in events_of(place, shard, known):
             if event.key not in told:
@@ -81,7 +84,7 @@ def _print(event: Event, stacks: bool, as_json: bool) -> None:
             fields["stack"] = event.stack
         print_json(fields, indent=None)
     else:
-        at = event.at[:23].replace("T", " ") or "at some time"
+        at = event.at[:23].replace("T", " ") or "unknown time"
         print_lines(printable(f"{at}  {event.text}"))
         if event.stack and stacks:
             print_lines(event.stack, "    ")
@@ -89,17 +92,17 @@ def _print(event: Event, stacks: bool, as_json: bool) -> None:
 
 
 def _print_driver(place: Storage, follow: bool) -> int:
-    """What the latest detached job has written, from Ray's memory of it."""
+    """Print the output of the latest detached job, as Ray keeps it."""
     detached = [job for job in Jobs(place).all() if job.record.submission]
     if not detached:
-        problem = "no job of this run was detached: what others write goes to their shells"
-        raise InputError(place.url, "jobs", problem, "Leave --driver out")
+        problem = "no job of this run was detached; others write to their terminals"
+        raise InputError(place.url, "jobs", problem, "Omit --driver")
     record = detached[-1].record
     ray, told = jobs_api_of(record.jobs_api), 0
     while True:
         live = follow and ray.state(record.submission) in ("PENDING", "RUNNING")
         output = ray.output(record.submission)
-        # A line that is still being written is printed when it is whole.
+        # A line that is still being written is printed when it is complete.
         whole = output.rfind("\n") + 1 if live else len(output)
         print_lines(output[told:whole])
         told = max(told, whole)

@@ -1,4 +1,4 @@
-"""`datagen merge`: runs made apart become one."""
+"""`datagen merge`: merge runs that were made separately."""
 
 from __future__ import annotations
 
@@ -21,16 +21,19 @@ from datagen.schemas.run import Run
 
 
 def merge(
-    runs: Annotated[list[str], Parameter(negative=(), help="Runs made apart, or places of merged ones.")],
+    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs, or merged runs, to merge.")],
+    /,
     *,
-    out: Annotated[str, Parameter(help="The result's folder or s3:// address; what is there is added to.")],
+    out: Annotated[str, Parameter(help="Folder or s3:// address of the result, which may exist.")],
     json: AsJson = False,
 ) -> int:
-    """One run of several: other machines, seeds, houses; partial, overlapping or merged themselves.
+    """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.
 
-    Runs may differ in seed, split, houses, objects and --scenes-from; other differences are named and
-    refused, and so are runs that hold other rows of one scene. Files are linked, not copied, wherever shards
-    are of one size. Sources stay as they are. The same command again finishes a merge that was cut short.
+    Runs may differ in seed, split, houses, objects and --scenes-from; other differences are refused, as are
+    runs with different rows for the same scene. Files are linked, not copied, where shards have the same
+    size. The merged runs stay unchanged. After an interruption, run the same command again.
+
+    For example: datagen merge runs/a runs/b --out runs/all
     """
     words = ["merge", *map(absolute_place, runs), *words_of({"--out": absolute_place(out), "--json": json})]
     with resumable(words):
@@ -48,7 +51,7 @@ def merge(
 
 
 def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:
-    """What was merged as plain values; times in seconds."""
+    """Return what was merged as plain values; times in seconds."""
     parts = open_runs(result.place)
     done = {w.run.storage.url: w for w in result.written}
     spending = account_for(parts)
@@ -91,11 +94,14 @@ def _print(report: dict[str, Any]) -> None:
     out = report["out"]
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
-        ("cost", f"{seconds(report['total_wall_s'])}, of which {seconds(report['useful_wall_s'])} useful"),
+        (
+            "worker time",
+            f"{seconds(report['total_wall_s'])}, of which {seconds(report['useful_wall_s'])} useful",
+        ),
         ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
     ]
     if missing:
-        rows.append(("go on with", f"datagen resume {shlex.quote(out)}"))
+        rows.append(("resume with", f"datagen resume {shlex.quote(out)}"))
     print_rows(f"merged: {out}", rows)
     for part in report["runs"]:
         shards = part["shards"]
@@ -111,10 +117,10 @@ def _print(report: dict[str, Any]) -> None:
 
 
 _WORDS = {
-    "there_before": "there before",
+    "there_before": "merged before",
     "linked": "linked",
-    "cut": "cut anew",
-    "held_more_than_once": "held more than once",
+    "cut": "resharded",
+    "held_more_than_once": "duplicates",
 }
 
 

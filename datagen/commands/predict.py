@@ -1,4 +1,4 @@
-"""`datagen predict`: a base pose from a depth camera's frame, by a trained checkpoint."""
+"""`datagen predict`: find a base pose in a depth camera's frame, with a trained checkpoint."""
 
 from __future__ import annotations
 
@@ -31,49 +31,52 @@ _MOST_ENTRIES = 10_000
 
 
 def predict(
-    checkpoint: Annotated[Path, Parameter(help="What `datagen train` wrote.")],
+    checkpoint: Annotated[Path, Parameter(name="CHECKPOINT", help="Checkpoint of `datagen train`.")],
+    /,
     *,
-    base_height: Annotated[float, Parameter(help="Height of the arm's mount above the floor, m.")],
-    reach: Annotated[float, Parameter(help="Reach of the arm, m.")],
-    rgb: Annotated[Path | None, Parameter(help="Colour picture, aligned with the depth.")] = None,
-    depth: Annotated[Path | None, Parameter(help="16-bit depth PNG.")] = None,
+    base_height: Annotated[float, Parameter(help="Height of the arm's mount above the floor (m).")],
+    reach: Annotated[float, Parameter(help="Reach of the arm from its mount (m).")],
+    rgb: Annotated[Path | None, Parameter(help="Colour image, aligned with the depth image.")] = None,
+    depth: Annotated[Path | None, Parameter(help="Depth image, 16-bit PNG.")] = None,
     intrinsics: Annotated[
-        Path | None, Parameter(help="JSON: fx, fy, cx, cy (or ppx, ppy), width, height.")
+        Path | None, Parameter(help="JSON file: fx, fy, cx, cy (or ppx, ppy), width, height (pixels).")
     ] = None,
-    mask: Annotated[Path | None, Parameter(help="PNG of the target's pixels, white on black.")] = None,
-    click: Annotated[str | None, Parameter(help="A pixel u,v on the target of the first frame.")] = None,
+    mask: Annotated[Path | None, Parameter(help="Mask of the target, PNG, white on black.")] = None,
+    click: Annotated[str | None, Parameter(help="Pixel u,v on the target in the first frame.")] = None,
     frame: Annotated[
         list[Path] | None,
-        Parameter(help="A frame's folder, .npz or .ply; several with poses are fused.", negative=()),
+        Parameter(help="Frame as a folder, .npz or .ply; several with poses are fused.", negative=()),
     ] = None,
-    frame_dir: Annotated[Path | None, Parameter(help="A folder of such frames, taken by name.")] = None,
-    camera_height: Annotated[float | None, Parameter(help="Of the camera that took the frame, m.")] = None,
+    frame_dir: Annotated[Path | None, Parameter(help="Folder of such frames, in order of name.")] = None,
+    camera_height: Annotated[float | None, Parameter(help="Height of the frame's camera (m).")] = None,
     camera_pose: Annotated[
-        Path | None, Parameter(help="JSON: T_world_camera (4x4); world z up, floor at z = 0.")
+        Path | None, Parameter(help="JSON file: T_world_camera (4x4); world z up, floor at z = 0.")
     ] = None,
     gravity: Annotated[
-        str | None, Parameter(help="x,y,z: where things fall, in the camera's frame (x right, y down).")
+        str | None, Parameter(help="Direction of gravity x,y,z in the camera frame (x right, y down).")
     ] = None,
     robot_camera_height: Annotated[
-        float | None, Parameter(help="Of the robot's own camera, m; that of the frame's unless given.")
+        float | None, Parameter(help="Height of the robot's own camera (m) [that of the frame's camera].")
     ] = None,
-    depth_scale: Annotated[float, Parameter(help="Metres a step of 16-bit depth.")] = 0.001,
-    grid: Annotated[int, WHOLE_NUMBER, Parameter(help="Places a side of the grid around the target.")] = 25,
-    half_width: Annotated[float, Parameter(help="Half the grid's side, m.")] = 1.0,
+    depth_scale: Annotated[float, Parameter(help="Metres per step of 16-bit depth.")] = 0.001,
+    grid: Annotated[int, WHOLE_NUMBER, Parameter(help="Cells per side of the grid around the target.")] = 25,
+    half_width: Annotated[float, Parameter(help="Half the side of the grid (m).")] = 1.0,
     allow_unseen: Annotated[
-        bool, Parameter(negative=(), help="Choose also among places whose floor was not seen.")
+        bool, Parameter(negative=(), help="Also consider cells whose floor no camera saw.")
     ] = False,
-    out: Annotated[Path | None, Parameter(help="The picture to write, FILE.png.")] = None,
-    html: Annotated[Path | None, Parameter(help="The page to write, FILE.html.")] = None,
-    as_json: Annotated[bool, Parameter(name="--json"), AsJson] = False,
+    out: Annotated[Path | None, Parameter(help="Picture to write, FILE.png.")] = None,
+    html: Annotated[Path | None, Parameter(help="Page to write, FILE.html.")] = None,
+    as_json: Annotated[AsJson, Parameter(name="--json")] = False,
 ) -> int:
-    """Score a grid of base poses around a target that a depth camera sees, and name the best clear one.
+    """Score a grid of base poses around a target seen by a depth camera, and name the best clear one.
 
-    One frame: --rgb --depth --intrinsics and --mask or --click; or --frame. Where the floor is comes from
-    --camera-pose, or from --gravity and --camera-height, or from the floor in the picture and
-    --camera-height. Exit code 1 when no place was seen to be clear.
+    Give a frame as --rgb --depth --intrinsics with --mask or --click, or as --frame. The floor is known from
+    --camera-pose, from --gravity and --camera-height, or from the image and --camera-height. Exit code 1 when
+    no cell was seen to be clear.
+
+    For example: datagen predict model.ckpt --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
     """
-    # Imported here: training's libraries take seconds, and other verbs need none of them.
+    # Imported here: the libraries of training take seconds to import.
     from datagen.train.prediction import RobotSize, load_scorer
     from datagen.train.prediction import predict as scored
     from datagen.train.prediction.prediction_report import document, told
@@ -82,8 +85,8 @@ def predict(
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
         _refuse_length(name, value)
     if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
-        mend = "Give metres a step: 0.001 for millimetres"
-        raise InputError("--depth-scale", str(depth_scale), "not between 0.000001 and 1", mend)
+        mend = "Give metres per step: 0.001 for millimetres"
+        raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", mend)
     pixel = None if click is None else _pixel(click)
     falls = None if gravity is None else _direction(gravity)
     frames = _frames(rgb, depth, intrinsics, mask, camera_pose, frame, frame_dir, depth_scale)
@@ -134,14 +137,14 @@ def _frames(
     folder: Path | None,
     depth_scale_m: float,
 ) -> list[SensorFrame]:
-    """The frames that the options name, the first with the pose that is given apart."""
+    """The frames that the options name; --camera-pose belongs to the first."""
     from datagen.train.prediction.files import read_pose
     from datagen.train.prediction.frames import read_frame, read_place
 
     named = list(places or [])
     if folder is not None:
         if not folder.is_dir():
-            raise InputError(folder, "--frame-dir", "no such folder", "Name a folder of frames")
+            raise InputError(folder, "--frame-dir", "does not exist", "Name a folder of frames")
         with os.scandir(folder) as entries:
             listed = [Path(entry) for entry in islice(entries, _MOST_ENTRIES + 1)]
         if len(listed) > _MOST_ENTRIES:
@@ -152,9 +155,9 @@ def _frames(
     missing = [name for name, value in parts.items() if value is None]
     pictures = rgb is not None or depth is not None or intrinsics is not None or mask is not None
     if len(named) > _MOST_FRAMES:
-        raise InputError("--frame", "", f"{len(named)} frames", f"Give at most {_MOST_FRAMES}")
+        raise InputError("--frame", "", f"is given {len(named)} times", f"Give at most {_MOST_FRAMES} frames")
     if pictures and missing:
-        raise InputError(", ".join(missing), "", "missing", "Give --rgb, --depth and --intrinsics together")
+        raise InputError(", ".join(missing), "", "is missing", "Give --rgb, --depth and --intrinsics")
     frames: list[SensorFrame] = []
     if rgb is not None and depth is not None and intrinsics is not None:
         frames.append(
@@ -162,11 +165,11 @@ def _frames(
         )
     elif camera_pose is not None and len(named) != 1:
         mend = "Put pose.json into each frame's folder, or T_world_camera into its .npz"
-        raise InputError("--camera-pose", "", f"one pose for {len(named)} frames", mend)
+        raise InputError("--camera-pose", "", f"is one pose for {len(named)} frames", mend)
     frames += [read_place(place, depth_scale_m) for place in named]
     if not frames:
         raise InputError(
-            "--rgb, --depth", "", "no frame is named", "Give --rgb, --depth, --intrinsics, or --frame"
+            "--rgb, --depth", "", "no frame is given", "Give --rgb, --depth and --intrinsics, or --frame"
         )
     if not pictures and camera_pose is not None:
         frames[0] = replace(frames[0], T_world_camera=read_pose(camera_pose))
@@ -175,13 +178,13 @@ def _frames(
 
 def _refuse_length(name: str, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
-        raise InputError(name, f"{value:g}", f"not between 0 and {_LARGEST_M:g}", "Give it in metres")
+        raise InputError(name, f"{value:g}", f"is not between 0 and {_LARGEST_M:g}", "Give it in metres")
 
 
 def _pixel(text: str) -> tuple[int, int]:
     parts = text.split(",")
     if len(parts) != 2 or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", part, re.ASCII) for part in parts):
-        raise InputError("--click", text[:40], "not a pixel", "Give column and row as u,v: 320,240")
+        raise InputError("--click", text[:40], "is not a pixel", "Give column and row as u,v: 320,240")
     return int(parts[0]), int(parts[1])
 
 
@@ -192,20 +195,20 @@ def _direction(text: str) -> F64:
         values = np.zeros(0)
     sound = values.shape == (3,) and bool(np.isfinite(values).all())
     if not sound or not 1e-6 < float(np.abs(values).max()) < 1e6:
-        mend = "Give x,y,z in the camera's frame; of a level camera 0,1,0"
-        raise InputError("--gravity", text[:60], "not a direction", mend)
+        mend = "Give x,y,z in the camera frame: 0,1,0 for a level camera"
+        raise InputError("--gravity", text[:60], "is not a direction", mend)
     return values
 
 
 def _refuse_outputs(out: Path | None, html: Path | None, inputs: Sequence[Path | None]) -> None:
-    """What is written must be new, or an older picture or page; never one of the inputs."""
+    """Raise InputError for an output that is a folder or one of the inputs."""
     if html is not None:
-        import_module("datagen.train.prediction.page")  # a missing library is named before anything is scored
+        import_module("datagen.train.prediction.page")  # reports a missing library before scoring
     read = {path.resolve() for path in inputs if path is not None}
     for option, file, suffix in (("--out", out, ".png"), ("--html", html, ".html")):
         if file is None:
             continue
         refuse_output(file, option, suffix)
         if file.is_dir() or file.resolve() in read:
-            problem = "a folder stands there" if file.is_dir() else "one of the files that are read"
+            problem = "is a folder" if file.is_dir() else "is one of the input files"
             raise InputError(file, option, problem, "Give another name")

@@ -1,4 +1,4 @@
-"""`datagen relabel`: the labels of a run by another rule, from stored distances and visibilities."""
+"""`datagen relabel`: label a run by other parameters, from its stored distances and visibilities."""
 
 from __future__ import annotations
 
@@ -21,31 +21,34 @@ from datagen.schemas.storage import Storage, open_storage
 
 def relabel(
     run: RunPlace,
+    /,
     *,
-    out: Annotated[str, Parameter(help="The new run's folder or s3:// address.")],
-    mu: Annotated[float | None, Parameter(help="Distance at which the distance score has its peak.")] = None,
-    sigma_l: Annotated[float | None, Parameter(help="How fast it falls off nearer than mu.")] = None,
-    sigma_r: Annotated[float | None, Parameter(help="How fast it falls off farther than mu.")] = None,
-    d_min: Annotated[float | None, Parameter(help="Nearest distance with a score.")] = None,
-    d_max: Annotated[float | None, Parameter(help="Farthest distance with a score.")] = None,
-    a: Annotated[float | None, Parameter(help="Height of the peak.")] = None,
+    out: Annotated[str, Parameter(help="Folder or s3:// address of the new run.")],
+    mu: Annotated[float | None, Parameter(help="Distance of the peak of the distance score.")] = None,
+    sigma_l: Annotated[float | None, Parameter(help="Width of the distance score below mu.")] = None,
+    sigma_r: Annotated[float | None, Parameter(help="Width of the distance score above mu.")] = None,
+    d_min: Annotated[float | None, Parameter(help="Smallest distance with a score.")] = None,
+    d_max: Annotated[float | None, Parameter(help="Largest distance with a score.")] = None,
+    a: Annotated[float | None, Parameter(help="Height of the peak of the distance score.")] = None,
     alpha: Annotated[
-        float | None, Parameter(help="Weight of the visibility score; the distance score has the rest.")
+        float | None, Parameter(help="Weight of the visibility score; the distance score has 1 - alpha.")
     ] = None,
-    tau: Annotated[float | None, Parameter(help="Score H from which on a label is good.")] = None,
+    tau: Annotated[float | None, Parameter(help="Smallest score H of a positive label.")] = None,
     distance: Annotated[
         Literal["planar", "planar-over-reach", "mount-over-reach"] | None,
-        Parameter(help="The distance that the score is a function of."),
+        Parameter(help="Distance that the score depends on."),
     ] = None,
     config: Annotated[Path | None, Parameter(help="TOML file with the section [heuristic].")] = None,
     json: AsJson = False,
 ) -> int:
-    """Label a heuristic run by another rule, without rendering.
+    """Label a heuristic run by other parameters of the rule, without rendering.
 
-    Distances are in metres, or shares of the reach where --distance says so. What is not given is as in the
-    run; an option wins over the file. The new run is that of `datagen submit heuristic --scenes-from RUN`,
-    and shares all files but those of labels, scores and ids. The same command again resumes it, and
-    extends it where the run has grown.
+    Distances are in metres, or shares of the reach with --distance planar-over-reach or mount-over-reach.
+    Parameters that are not given stay as in the run; an option overrides the file. The new run equals that of
+    `datagen submit heuristic --scenes-from RUN`, and shares all files except labels, scores and ids. The same
+    command again resumes it, or extends it after the run has grown.
+
+    For example: datagen relabel runs/first --tau 0.6 --out runs/stricter
     """
     given = {
         "a": a, "mu": mu, "sigma_l": sigma_l, "sigma_r": sigma_r, "d_min": d_min, "d_max": d_max,
@@ -55,8 +58,8 @@ def relabel(
     sources = open_runs(run)
     specs = [relabelled_specification(source, options, config) for source in sources]
     if all(spec.heuristic == s.manifest.spec.heuristic for spec, s in zip(specs, sources, strict=True)):
-        problem = "nothing would change: its labels are by these very parameters"
-        raise InputError(run, "heuristic", problem, "Give --mu or another of its parameters, or --config")
+        problem = "has these parameters already"
+        raise InputError(run, "heuristic", problem, "Give another parameter, such as --tau, or --config")
     place = open_storage(out)
     started_s = time.monotonic()
     done = relabel_all(place, sources, specs, json)
@@ -82,9 +85,9 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
         print_json(report)
     else:
         rows = [
-            ("labels", f"{labels:,} new, {report['wanted']:,} wanted" if labels else "nothing to do"),
+            ("labels", f"{labels:,} new of {report['wanted']:,} wanted" if labels else "nothing to do"),
             ("positive", f"{100 * positives / labels:.1f}%" if labels else "-"),
-            ("changed", f"{done.flips.to_good:,} labels became good, {done.flips.to_bad:,} bad"),
+            ("changed", f"{done.flips.to_good:,} labels became positive, {done.flips.to_bad:,} negative"),
             ("time", seconds(elapsed_s)),
         ]
         if done.absent:
@@ -93,10 +96,10 @@ def _report(run: str, out: str, place: Storage, done: Relabelled, elapsed_s: flo
         print_rows(f"{summary.end}: {out}", rows)
     if summary.end == "aborted":
         raise InputError(
-            out, "", f"cannot go on: {summary.cause}", f"Then again: {command_line(sys.argv[1:])}"
+            out, "", f"cannot continue: {summary.cause}", f"Then run again: {command_line(sys.argv[1:])}"
         )
     if summary.end == "failed":
         sys.stderr.write(f"error: {out}: too many shards failed. See: datagen status {shlex.quote(out)}\n")
     if summary.end == "interrupted":
-        say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", sys.argv[1:])
+        say_interrupted(f"; {counted(summary.remaining, 'shard')} left", sys.argv[1:])
     return summary.exit_code

@@ -1,4 +1,4 @@
-"""`datagen repair`: what `verify` finds, repaired from second copies or by making bad shards again."""
+"""`datagen repair`: fix what `verify` finds, from second copies or by making bad shards again."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ if TYPE_CHECKING:
 
 def repair(
     run: RunPlace,
+    /,
     *,
     workers: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0 works in this one.")
+        int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0: this process.")
     ] = 0,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
-    """Check a run as verify does, mend what can be repaired, and check again.
+    """Check a run as `datagen verify` does, fix the damage, and check again.
 
-    Records come back from their second copies, files of shards by making only the bad shards again; a
-    file is written only with the very bytes that were committed. All other files stay as they are. It can
-    be broken off and begun again at any time. Exit code 0 when nothing is left, 1 when something is.
+    Records are restored from their second copies. Bad shards are made again, and a file is written only if it
+    has the bytes that were committed. All other files stay untouched. After an interruption, run it again.
+    Exit code 0 when no damage is left, else 1.
+
+    For example: datagen repair runs/first
     """
     if not 0 <= workers <= 256:
-        raise InputError("--workers", str(workers), "is not between 0 and 256", "Leave it out for none")
+        raise InputError("--workers", str(workers), "is not between 0 and 256", "Omit it for this process")
     place = open_storage(run, probe=False, create=False)
     with (
         counting("shards checked", as_json=json) as seen,
@@ -61,11 +64,11 @@ def repair(
 
 @contextmanager
 def _regenerator(given: Sources, workers: int) -> Generator[RegenerateShard]:
-    """How shards are made again: in this process, or in so many others."""
+    """Give the function that makes a shard again: in this process, or in `workers` subprocesses."""
     if workers == 0:
         yield lambda run, shard: _regenerate(run, shard, given)
         return
-    # Workers are spawned when the first shard is bad, and not before.
+    # Workers are spawned at the first bad shard.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_signals)
     try:
@@ -75,12 +78,12 @@ def _regenerator(given: Sources, workers: int) -> Generator[RegenerateShard]:
 
 
 def _leave_signals() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
 
 
 def _regenerate(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
-    """The files of a shard, computed here."""
-    # Simulators are imported only where a shard is bad.
+    """The files of a shard, computed in this process."""
+    # Simulators are imported only for a bad shard.
     from datagen.regeneration.shards import regenerate_shard, regenerated_files
 
     return regenerated_files(run, regenerate_shard(run, shard, _origin(run.storage.url, given)))
@@ -123,21 +126,24 @@ def _apart(repaired: Repaired) -> list[str]:
 def _print(report: dict[str, Any], repaired: Repaired) -> None:
     made, of_shards = len(report["files_made_again"]), report["shards_made_again"]
     rows = [
-        ("records", f"{len(report['records'])} put back from copies and other records"),
-        ("files", f"{len(report['files_from_copies'])} put back from copies"),
+        ("records", f"{len(report['records'])} restored from copies and other records"),
+        ("files", f"{len(report['files_from_copies'])} restored from copies"),
         ("", f"{made} made again" + (f", of shards {listed(of_shards)}" if of_shards else "")),
         (
             "sealed",
             "anew" if repaired.resealed else f"{counted(len(report['sealed_files']), 'file')} repaired",
         ),
-        ("all others", f"the bytes and times that they had: {counted(repaired.untouched, 'file')}"),
+        ("untouched", counted(repaired.untouched, "file")),
     ]
     if repaired.changed:
         rows.append(
-            ("changed", f"{counted(len(repaired.changed), 'file')} meanwhile, not by this: is a job at work?")
+            (
+                "changed",
+                f"{counted(len(repaired.changed), 'file')} by another process meanwhile: is a job running?",
+            )
         )
     if any("other bytes" in finding.mend for finding in repaired.left):
-        apart = "; ".join(report["apart_from_here"]) or "nothing that the run's records tell of"
+        apart = "; ".join(report["apart_from_here"]) or "nothing that the run's records name"
         rows.append(("differs here", apart))
     left = sum(finding.is_damage for finding in repaired.left)
     state = f"{counted(left, 'finding')} left" if left else "clean"

@@ -1,4 +1,4 @@
-"""`datagen replay`: a scene made again and compared stage by stage; or one shard alone, nothing caught."""
+"""`datagen replay`: make a scene again and compare it stage by stage, or run one shard for a debugger."""
 
 from __future__ import annotations
 
@@ -36,33 +36,36 @@ def replay(
     run: RunPlace,
     sample: Annotated[
         str | None,
-        Parameter(help="A sample's id, 32 hexadecimal digits, or as many as make it the only one."),
+        Parameter(name="SAMPLE_ID", help="sample_id, 32 hexadecimal digits, or its first ones if unique."),
     ] = None,
     /,
     *,
     scene: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a scene, instead of a sample.")
+        int | None, WHOLE_NUMBER, Parameter(help="Index of a scene, instead of a sample id.")
     ] = None,
     shard: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a shard, instead: runs here, with nothing caught.")
+        int | None, WHOLE_NUMBER, Parameter(help="Index of a shard to run in this process, for a debugger.")
     ] = None,
     out: Annotated[
-        Path | None, Parameter(help="A .png file: the stored scene beside the replayed one.")
+        Path | None, Parameter(help="Picture to write, FILE.png: the stored and the replayed scene.")
     ] = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
-    """Draw a sample's scene again from its seeds, as a worker does, and compare it with what is stored.
+    """Make a sample's scene again from its seeds and compare it with the stored one.
 
-    Stage by stage: equal bit for bit, or how many values differ and by how much. Then the sample's label is
-    worked out again from the stored poses. Ends with 0 where all is equal, with 1 where anything differs.
+    Each stage is equal bit for bit, or the report counts the values that differ and gives the largest
+    difference. The sample's label is also computed from the stored poses. Exit code 0 when all is equal, else
+    1.
 
-    With --shard, a shard runs alone in this process, in quarantine or not: an exception ends in its
-    traceback, and a debugger stops where it is raised. Nothing is written.
+    With --shard, one shard, quarantined or not, runs in this process: an exception keeps its traceback, and a
+    debugger stops where it is raised. No file is written.
+
+    For example: datagen replay runs/first --scene 0 --out replay.png
     """
     if sum(given is not None for given in (sample, scene, shard)) != 1:
-        problem = "name one thing to replay"
-        raise InputError("datagen replay", "SAMPLE_ID", problem, "Give a sample's id, or --scene, or --shard")
+        problem = "is one of three ways to say what to replay"
+        raise InputError("datagen replay", "SAMPLE_ID", problem, "Give a sample id, --scene or --shard")
     if out is not None:
         refuse_output(out, "--out", ".png")
     runs = open_runs(run)
@@ -75,7 +78,7 @@ def replay(
     refuse_missing_packages(found.manifest.spec.label_source)
     if shard is not None:
         if out is not None:
-            raise InputError("--out", str(out), "a shard has no picture", "Take it out, or give --scene")
+            raise InputError("--out", str(out), "a shard has no picture", "Omit it, or give --scene")
         return replay_shard(run, found, shard, open_sources(found, given), json)
     assert index is not None
     stored = read_scene(found, index)
@@ -83,10 +86,10 @@ def replay(
 
 
 def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:
-    """(run, scene, row in its scene) of the committed sample whose id begins with these digits.
+    """Return (run, scene, row in its scene) of the committed sample whose id begins with these digits.
 
-    Ids are hashes of specification, scene and candidate, so they are counted out and nothing is read but
-    the list of commits. `step` is called for every shard. InputError where none or more than one fits.
+    Ids are hashes of specification, scene and candidate: they are computed, and only the list of commits is
+    read. `step` is called for every shard. InputError where no id or more than one matches.
     """
     place = runs[0].storage.url if len(runs) == 1 else f"{len(runs)} merged runs"
     wanted = text.lower()
@@ -112,11 +115,11 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
                 break
     if not found:
         mend = "Give the id of a committed sample of this run"
-        raise InputError("SAMPLE_ID", text, f"is no sample of {place}", mend)
+        raise InputError("SAMPLE_ID", text, f"is not a sample of {place}", mend)
     if len(found) > 1:
         shown = ", ".join(_ids(r, s, k + 1)[k].hex() for r, s, k in found[:_SHOWN])
         raise InputError(
-            "SAMPLE_ID", text, f"begins more than one id of {place} ({shown})", "Give more digits"
+            "SAMPLE_ID", text, f"matches several samples of {place} ({shown})", "Give more digits"
         )
     return found[0]
 
@@ -131,7 +134,7 @@ def _only(place: str, runs: list[Run], option: str) -> Run:
         return runs[0]
     parts = ", ".join(run.storage.url for run in runs[:3])
     problem = f"each of the {len(runs)} merged runs has its own"
-    raise InputError(place, option, problem, f"Give a sample's id, or name a part: {parts}")
+    raise InputError(place, option, problem, f"Give a sample id, or name a part: {parts}")
 
 
 def _compare(
@@ -208,9 +211,7 @@ def _print(place: str, report: dict[str, Any]) -> None:
     sample = report["sample"]
     rows = [(s["stage"], f"{s['fields']} fields", _words(s)) for s in report["stages"]]
     if not report["drawn_again"]:
-        rows.append(
-            ("draw", "-", "not drawn again: the run that drew the scenes is not there (--scenes-from)")
-        )
+        rows.append(("draw", "-", "not sampled again: the run of --scenes-from does not exist any more"))
     rows += [
         (f"{s['stage']}, from stored poses", f"{s['fields']} fields", _words(s)) for s in report["recomputed"]
     ]
@@ -221,7 +222,7 @@ def _print(place: str, report: dict[str, Any]) -> None:
     print_rows(name, rows, ("stage", "compared", "result"))
     end = [("result", "equal, bit for bit" if report["equal"] else "different")]
     if report["differs_here"]:
-        end.append(("not as where it was made", "; ".join(report["differs_here"])))
+        end.append(("this machine differs", "; ".join(report["differs_here"])))
     if report["picture"]:
         end.append(("picture", report["picture"]))
     print_rows("", end)

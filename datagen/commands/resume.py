@@ -1,4 +1,4 @@
-"""`datagen resume`: make what is missing of a run, or of merged runs."""
+"""`datagen resume`: make the missing shards of a run, or of merged runs."""
 
 from __future__ import annotations
 
@@ -21,17 +21,19 @@ from datagen.schemas.storage import open_storage
 
 def resume(
     run: RunPlace,
+    /,
     *,
     quarantined: Annotated[
-        bool,
-        Parameter(negative=(), help="Try the shards in quarantine again; their records stay as history."),
+        bool, Parameter(negative=(), help="Try quarantined shards again; their records are kept.")
     ] = False,
     given: Sources = AS_FOUND,
     job_options: JobOptions = HERE,
 ) -> int:
-    """Make every missing shard of a run, and seal it: of what was begun, nothing is made twice.
+    """Make the missing shards of a run and seal it. Committed shards are not made again.
 
-    Of merged runs every part is resumed, one after the other.
+    The parts of merged runs are resumed one after the other.
+
+    For example: datagen resume runs/first
     """
     job_options.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]

@@ -1,4 +1,4 @@
-"""`datagen seal` and `datagen unseal`: make or remove the one store that stock readers open."""
+"""`datagen seal` and `datagen unseal`: make or remove the one store that any Zarr reader opens."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from datagen.schemas.sealing import unseal as unseal_place
 from datagen.schemas.storage import open_storage
 
 
-def seal(run: RunPlace) -> int:
-    """Lay one flat Zarr store, data.zarr, over the committed shards, also of an unfinished run.
+def seal(run: RunPlace, /) -> int:
+    """Make one flat Zarr store, data.zarr, of the committed shards; the run may be unfinished.
 
-    Chunks are hard links, or copies by the S3 server. An older store stays whole until the new one is.
+    Chunks are hard links, or copies by the S3 server. An older store stays until the new one is complete.
+
+    For example: datagen seal runs/first
     """
     storage = open_storage(run, probe=False, create=False)
     address = seal_place(storage)
@@ -26,10 +28,13 @@ def seal(run: RunPlace) -> int:
     return 0
 
 
-def unseal(run: RunPlace) -> int:
-    """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again."""
+def unseal(run: RunPlace, /) -> int:
+    """Remove data.zarr. The run keeps every shard, and `datagen seal` makes the store again.
+
+    For example: datagen unseal runs/first
+    """
     storage = open_storage(run, probe=False, create=False)
-    open_runs(storage)  # a folder that is no run is not touched
+    open_runs(storage)  # a folder without a run is not touched
     root = sealed_root(storage)
     was_there = next(iter(storage.list(SEALED)), None) is not None
     unseal_place(storage)
@@ -43,7 +48,7 @@ def unseal(run: RunPlace) -> int:
 
 
 def _told(root: SealedRoot) -> list[tuple[str, str]]:
-    """What a store holds and lacks, run by run."""
+    """Rows with the labels and the missing shards of each run in a store."""
     rows: list[tuple[str, str]] = []
     for part in root.parts:
         head = f"run {part.spec_hash[:16]}"

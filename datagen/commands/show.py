@@ -1,4 +1,4 @@
-"""`datagen show`: a picture that explains one scene of a run, or one trial in it."""
+"""`datagen show`: draw one scene of a run, or one trial in it."""
 
 from __future__ import annotations
 
@@ -25,19 +25,22 @@ _BEST = "best"
 
 def show(
     run: RunPlace,
+    /,
     *,
-    out: Annotated[Path, Parameter(help="The picture to write: a .png file, or a .gif of a trial.")],
+    out: Annotated[Path, Parameter(help="Picture to write: FILE.png, or FILE.gif of a trial.")],
     scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
     trial: Annotated[
-        str | None, Parameter(help="A candidate's index, or best: show how its trial went (plan, sim).")
+        str | None, Parameter(help="Show the trial of a candidate: its index, or best (plan, sim).")
     ] = None,
     given: AssetSources = AS_FOUND,
 ) -> int:
-    """A picture of one scene: the RGB-D frame, floor plans with the candidates, numbers.
+    """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
 
-    For heuristic labels with the depth and the cloud; for plan and sim with the map of outcomes beside
-    that of scores, and with the grasps that succeeded. With --trial the candidate is tried again and
-    shown as a filmstrip, or in motion as a .gif. Scenes are rendered again from the stored poses.
+    For heuristic labels it shows depth and point cloud; for plan and sim labels, outcomes, scores and the
+    successful grasps. With --trial, a candidate's trial is run again and drawn as a filmstrip, or animated
+    in a .gif. Scenes are rendered again from the stored poses.
+
+    For example: datagen show runs/first --scene 3 --out scene.png
     """
     refuse_output(out, "--out", ".png", ".gif")
     moving = out.suffix.lower() == ".gif"
@@ -46,8 +49,8 @@ def show(
     spec, sources = opened.manifest.spec, opened.manifest.sources
     of_trial = trial is not None or moving
     if of_trial and spec.arm is None:
-        problem = f"{spec.label_source} labels come without trials"
-        mend = "Give a run of plan or sim, or --out FILE.png alone"
+        problem = f"{spec.label_source} labels have no trials"
+        mend = "Name a run of plan or sim labels, or give only --out FILE.png"
         raise InputError(run, "--trial" if trial is not None else "--out", problem, mend)
     refuse_missing_packages(spec.label_source)
     rows = read_scene(opened, of_run)
@@ -55,7 +58,7 @@ def show(
     world = open_world(spec, houses, given.objects or sources.get("objects", "builtin"))
     shown = Shown(run, spec, rows, reconstruct_scene(world, rows.record))
     if of_trial:
-        # Imported here, so that scenes can be seen without what plans and executes.
+        # Imported here, so that scenes are drawn without the libraries for planning and trials.
         from datagen.drawing.trial_picture import draw_trial
 
         lines = draw_trial(shown, candidate, out)
@@ -66,7 +69,7 @@ def show(
 
 
 def _candidate(trial: str | None) -> int | None:
-    """The candidate that `--trial` names; None for the best success."""
+    """The candidate index that `--trial` names; None for the best success."""
     if trial is None or trial == _BEST:
         return None
     if not re.fullmatch(r"[+-]?[0-9]{1,30}", trial):

@@ -1,4 +1,4 @@
-"""`datagen status`: how far a run is, who works on it, and what failed."""
+"""`datagen status`: progress of a run, its jobs and its failures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ from datagen.schemas.storage import Storage, open_storage
 
 def status(
     run: RunPlace,
+    /,
     *,
-    stacks: Annotated[bool, Parameter(negative=(), help="With one stack of each cause of failure.")] = False,
+    stacks: Annotated[bool, Parameter(negative=(), help="Add one stack for each cause of failure.")] = False,
     json: AsJson = False,
 ) -> int:
-    """How far a run is: shards, labels, jobs at work, failed attempts by cause, quarantine.
+    """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
 
-    Of merged runs the sums, and one line a part.
+    Of merged runs it shows the sums, and one line per part.
+
+    For example: datagen status runs/first
     """
     place = open_storage(run, probe=False, create=False)
     report = runs_report(place, stacks)
@@ -37,23 +40,24 @@ def status(
 def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
     shards = report["shards"]
     given_up = len(shards["quarantined"])
-    state = "complete" if report["complete"] else f"{counted(shards['missing'], 'shard')} to make"
+    state = "complete" if report["complete"] else f"{counted(shards['missing'], 'shard')} missing"
     if given_up:
-        state += f", {given_up} in quarantine ({listed(shards['quarantined'])})"
+        state += f", {given_up} quarantined ({listed(shards['quarantined'])})"
     attempts = ", ".join(f"{outcome} {count}" for outcome, count in report["attempts"].items()) or "none"
     rows = [
         ("labels", f"{report['labels']:,} of {report['n']:,} ({report['label_source']})"),
+        ("made from", report["made_from"]),
         ("shards", f"{shards['committed']} of {shards['planned']} committed; {state}"),
         ("attempts", attempts),
         ("sealed", _seal(report)),
-        ("specification", report["spec_hash"][:16] or "of each part its own"),
+        ("specification", report["spec_hash"][:16] or "one per part"),
         ("created", report["created"]),
     ]
     if report["scenes_from"]:
         rows.append(("scenes from", report["scenes_from"]))
     if report["attempts_without_end"]:
         without = counted(report["attempts_without_end"], "attempt")
-        rows.insert(3, ("without end", f"{without}: at work now, or lost"))
+        rows.insert(3, ("unfinished", f"{without}: running or lost"))
     print_rows(f"run {name}", rows)
     _print_jobs(place)
     _print_parts(report)
@@ -62,7 +66,7 @@ def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
 
 
 def _print_jobs(place: Storage) -> None:
-    """Whoever may be at work, and the latest job where that is nobody."""
+    """The jobs that may be running, or else the latest job."""
     jobs = Jobs(place).all()
     shown = [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]
     if shown:
@@ -101,7 +105,7 @@ def _print_failures(name: str, report: dict[str, Any]) -> None:
             )
             for row in report["budgets"]
         ]
-        print_rows("failures", rows, ("kind", "attempts", "shards", "most on one shard"))
+        print_rows("failures", rows, ("kind", "attempts", "shards", "most per shard"))
     if report["causes"]:
         rows = [(cause, str(n)) for cause, n in report["causes"].items()]
         print_rows("causes", rows, ("cause", "attempts"))
@@ -110,9 +114,9 @@ def _print_failures(name: str, report: dict[str, Any]) -> None:
     given_up = report["quarantine"]
     if given_up:
         rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in given_up[:20]]
-        print_rows("quarantine", rows, ("shard", "attempts", "last cause"))
+        print_rows("quarantined", rows, ("shard", "attempts", "last cause"))
         again = command_line(["resume", name, "--quarantined"])
-        print_rows(f"try them again: {again}", [])
+        print_rows(f"Try them again: {again}", [])
 
 
 def _seal(report: dict[str, Any]) -> str:
@@ -120,4 +124,4 @@ def _seal(report: dict[str, Any]) -> str:
         return "yes, data.zarr"
     if report["sealed_labels"] is None:
         return "no"
-    return f"data.zarr is older ({report['sealed_labels']:,} labels): datagen seal makes it anew"
+    return f"data.zarr is out of date ({report['sealed_labels']:,} labels): run datagen seal again"

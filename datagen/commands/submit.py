@@ -1,4 +1,4 @@
-"""`datagen submit`: make labels. The same command on the same folder resumes."""
+"""`datagen submit`: make labels. The same command on the same folder resumes the run."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from datagen.jobs.start_job import refuse_unusable_engines, start_job
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
+from datagen.schemas.progress import Progress
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from datagen.schemas.storage import open_storage
@@ -34,76 +35,77 @@ from datagen.workers.objects import open_objects
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import World, assemble_world, open_world
 
-# Options that stored scenes have decided.
+# Options that --scenes-from decides.
 _OF_SCENES = (
     *("--seed", "--split", "--candidates", "--candidates-per-scene", "--robots-per-scene"),
     *("--settler", "--renderer", "--noise"),
 )
+_BUILTIN = (
+    "Using built-in houses. For real ones: datagen assets fetch procthor-10k --out DIR, then "
+    "--houses procthor:DIR/procthor"
+)
 
 
 def submit(
-    label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic, plan or sim.")],
+    label_source: Annotated[str, Parameter(name="LABEL_SOURCE", help="heuristic, plan or sim.")],
     /,
     *,
-    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number later extends the run.")],
-    out: Annotated[str, Parameter(help="The run's folder or s3:// address.")],
+    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number extends the run.")],
+    out: Annotated[str, Parameter(help="Folder or s3:// address of the run.")],
     houses: Annotated[str | None, Parameter(help="builtin, procthor:DIR or ai2thor:DIR [builtin].")] = None,
     objects: Annotated[str | None, Parameter(help="builtin or ycb:DIR [builtin].")] = None,
     scenes_from: Annotated[
-        str | None, Parameter(help="A run whose scenes and candidates are labelled again.")
+        str | None, Parameter(help="Run whose scenes and candidates are labelled again.")
     ] = None,
     robot: Annotated[
         str | None,
         Parameter(
-            help="The arm: fetch, panda, panda-scaled or xarm7; candidates get its reach, height and base "
-            "[plan, sim: panda-scaled]."
+            help="fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled]."
         ),
     ] = None,
     perturb: Annotated[
         int | None,
         WHOLE_NUMBER,
-        Parameter(
-            help="Arrivals at each candidate, each off it and in a world disturbed anew (sim) [undisturbed]."
-        ),
+        Parameter(help="Trials per candidate, each with random errors of pose and world (sim) [1, without]."),
     ] = None,
     candidates: Annotated[
         Literal["grid", "clear", "in-range"] | None,
         Parameter(
-            help="Cells that are drawn: all of the grid, those where the base is clear, or those within the "
-            "arm's reach too [plan, sim: grid]."
+            help="Cells to sample from: all, those with a clear base, or those also within reach [grid]."
         ),
     ] = None,
     candidates_per_scene: Annotated[
-        str | None, Parameter(help="60 drawn from the 25x25 grid, another number, or grid for all 625.")
+        str | None,
+        Parameter(help="Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60]."),
     ] = None,
     robots_per_scene: Annotated[
         int | None,
         WHOLE_NUMBER,
-        Parameter(help="Robots the candidates are dealt out to: 4, and 1 on a whole grid."),
+        Parameter(help="Robots that share a scene's candidates [4; 1 on a whole grid]."),
     ] = None,
     split: Annotated[
         Literal["train", "val", "test", "all"] | None,
-        Parameter(help="Houses to use, disjoint by split [all]."),
+        Parameter(help="Split of the houses; splits share no house [all]."),
     ] = None,
     seed: Annotated[int | None, WHOLE_NUMBER, Parameter(help="Seed of the whole run [0].")] = None,
     settler: Annotated[
-        str | None, Parameter(help="Physics: sapien, or pybullet [sapien, or what can be imported].")
+        str | None, Parameter(help="Physics engine: sapien or pybullet [sapien where installed].")
     ] = None,
-    renderer: Annotated[
-        str | None, Parameter(help="Renderer of the RGB-D frame: embree, sapien or pybullet [embree].")
-    ] = None,
-    noise: Annotated[bool, Parameter(negative=(), help="Add the sensor noise model to the frame.")] = False,
+    renderer: Annotated[str | None, Parameter(help="Renderer: embree, sapien or pybullet [embree].")] = None,
+    noise: Annotated[bool, Parameter(negative=(), help="Add sensor noise to the frame.")] = False,
     config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
     job_options: JobOptions = HERE,
 ) -> int:
-    """Make labels: start a run, or go on with the one that is in the folder.
+    """Make labels: start a run, or resume the run in the folder.
 
-    Submitting the same specification to the same folder resumes it; a larger --n extends it; another
-    specification is refused with the fields that differ. Ctrl-C once finishes what is in flight,
-    twice ends it at once; nothing that is committed is lost.
+    The same command on the same folder resumes the run, and a larger --n extends it; other options are
+    refused with the fields that differ. Ctrl-C finishes the running attempts, a second Ctrl-C stops at once;
+    committed shards are kept.
+
+    For example: datagen submit heuristic --n 1e5 --out runs/first
     """
     refuse_missing_packages(label_source)
-    load_label_source(label_source)  # refuses an unknown one
+    load_label_source(label_source)  # InputError for an unknown one
     refuse_odd_n(n)
     job_options.refuse_bad()
     said = {
@@ -126,7 +128,7 @@ def submit(
     }
     words = ["submit", label_source, *words_of(said), *job_options.words()]
     if job_options.detach and job_options.address != "local":
-        return detach_job(words, out, job_options)  # sources lie where the cluster is
+        return detach_job(words, out, job_options)  # its sources are paths on the cluster
     options = {
         "seed": seed,
         "split": split,
@@ -152,16 +154,19 @@ def submit(
             )
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
-            open_world(spec, houses, objects)  # refuses other ones than the scenes were made from
+            world = open_world(spec, houses, objects)
             refuse_unusable_engines(spec, job_options.address)
             source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
             schema_version = stored.run.manifest.schema_version
             refuse_too_few(stored, layout, n)
         sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
+        sources |= {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
         if source_url:
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
         run = Run.create_or_open(open_storage(out), manifest, n)
+    if said["--houses"] is None and not source_url:
+        Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
     if job_options.detach:
         return detach_job(words, out, job_options)
     job_run = JobRun(run, sources["houses"], sources["objects"], source_url)
@@ -169,35 +174,35 @@ def submit(
 
 
 def _layout_there(out: str) -> Layout | None:
-    """The layout of the run that is there; None where there is none yet. InputError for merged runs."""
+    """The layout of the run at `out`; None where there is none yet. InputError for merged runs."""
     try:
         storage = open_storage(out, probe=False, create=False)
     except InputError:
-        return None  # nothing there, or what `open_storage` will refuse with its own words
+        return None  # nothing there, or an address that `open_storage` refuses
     if storage.exists(MERGED):
-        mend = "Give it more with `datagen extend`, or choose another --out"
-        raise InputError(out, "", "runs were merged here, and each has a specification of its own", mend)
+        mend = "Extend it with `datagen extend`, or choose another --out"
+        raise InputError(out, "", "holds merged runs, each with its own specification", mend)
     return Run.open(storage).layout if storage.exists("manifest.json") else None
 
 
 def _refuse_no_scene(world: World, houses: str) -> None:
-    """Draw a new run's first scene here: sources that give none are refused before anything is written."""
+    """Sample a new run's first scene: InputError, before anything is written, where no scene can be made."""
     try:
         generate_scene(world, 0, StageClock())
     except InputError as error:
-        raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
+        raise InputError("--houses", houses, f"no scene can be made: {error.problem}", error.mend) from error
 
 
 def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:
-    """What --candidates and --candidates-per-scene say, by dotted name."""
+    """Fields of --candidates and --candidates-per-scene, by dotted name."""
     number = _per_scene(per_scene)
     if kind == "grid":
         if number not in (None, "grid"):
-            mend = "Give --candidates clear or in-range to draw some, or leave the number out"
+            mend = "Give --candidates clear or in-range to sample some, or omit the number"
             raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", mend)
         number = "grid"
     elif kind is not None and number == "grid":
-        problem = f"a whole grid is not only {kind}"
+        problem = f"a whole grid has other cells than {kind} ones"
         raise InputError("--candidates", kind, problem, "Give --candidates-per-scene 60")
     within = kind if kind != "grid" else None
     return {"candidates.per_scene": number, "candidates.within": within}
@@ -208,6 +213,6 @@ def _per_scene(text: str | None) -> int | str | None:
         return text
     if not (text.isascii() and text.isdigit() and len(text) < 9) or not 1 <= int(text) <= 625:
         raise InputError(
-            "--candidates-per-scene", text, "is neither grid nor a number from 1 to 625", "Give 60, or grid"
+            "--candidates-per-scene", text, "is neither grid nor a number from 1 to 625", "Give 60 or grid"
         )
     return int(text)

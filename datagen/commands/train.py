@@ -1,4 +1,4 @@
-"""`datagen train`: a model from labels, stage by stage."""
+"""`datagen train`: train a model on labels, stage by stage."""
 
 from __future__ import annotations
 
@@ -24,60 +24,64 @@ Whole = Annotated[int | None, WHOLE_NUMBER]
 
 
 def train(
-    stage: Literal["stage1", "stage2", "sim-only"],
-    runs: Annotated[
-        list[str], Parameter(negative=(), help="Runs to learn from, also merged or sealed ones.")
+    stage: Annotated[
+        Literal["stage1", "stage2", "sim-only"],
+        Parameter(name="STAGE", help="Heuristic labels, then sim labels, or sim labels alone."),
     ],
+    runs: Annotated[
+        list[str], Parameter(name="RUN...", negative=(), help="Runs to train on; merged and sealed ones too.")
+    ],
+    /,
     *,
-    out: Annotated[Path, Parameter(help="The checkpoint's file; the same command on it goes on.")],
+    out: Annotated[Path, Parameter(help="Checkpoint to write; the same command resumes it.")],
     val: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="Runs that decide when to stop [a tenth of the houses is held out]."),
+        Parameter(negative=(), help="Runs for validation [a tenth of the houses is held out]."),
     ] = None,
-    init: Annotated[Path | None, Parameter(help="stage2: the checkpoint of stage 1 to begin from.")] = None,
-    model: Annotated[Literal["paper", "shared"] | None, Parameter(help="[shared, or that of --init]")] = None,
+    init: Annotated[Path | None, Parameter(help="Checkpoint of stage 1 (stage2).")] = None,
+    model: Annotated[
+        Literal["paper", "shared"] | None, Parameter(help="Architecture [shared, or that of --init].")
+    ] = None,
     model_config: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="Sizes of the model: a TOML file, or field=value, as often as needed."),
+        Parameter(negative=(), help="Sizes of the model: a TOML file, or field=value; repeat for more."),
     ] = None,
-    epochs: Annotated[Whole, Parameter(help="[12 in stage1, else 20]")] = None,
-    batch_scenes: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Whole scenes in a step, of all processes together.")
-    ] = 16,
+    epochs: Annotated[Whole, Parameter(help="Epochs [12 in stage1, else 20].")] = None,
+    batch_scenes: Annotated[int, WHOLE_NUMBER, Parameter(help="Scenes per step, over all processes.")] = 16,
     house_share: Annotated[
-        float, Parameter(help="Learn from this share of the houses alone, for learning curves.")
+        float, Parameter(help="Share of the houses to train on, for learning curves.")
     ] = 1.0,
     candidates_per_robot: Annotated[
-        Whole, Parameter(help="Take a random so many of each robot's candidates in each epoch [all].")
+        Whole, Parameter(help="Candidates sampled per robot per epoch [all].")
     ] = None,
     lr: Annotated[float | None, Parameter(help="Highest learning rate [0.002; 0.001 in stage2].")] = None,
-    weight_decay: Annotated[float | None, Parameter(help="[0 in stage1, else 0.01]")] = None,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Decides weights, order and dropout.")] = 0,
+    weight_decay: Annotated[float | None, Parameter(help="Weight decay [0 in stage1, else 0.01].")] = None,
+    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of weights, order and dropout.")] = 0,
     patience: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Epochs without a lower validation loss before it stops.")
+        int, WHOLE_NUMBER, Parameter(help="Epochs without a lower validation loss before training stops.")
     ] = 8,
     augment: Annotated[
         str | None,
-        Parameter(help="noise, holes, dropout, colour, rotation, with commas between; or a TOML file."),
+        Parameter(help="noise, holes, dropout, colour, rotation, comma-separated; or a TOML file."),
     ] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where the model computes.")] = "auto",
-    processes: Annotated[
-        Whole, Parameter(help="Processes that train together [one a GPU; on CPUs one].")
-    ] = None,
-    threads: Annotated[Whole, Parameter(help="Threads of each process [cores over processes].")] = None,
-    tensorboard: Annotated[str | None, Parameter(help="A folder for TensorBoard's curves.")] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Device of the model.")] = "auto",
+    processes: Annotated[Whole, Parameter(help="Training processes [one per GPU; one on CPUs].")] = None,
+    threads: Annotated[Whole, Parameter(help="Threads per process [cores / processes].")] = None,
+    tensorboard: Annotated[str | None, Parameter(help="Folder for TensorBoard logs.")] = None,
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
-    """Train a model and keep it, with all that made it, in one file.
+    """Train a model; the checkpoint records the data, settings and history.
 
-    stage1 learns from heuristic labels by cross-entropy weighted by class; stage2 goes on from it on sim or
-    plan labels by cross-entropy with weight decay; sim-only is stage2 from scratch. It stops when the loss
-    on houses that are not trained on no longer falls, and the best epoch's weights are those that count.
-    Ctrl-C keeps everything; the same command goes on where it stopped.
+    stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from it on sim or
+    plan labels with cross-entropy and weight decay; sim-only is stage2 from scratch. Training stops when the
+    loss on held-out houses no longer falls, and the best epoch's weights are used. After Ctrl-C, the same
+    command resumes.
+
+    For example: datagen train stage1 runs/first --out model.ckpt
     """
     if not runs:
-        raise InputError("datagen train", "RUN", "no run is named", "Name one or more run folders")
+        raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
     each = share_cores(processes, threads)
     from datagen.train.training.checkpoints import read_checkpoint
     from datagen.train.training.devices import choose_device
@@ -122,15 +126,15 @@ def train(
 
 def _refuse_odd_init(stage: str, init: Path | None, needs_one: bool) -> None:
     if init is None and needs_one:
-        problem = f"{stage} begins from the weights of stage 1, and no checkpoint is named"
+        problem = f"is missing: {stage} starts from a checkpoint of stage 1"
         raise InputError("datagen train", "--init", problem, "Give --init CKPT, or train sim-only")
     if init is not None and not needs_one:
-        problem = f"{stage} begins from fresh weights"
-        raise InputError("datagen train", "--init", problem, "Leave it out, or train stage2")
+        problem = f"does not apply: {stage} starts from random weights"
+        raise InputError("datagen train", "--init", problem, "Omit it, or train stage2")
 
 
 def _train(job: TrainingJob, processes: int) -> bool:
-    """Whether it came to its end; else it was interrupted."""
+    """Run the training; True when it finished, False when it was interrupted."""
     from datagen.train.training.launching import interruptible, train_in_processes
     from datagen.train.training.ranks import Ranks
     from datagen.train.training.training_setup import train_job
@@ -164,13 +168,13 @@ def _report(out: Path, finished: bool, json: bool) -> int:
         print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
     if finished:
         return 0
-    say_interrupted(", and nothing is lost", sys.argv[1:])
+    say_interrupted("; nothing is lost", sys.argv[1:])
     return 130
 
 
 def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str, str]]:
     yield "model", f"{head.model}, {head.stage}, sha256 {head.digest[:16]}"
-    for name, runs in (("learned from", head.data), ("judged on", head.val_data)):
+    for name, runs in (("trained on", head.data), ("validated on", head.val_data)):
         for run in runs:
             labels = f"{run['n_samples']:,} {run['schema']} labels of {run['n_scenes']:,} scenes"
             specified = "+".join(spec_hash[:12] for spec_hash in run["spec_hashes"])

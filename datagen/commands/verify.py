@@ -1,4 +1,4 @@
-"""`datagen verify`: whether a run is what it says, to the last byte."""
+"""`datagen verify`: check every record and every byte of a run."""
 
 from __future__ import annotations
 
@@ -22,28 +22,29 @@ from datagen.schemas.progress import counting
 from datagen.schemas.run import Run
 from datagen.schemas.storage import Storage, open_storage
 
-_KEPT = 10_000  # findings that are told one by one; all are counted
+_KEPT = 10_000  # findings that are listed; all are counted
 _SHOWN = 50  # of them on a terminal
 
 
 def verify(
     run: RunPlace,
+    /,
     *,
     deep: Annotated[
-        int,
-        WHOLE_NUMBER,
-        Parameter(help="Recompute so many random samples, and draw so many random scenes again."),
+        int, WHOLE_NUMBER, Parameter(help="Number of random samples and of random scenes to compute again.")
     ] = 0,
     seed: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Which samples and scenes --deep takes [others each time].")
+        int | None, WHOLE_NUMBER, Parameter(help="Seed of the samples and scenes of --deep [random].")
     ] = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
     """Check a run: every record and its copy, every file and its rows, the ledger, the sealed store.
 
-    Nothing is written. Each finding names the file, what is wrong and how to mend it. Exit code 0 when
-    there is none, 1 when there are some. With --deep, labels are computed again too.
+    No file is written. Each finding names the file, the problem and the fix. Exit code 0 when there is no
+    damage, else 1. With --deep, labels are also computed again.
+
+    For example: datagen verify runs/first
     """
     if not 0 <= deep <= 1_000_000:
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
@@ -65,14 +66,14 @@ def verify(
 
 
 class Found:
-    """Findings as they come: all are counted, the first are kept."""
+    """Findings as they are found: all are counted, the first are kept."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.kept: list[Finding] = []
 
     def take(self, findings: Iterable[Finding]) -> None:
-        """Take all of them."""
+        """Count the findings and keep the first."""
         for finding in findings:
             self.counts[finding.kind] += 1
             if len(self.kept) < _KEPT:
@@ -80,13 +81,13 @@ class Found:
 
     @property
     def damage(self) -> int:
-        """How many findings are damage, and not only age."""
+        """Number of findings that are damage."""
         return self.counts.total() - self.counts["stale"]
 
 
 def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources) -> Iterator[Finding]:
-    """Samples recomputed and scenes redrawn, shared out among the runs."""
-    # Simulators are imported only where they are needed.
+    """Findings of samples and scenes computed again, divided among the runs."""
+    # Simulators are imported only for --deep_check.
     from datagen.regeneration.deep_check import deep_findings
     from datagen.regeneration.shards import open_sources
 
@@ -142,7 +143,7 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
     files, attempts = counted(checked.files, "file"), counted(totals.attempts, "attempt")
     rows = [
         ("shards", f"{checked.shards:,}, {files} of {size(checked.bytes)}, every byte"),
-        ("samples", f"{checked.samples:,}; each id is that of its specification, scene and candidate"),
+        ("samples", f"{checked.samples:,}, with correct ids"),
         (
             "ledger",
             f"{attempts}: {seconds(wall_s)} = {seconds(totals.committed_wall_s)} in commits"
@@ -153,9 +154,9 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
     deep = report["deep"]
     if deep:
         asked = deep["asked"]
-        done = f"{counted(asked, 'sample')} recomputed, {counted(asked, 'scene')} drawn again"
+        done = f"{counted(asked, 'sample')} and {counted(asked, 'scene')} computed again"
         rows.append(
-            ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: mend it first")
+            ("deep", f"{done} (--seed {deep['seed']})" if deep["done"] else "not done: repair the run first")
         )
     state = "clean" if not found.damage else counted(found.damage, "finding")
     print_rows(f"{state}: {report['run']}", rows)
@@ -163,12 +164,12 @@ def _print(report: dict[str, Any], checked: Checked, found: Found) -> None:
 
 
 def print_findings(title: str, findings: list[Finding], total: int) -> None:
-    """The findings one by one: the file, and below it what is wrong and how to mend it."""
+    """List the findings: the file, and below it the problem and the fix."""
     if not findings:
         return
-    lines = [f"{title}: the file, what is wrong, how to mend it"]
+    lines = [f"{title}: the file, the problem, the fix"]
     for finding in findings[:_SHOWN]:
         lines += [f"  {printable(finding.key)}", f"      {printable(f'{finding.problem}. {finding.mend}')}"]
     if total > _SHOWN:
-        lines.append(f"  and {total - _SHOWN:,} more: --json tells them")
+        lines.append(f"  and {total - _SHOWN:,} more: --json lists them")
     print_lines("\n".join(lines))

@@ -1,1 +1,1 @@
-"""From options, files and stored scenes to a specification, a layout and a manifest."""
+"""Make the specification, layout and manifest of a run from options, files and stored scenes."""

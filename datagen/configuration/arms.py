@@ -1,4 +1,4 @@
-"""The arm of a specification: which robot `plan` and `sim` label for, and where that robot can stand."""
+"""The arm of a specification: the robot of `plan` and `sim` labels, and the candidates that suit it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from datagen.schemas.specification import ArmParams, CandidateParams, Disturbanc
 from datagen.workers.registry import SIM_MEND
 from datagen.workers.robots import ROBOTS, robot_limits
 
-# Label sources that move an arm, and the distributions whose version can move bits of their labels.
+# Label sources that move an arm, and the distributions whose version can change bits of their labels.
 ARM_PACKAGES: dict[str, tuple[str, ...]] = {
     "plan": ("coal", "mani_skill", "pin", "sapien"),
     "sim": ("coal", "mani_skill", "pin", "sapien"),
@@ -31,49 +31,46 @@ def refuse_missing_packages(label_source: str) -> None:
         try:
             version(name)
         except PackageNotFoundError:
-            problem = f"needs {name}, which is not installed"
-            raise InputError("label source", label_source, problem, SIM_MEND) from None
+            raise InputError("label source", label_source, f"needs {name}, not installed", SIM_MEND) from None
 
 
 def arm_versions(label_source: str) -> dict[str, str]:
-    """Versions of what moves the arm of this label source, by distribution; none for one without an arm."""
+    """Versions of the distributions that plan or simulate the arm of this label source."""
     return {name: version(name) for name in ARM_PACKAGES.get(label_source, ())}
 
 
 def complete_arm(
     label_source: str, fields: Fields, robot: str | None, repeats: int | None, place: str
 ) -> None:
-    """Fill in the section `arm` of a specification's fields, as this label source has it.
+    """Fill in the section `arm` of a specification's fields for this label source.
 
-    `robot` and `repeats` are the options --robot and --perturb, and win over the section that came
-    from `place`. Raises InputError for what contradicts the label source.
+    `robot` and `repeats` are the options --robot and --perturb, and override the section that came from
+    `place`. Raises InputError for what the label source does not support.
     """
     if repeats is not None and label_source != "sim":
-        mend = "Take it out, or submit sim"
-        raise InputError("--perturb", str(repeats), f"nothing is executed by {label_source}", mend)
+        mend = "Omit it, or submit sim"
+        raise InputError("--perturb", str(repeats), f"{label_source} runs no trials", mend)
     if repeats is not None:
         try:
             DisturbanceParams(repeats=repeats)
         except ValidationError as error:
             problem = error.errors()[0]["msg"]
-            raise InputError(
-                "--perturb", str(repeats), problem, "Leave it out for undisturbed trials"
-            ) from None
+            raise InputError("--perturb", str(repeats), problem, "Omit it for undisturbed trials") from None
     if label_source not in ARM_PACKAGES:
         if "arm" in fields:
-            raise InputError(place, "arm", f"{label_source} has no arm", "Take the section out")
+            raise InputError(place, "arm", f"{label_source} has no arm", "Remove the section")
         return
     arm = fields.setdefault("arm", {})
     if not isinstance(arm, dict):
         return  # the specification refuses it
     for section in _NOT_FOR[label_source]:
         if section in arm:
-            problem = f"nothing is executed by {label_source}"
-            raise InputError(place, f"arm.{section}", problem, "Take the section out, or submit sim")
+            problem = f"{label_source} runs no trials"
+            raise InputError(place, f"arm.{section}", problem, "Remove the section, or submit sim")
     if robot is not None:
         arm["robot"] = robot
     elif isinstance(named := arm.get("robot"), str) and named not in ROBOTS:
-        raise InputError(place, "arm.robot", f"no robot named {named!r}", choices(ROBOTS))
+        raise InputError(place, "arm.robot", f"{named!r} is unknown", choices(ROBOTS, str(named)))
     if label_source == "sim":
         arm.setdefault("trial", {})
         if repeats is not None:
@@ -83,7 +80,7 @@ def complete_arm(
 
 
 def robot_of(fields: Fields, robot: str | None) -> str | None:
-    """The robot that candidates must suit: --robot, or that of the arm; None where any will do."""
+    """The robot that candidates must suit: --robot, or that of the arm; None for any."""
     arm = fields.get("arm")
     if robot is not None or not isinstance(arm, dict):
         return robot
@@ -92,9 +89,9 @@ def robot_of(fields: Fields, robot: str | None) -> str | None:
 
 
 def narrow_candidates(fields: Fields, robot: str) -> None:
-    """Leave of the candidates' ranges what the robot has, where the fields do not set them.
+    """Narrow the ranges of candidates that the fields do not set to those of the robot.
 
-    Raises InputError naming --robot for an unknown robot.
+    Raises InputError for an unknown robot.
     """
     limits, defaults = robot_limits(robot), CandidateParams()
     candidates = fields.setdefault("candidates", {})
@@ -108,7 +105,7 @@ def narrow_candidates(fields: Fields, robot: str) -> None:
 
 
 def refuse_unsuited(spec: Specification, robot: str, place: str, mend: str) -> None:
-    """Raise InputError where candidates of this specification ask for what the robot is not."""
+    """Raise InputError where candidates of this specification do not suit the robot."""
     limits, candidates = robot_limits(robot), spec.candidates
     for field, asked, limit in (
         ("arm_reach_m", candidates.arm_reach_m, limits.reach_m),
@@ -125,6 +122,6 @@ def refuse_unsuited(spec: Specification, robot: str, place: str, mend: str) -> N
 
 
 def _narrowed(default: Range, limit: tuple[float, float]) -> dict[str, float]:
-    """What default and limit share, or the limit where they share nothing."""
+    """The intersection of default and limit, or the limit where it is empty."""
     low, high = max(default.low, limit[0]), min(default.high, limit[1])
     return {"low": low, "high": high} if low <= high else {"low": limit[0], "high": limit[1]}

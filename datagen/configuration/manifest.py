@@ -1,4 +1,4 @@
-"""The manifest of a new run: what makes it, and what it is made with."""
+"""The manifest of a new run: specification, layout, sources and versions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def manifest_of(
 ) -> Manifest:
     """The manifest of a new run in shards of this layout.
 
-    `schema_version` is that of the run whose scenes are taken: what their rows lack cannot be stored.
+    `schema_version` is that of the run whose scenes are labelled: fields that its rows lack cannot be stored.
     """
     source = load_label_source(spec.label_source)
     newest = SCHEMAS[source.schema].version

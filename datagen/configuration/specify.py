@@ -33,7 +33,7 @@ Options = Mapping[str, Any]  # by dotted name in the specification; None where n
 
 _MAX_CONFIG_BYTES = 1 << 20
 _MAX_DEPTH = 16
-# Distributions whose version can move bits of a sample, by the engine that needs them.
+# Distributions whose version can change bits of a sample, by the engine that needs them.
 _ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
 _SCENES_PER_SHARD = 32
 _SHARDS_AT_LEAST = 8
@@ -48,11 +48,10 @@ def specify(
     robot: str | None = None,
     repeats: int | None = None,
 ) -> Specification:
-    """The specification that the options (dotted names, None where not given) and the file ask for.
+    """Return the specification of the options (dotted names, None where not given) and the file.
 
-    An option wins over the file, the file over the default. `robot` and `repeats` are --robot and
-    --perturb. Raises InputError naming the option or the file and the field, or an engine that
-    cannot be imported here.
+    An option overrides the file, and the file the default. `robot` and `repeats` are --robot and --perturb.
+    Raises InputError for an option, for a field of the file, and for an engine that cannot be imported here.
     """
     place = str(config) if config else "options"
     fields = read_fields(config)
@@ -61,7 +60,7 @@ def specify(
             put_field(fields, name, value, config)
     settle = fields.setdefault("settle", {})
     if isinstance(settle, dict):
-        # SAPIEN where its libraries are, else what works here; the choice is recorded.
+        # SAPIEN where it can be imported, else the first that can; the choice is recorded.
         settle.setdefault("engine", first_settler())
     complete_arm(label_source, fields, robot, repeats, place)
     chosen = robot_of(fields, robot)
@@ -72,7 +71,7 @@ def specify(
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
         if candidates.get("per_scene") == "grid":
-            # The cells of a whole grid are ranked against each other, so one robot stands on all.
+            # The cells of a whole grid are ranked against each other, so they have one robot.
             candidates.setdefault("robots_per_scene", 1)
     fields |= {
         "label_source": label_source,
@@ -81,34 +80,35 @@ def specify(
     }
     spec = validated(fields, place)
     if spec.candidates.per_scene == "grid" and spec.candidates.within is not None:
-        problem = f"a whole grid is not only {spec.candidates.within}"
+        problem = f"a whole grid has other cells than {spec.candidates.within} ones"
         raise InputError(place, "candidates.within", problem, "Give --candidates-per-scene 60")
     if chosen is not None:
-        refuse_unsuited(spec, chosen, place, "Correct the values, or take another --robot")
-    for field, name, registry in (
-        ("settle.engine", spec.settle.engine, SETTLERS),
-        ("observation.renderer", spec.observation.renderer, RENDERERS),
+        refuse_unsuited(spec, chosen, place, "Correct the values, or choose another --robot")
+    for option, field, name, registry in (
+        ("--settler", "settle.engine", spec.settle.engine, SETTLERS),
+        ("--renderer", "observation.renderer", spec.observation.renderer, RENDERERS),
     ):
         if name not in registry:
-            raise InputError(place, field, f"no {field.split('.')[-1]} named {name!r}", choices(registry))
+            given = option if options.get(field) == name else place
+            raise InputError(given, field, f"{name!r} is unknown", choices(registry, name))
     load_settler(spec.settle.engine)
     load_renderer(spec.observation.renderer)
     return spec.model_copy(update={"engines": scene_engines(spec) | label_engines(spec.label_source)})
 
 
 def read_fields(config: Path | None) -> dict[str, Any]:
-    """The fields that the file sets. Raises InputError for those that are not set there."""
+    """The fields of the file. Raises InputError for those that only the command line may set."""
     fields = read_toml(config) if config else {}
     for reserved in ("label_source", "houses", "objects", "engines", "scenes_from"):
         if reserved in fields:
             raise InputError(
-                config or "", reserved, "is not set in this file", "Give it on the command line instead"
+                config or "", reserved, "cannot be set in this file", "Give it on the command line instead"
             )
     return fields
 
 
 def validated(fields: dict[str, Any], place: str) -> Specification:
-    """The specification of these fields. Raises InputError naming the first that is wrong."""
+    """The specification of these fields. Raises InputError for the first that is wrong."""
     try:
         return Specification.model_validate(fields)
     except ValidationError as error:
@@ -116,11 +116,11 @@ def validated(fields: dict[str, Any], place: str) -> Specification:
 
 
 def first_of(error: ValidationError, place: str, *section: str) -> InputError:
-    """The first field that is wrong in a file, or in this section of it, as one line."""
+    """The first field that is wrong in a file, or in this section of it."""
     first = error.errors()[0]
     field = ".".join((*section, *map(str, first["loc"])))
     mend = (
-        "Take the key out, or correct it: docs/reference/specification.md lists all"
+        "Remove or correct the key: docs/reference/specification.md lists all"
         if (first["type"] == "extra_forbidden")
         else "Correct the value"
     )
@@ -128,9 +128,9 @@ def first_of(error: ValidationError, place: str, *section: str) -> InputError:
 
 
 def layout_of(spec: Specification, n: int) -> Layout:
-    """Scenes in shards of about 32, fewer for a small run so that workers share it evenly.
+    """Shards of about 32 scenes, of fewer in a small run so that workers share it evenly.
 
-    A number of scenes that divides evenly is preferred: then nothing beyond n is made.
+    A number of scenes that divides evenly is preferred, so that no label beyond n is made.
     """
     scenes = -(-n // spec.candidates.count)
     most = max(1, min(_SCENES_PER_SHARD, scenes // _SHARDS_AT_LEAST))
@@ -139,13 +139,13 @@ def layout_of(spec: Specification, n: int) -> Layout:
 
 
 def scene_engine_names(spec: Specification) -> set[str]:
-    """Names in `engines` of what moves bits of the scenes and candidates of this specification."""
+    """Names in `engines` of what can change bits of the scenes and candidates of this specification."""
     used = (spec.settle.engine, spec.observation.renderer)
     return {"scenes", *(_ENGINE_PACKAGES[name] for name in used)}
 
 
 def label_engines(label_source: str) -> dict[str, str]:
-    """Versions of what moves bits of labels, and of the random streams that scenes and labels draw from."""
+    """Versions of what can change bits of labels, and of the random streams of scenes and labels."""
     return {
         _ENGINE_PACKAGES["embree"]: version(_ENGINE_PACKAGES["embree"]),
         # numpy may change what a generator draws between feature releases, never between patches.
@@ -156,13 +156,13 @@ def label_engines(label_source: str) -> dict[str, str]:
 
 
 def scene_engines(spec: Specification) -> dict[str, str]:
-    """Versions here of what moves bits of the scenes and candidates of this specification."""
+    """Versions on this machine of what can change bits of the scenes and candidates."""
     packages = sorted(scene_engine_names(spec) - {"scenes"})
     return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
 
 
 def read_toml(
-    path: Path, mend: str = "Give a TOML file as docs/reference/specification.md shows it"
+    path: Path, mend: str = "Give a TOML file as in docs/reference/specification.md"
 ) -> dict[str, Any]:
     """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
     data = read_regular(path, _MAX_CONFIG_BYTES, mend)
@@ -173,8 +173,8 @@ def read_toml(
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """What TOML text holds. ValueError where it is none, or nested more deeply than any configuration."""
-    # The parser's memory grows with the square of the parts of a dotted key.
+    """Return the content of TOML text. ValueError where it is not TOML, or nested too deeply."""
+    # The parser's memory grows with the square of the number of parts of a dotted key.
     if any(line.count(".") > 1000 for line in text.splitlines()):
         raise ValueError("nested too deeply: more than 1000 dots in a line")
     try:
@@ -182,7 +182,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("nested too deeply") from None
     level: list[Any] = [document]
-    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond what can be printed
+    for _ in range(_MAX_DEPTH):  # dotted keys nest without brackets, beyond the recursion limit
         tables = [value.values() if isinstance(value, dict) else value for value in level]
         level = [value for table in tables for value in table if isinstance(value, dict | list)]
     if level:
@@ -196,6 +196,6 @@ def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None
     for parent in parents:
         below = fields.setdefault(parent, {})
         if not isinstance(below, dict):
-            raise InputError(config or "", parent, "is a value where a section belongs", f"Write [{parent}]")
+            raise InputError(config or "", parent, "is a value, not a section", f"Write [{parent}]")
         fields = below
     fields[leaf] = value

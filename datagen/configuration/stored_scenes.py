@@ -1,4 +1,4 @@
-"""`--scenes-from`: the scenes and candidates of an existing run, to be labelled again."""
+"""`--scenes-from`: label the scenes and candidates of an existing run again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from datagen.schemas.run_records import Layout
 from datagen.schemas.scene_rows import committed_scenes
 from datagen.schemas.specification import Specification
 
-# What a configuration may still decide: how stored scenes are labelled.
+# Sections that a configuration may set for stored scenes.
 _LABEL_SECTIONS = ("arm", "heuristic", "visibility")
 
 
@@ -39,24 +39,24 @@ class StoredScenes:
         return self.run.layout.candidates_per_scene
 
     def available(self) -> int:
-        """Candidates of the scenes that are committed without a gap."""
+        """Number of candidates in the scenes before the first missing shard."""
         return committed_scenes(self.run) * self.candidates_per_scene
 
 
 def open_stored_scenes(
     place: str, houses: str | None, objects: str | None, given: Mapping[str, Any]
 ) -> StoredScenes:
-    """The run at `place`. `given` are the options that decide scenes, by name: none may be given.
+    """Open the run at `place`. `given` are the options that decide scenes, by name: all must be unset.
 
-    `houses` and `objects` are where the sources lie now, None where the run found them. Raises
-    InputError for an option that would change scenes or candidates, and for a place without a run.
+    `houses` and `objects` are the sources now, None for those in the run's manifest. Raises InputError for an
+    option that would change scenes or candidates, and for a path without a run.
     """
     for option, value in given.items():
         if value is not None and value is not False:
-            problem = "scenes and candidates are those of --scenes-from"
-            raise InputError(option, str(value), problem, f"Take {option} out, or --scenes-from")
+            problem = "cannot change the scenes and candidates of --scenes-from"
+            raise InputError(option, str(value), problem, f"Omit {option} or --scenes-from")
     run = Run.open(place)
-    _ = run.schema  # refuses stores of another version, whose rows would not fit
+    _ = run.schema  # InputError for stores of another version, whose rows do not fit
     sources = run.manifest.sources
     return StoredScenes(
         run, houses or sources.get("houses", "builtin"), objects or sources.get("objects", "builtin")
@@ -71,24 +71,24 @@ def specify_again(
     repeats: int | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Specification:
-    """The stored run's specification with other labels.
+    """Return the stored run's specification with another label source or other parameters of labels.
 
-    The configuration may set the sections `arm`, `heuristic` and `visibility`; what it leaves out is as
-    in the stored run. `options`, by dotted name, win over it. Raises InputError for other sections, and
-    for a robot that the stored candidates do not suit.
+    The configuration may set the sections `arm`, `heuristic` and `visibility`; the rest is as in the stored
+    run. `options`, by dotted name, override it. Raises InputError for other sections, and for a robot that
+    the stored candidates do not suit.
     """
     before = stored.run.manifest.spec
     place = str(config) if config else "options"
     chosen = read_fields(config)
     for section in chosen:
         if section not in _LABEL_SECTIONS:
-            problem = "decides scenes and candidates, which are those of --scenes-from"
-            raise InputError(place, section, problem, "Take it out")
+            problem = "cannot change the scenes and candidates of --scenes-from"
+            raise InputError(place, section, problem, "Remove the section")
     for name, value in (options or {}).items():
         put_field(chosen, name, value, config)
     fields = before.model_dump(mode="json", exclude_none=True)
     arm = fields.pop("arm", {})
-    # Which arm it is and how it plans stays; whether worlds are disturbed is said for each run.
+    # The robot and its planning stay; disturbances are chosen for each run.
     arm.pop("disturbance", None)
     if label_source != before.label_source:
         arm.pop("trial", None)
@@ -104,13 +104,13 @@ def specify_again(
     }
     spec = validated(fields, place)
     if suited is not None:
-        mend = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or take another robot"
+        mend = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or choose another robot"
         refuse_unsuited(spec, suited, stored.run.storage.url, mend)
     return spec
 
 
 def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
-    """The layout of a new run of n labels whose whole shards are within the stored scenes."""
+    """The layout of a new run of n labels, in shards that the stored scenes fill."""
     per_scene, there = stored.candidates_per_scene, stored.available() // stored.candidates_per_scene
     wanted = -(-n // per_scene)
     most = layout_of(spec, n).scenes_per_shard
@@ -119,19 +119,19 @@ def layout_again(spec: Specification, stored: StoredScenes, n: int) -> Layout:
 
 
 def refuse_too_few(stored: StoredScenes, layout: Layout, n: int) -> None:
-    """Raise InputError where n labels in shards of this layout need more scenes than are stored."""
+    """Raise InputError where n labels in shards of this layout need more scenes than there are."""
     shards = stored.available() // layout.samples_per_shard
     if layout.shards_for(n) > shards:
         raise InputError(
             "--n",
             str(n),
-            f"{stored.run.storage.url} has {shards * layout.samples_per_shard} committed candidates for it",
+            f"is more than the {shards * layout.samples_per_shard:,} candidates of {stored.run.storage.url}",
             "Ask for fewer labels, or extend that run first",
         )
 
 
 def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Nested dictionaries, `above` over `below`."""
+    """Nested dictionaries merged; `above` overrides `below`."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)

@@ -1,1 +1,1 @@
-"""The terminal: tables, JSON, progress, numbers among the options."""
+"""The terminal: tables, JSON, command lines and shared options."""

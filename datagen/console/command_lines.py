@@ -1,4 +1,4 @@
-"""Command lines that a user can paste, and what an interrupted command says."""
+"""Command lines to copy, and the message of an interrupted command."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 def words_of(options: Mapping[str, object]) -> list[str]:
-    """Options as words of a command line; None and False say nothing."""
+    """Options as words of a command line; None and False are omitted."""
     words: list[str] = []
     for name, value in options.items():
         if value is True:
@@ -20,20 +20,20 @@ def words_of(options: Mapping[str, object]) -> list[str]:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """The command that a user can paste."""
+    """The quoted command line."""
     return shlex.join(["datagen", *words])
 
 
 def say_interrupted(how: str, words: Sequence[str]) -> None:
-    """Say that the command was interrupted, and with which words it goes on."""
-    sys.stderr.write(f"interrupted{how}. Go on with:\n  {command_line(words)}\n")
+    """Print that the command was interrupted, and the command that resumes it."""
+    sys.stderr.write(f"interrupted{how}. Resume with:\n  {command_line(words)}\n")
 
 
 @contextmanager
 def resumable(words: Sequence[str]) -> Generator[None]:
-    """Tell whoever interrupts the block how to go on."""
+    """Print how to resume where the block is interrupted."""
     try:
         yield
     except KeyboardInterrupt:
-        say_interrupted(" early; what is committed stays", words)
+        say_interrupted("; committed shards are kept", words)
         raise

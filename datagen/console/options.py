@@ -1,4 +1,4 @@
-"""Options that many verbs have, each worded once."""
+"""Options that several verbs share."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from datagen.schemas.errors import InputError
 
 _MOST_RESAMPLES = 10_000
 
-RunPlace = Annotated[str, Parameter(help="The run's folder or s3:// address; also of merged runs.")]
+RunPlace = Annotated[str, Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")]
 AllowIncomplete = Annotated[
-    bool, Parameter(negative=(), help="Read runs that lack samples of their plan, too, instead of failing.")
+    bool, Parameter(negative=(), help="Accept runs that lack planned samples instead of failing.")
 ]
-AsJson = Annotated[bool, Parameter(negative=(), help="Print one JSON document.")]
+AsJson = Annotated[bool, Parameter(negative=(), help="Print one JSON document to standard output.")]
 
 
 def refuse_odd_draws(bootstrap: int, seed: int) -> None:
-    """InputError for a number of resamples, or a seed, that cannot be used."""
+    """Raise InputError for a number of resamples or a seed that is out of range."""
     if not 1 <= bootstrap <= _MOST_RESAMPLES:
-        mend = f"Give 1 to {_MOST_RESAMPLES}; 1000 is usual"
-        raise InputError("--bootstrap", str(bootstrap), "not a usable number of resamples", mend)
+        mend = "Give another number; 1000 is usual"
+        raise InputError("--bootstrap", str(bootstrap), f"is not between 1 and {_MOST_RESAMPLES}", mend)
     if seed < 0:
-        raise InputError("--seed", str(seed), "below 0", "Give 0 or more")
+        raise InputError("--seed", str(seed), "is below 0", "Give 0 or more")
 
 
 def refuse_output(file: Path, option: str, *endings: str) -> None:
-    """InputError for a file to be written that has another ending, or whose folder is not there."""
+    """Raise InputError for an output file with another suffix or in a folder that does not exist."""
     if file.suffix.lower() not in endings:
         valid = " or ".join(endings)
         raise InputError(file, option, f"is not a {valid} file", f"Give a name that ends in {valid}")

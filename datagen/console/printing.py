@@ -1,7 +1,6 @@
-"""What verbs print: tables for people, JSON for programs.
+"""Output of verbs: tables for people, JSON for programs.
 
-Records of a run may be another user's. So whatever a terminal acts on is printed as its escape, and brackets
-are not markup.
+Records of a run may come from another user, so control characters are escaped, and brackets are not markup.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from datagen.schemas.errors import printable
 
 
 def print_json(value: Any, indent: int | None = 2) -> None:
-    """One JSON document on standard output: whole or, where a value has no place in JSON, nothing of it."""
+    """Print one JSON document; ValueError, before any output, for values that JSON cannot hold."""
     sys.stdout.write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
 def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:
-    """A table; the first column is left-aligned, the others right-aligned when there are heads."""
+    """Print a table; the first column is left-aligned, the others right-aligned when there are heads."""
     table = Table(show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
     for k in range(len(heads)) if heads else range(2):
         table.add_column(
@@ -33,30 +32,30 @@ def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] =
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
-    # A table's own title is wrapped to the table's width.
+    # Printed apart: rich wraps a table's own title to the table's width.
     console.print(Text(printable(title), style="italic"), soft_wrap=True)
     console.print(table)
 
 
 def print_lines(text: str, indent: str = "", stream: TextIO | None = None) -> None:
-    """The lines of a text on standard output, or on another stream."""
+    """Print the lines of a text to standard output or another stream."""
     out: TextIO = stream or sys.stdout
     out.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
     out.flush()
 
 
 def counted(n: int, what: str) -> str:
-    """How many there are of what has a regular plural: 1 shard, 1,200 shards."""
+    """A count with its noun: 1 shard, 1,200 shards."""
     return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
 
 
 def listed(values: Sequence[object], most: int = 10) -> str:
-    """The first of them: 3, 5, 8, ..."""
+    """The first values: 3, 5, 8, ..."""
     return ", ".join(map(str, values[:most])) + (", ..." if len(values) > most else "")
 
 
 def seconds(value: float) -> str:
-    """A duration as people read it: 0.8 s, 3 min 20 s, 2 h 5 min, 3.1 days."""
+    """A duration: 0.8 s, 3 min 20 s, 2 h 5 min, 3.1 days."""
     if value < 60:
         return f"{value:.2g} s" if value < 1 else f"{value:.1f} s"
     if value < 3600:
@@ -67,7 +66,7 @@ def seconds(value: float) -> str:
 
 
 def size(value: float) -> str:
-    """Bytes as people read them."""
+    """A size in bytes with its unit: 1.2 MB."""
     for unit in ("B", "kB", "MB", "GB"):
         if value < 1000:
             return f"{value:.3g} {unit}"

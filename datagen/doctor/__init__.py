@@ -1,4 +1,4 @@
-"""`datagen doctor`: what this machine can do, each problem with its mend."""
+"""`datagen doctor`: check this machine, and show how to fix each problem."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
     except InputError as error:
         return Check(name, "fail", f"{error.place}: {error.problem}", error.mend)
     if n == 0:
-        return Check(name, "fail", f"{ref}: none", "Name a folder that holds some.")
+        return Check(name, "fail", f"{ref}: none", f"Name a folder with {name}.")
     return Check(name, "ok", f"{n} from {ref}")
 
 
@@ -47,7 +47,7 @@ def _objects(ref: str) -> int:
 
 
 def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
-    """Counts of houses and objects: those named, else those in DATAGEN_ASSETS, else the built-in ones."""
+    """Checks of houses and objects: those given, else those in DATAGEN_ASSETS, else the built-in ones."""
     root = os.environ.get("DATAGEN_ASSETS")
     if root and houses is None and (Path(root) / "procthor").is_dir():
         houses = f"procthor:{Path(root) / 'procthor'}"
@@ -63,13 +63,13 @@ def as_json(checks: list[Check]) -> dict[str, Any]:
 
 
 def as_table(checks: list[Check]) -> Table:
-    """One row a check; the mend under the finding."""
+    """A table with one row per check; the fix is below the finding."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for check in checks:
-        # Details hold paths and messages of others: Text, because brackets in them are not markup.
+        # Text, because brackets in paths and messages are not markup.
         finding = Text(check.detail)
         if check.mend:
             finding.append(f"\n-> {check.mend}", style="cyan")
@@ -81,13 +81,13 @@ def doctor(
     *,
     json: AsJson = False,
     houses: Annotated[
-        str | None, Parameter(help="Houses to look for: builtin, procthor:DIR or ai2thor:DIR.")
+        str | None, Parameter(help="Houses to check: builtin, procthor:DIR or ai2thor:DIR.")
     ] = None,
-    objects: Annotated[str | None, Parameter(help="Objects to look for: builtin or ycb:DIR.")] = None,
+    objects: Annotated[str | None, Parameter(help="Objects to check: builtin or ycb:DIR.")] = None,
 ) -> int:
-    """Say what this machine can do, and how to mend what it cannot.
+    """Check this machine, and show how to fix what is missing.
 
-    Exits with 0 when labels can be made here, else with 1.
+    Exit code 0 when labels can be made here, else 1.
     """
     checks = [*host_checks(), *engine_checks(), *arm_checks(), *asset_checks(houses, objects)]
     failures = sum(check.status == "fail" for check in checks)

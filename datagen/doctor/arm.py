@@ -1,4 +1,4 @@
-"""Whether arms can be planned for and trials run, asked in processes of their own: the `sim` extra."""
+"""Checks of planning and grasp trials, in separate processes: the `sim` extra."""
 
 from __future__ import annotations
 
@@ -35,17 +35,16 @@ raise SystemExit(main())
 """
 
 _AGAIN = "Install it again: pip install --force-reinstall pin coal mani-skill"
-# Several times what it takes where every file is read for the first time and the cores are busy.
+# Several times the usual duration: files may be read for the first time, and the cores may be busy.
 _DEADLINE_S = 120.0
-# An arm stands so high where its own limits allow any height.
+# Mount height for robots that allow any.
 _HEIGHT_M = 0.5
 
 
 def arm_checks() -> list[Check]:
-    """The arm libraries, every robot of the registry, and a trial in physics.
+    """Check the arm libraries, every robot of the registry, and a grasp trial.
 
-    Nothing here fails the machine: heuristic labels need none of it. Where the libraries are missing
-    the rest is not asked.
+    No check fails, because heuristic labels need none of this. Without the libraries the rest is skipped.
     """
     libraries = probe(_LIBRARIES, _DEADLINE_S)
     if not libraries.succeeded:
@@ -60,6 +59,6 @@ def arm_checks() -> list[Check]:
         mend = SIM_MEND if "not installed" in opened.text else f"Use another --robot, or: {_AGAIN}"
         checks.append(opened.check(f"robot {name}", "warn", mend))
     trial = probe(_TRIAL, _DEADLINE_S)
-    mend = "See sapien physics and the robots above; plan labels need no physics."
+    mend = "See `sapien physics` and the robots above; plan labels need no physics."
     checks.append(trial.check("grasp trial", "warn", mend))
     return checks

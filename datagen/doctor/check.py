@@ -1,4 +1,4 @@
-"""One finding of the doctor, and the probe that asks an engine a question in a process of its own."""
+"""One finding of the doctor, and the probe that runs code in a separate process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Status = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report. `fail` means that labels cannot be made; `warn` that something is lost.
+    """One line of the report. `fail`: labels cannot be made; `warn`: a feature is missing.
 
-    `mend` is what to do about it, "" where nothing is to be done.
+    `mend` is the fix, "" where none is needed.
     """
 
     name: str
@@ -26,13 +26,13 @@ class Check:
 
 @dataclass(frozen=True)
 class Probe:
-    """How a probe ended: its last line of output, or why there is none."""
+    """The result of a probe: its last line of output, or why there is none."""
 
     succeeded: bool
     text: str
 
     def check(self, name: str, failed: Status, mend: str) -> Check:
-        """The check of that name: ok, or `failed` with how to mend it."""
+        """The check of that name: ok, or `failed` with its fix."""
         return Check(name, "ok", self.text) if self.succeeded else Check(name, failed, self.text, mend)
 
 
@@ -42,7 +42,7 @@ def _last_line(text: str) -> str:
 
 
 def probe(code: str, timeout_s: float = 60.0) -> Probe:
-    """Run Python code in a fresh interpreter, so that a crash or a hang there is only a finding here."""
+    """Run Python code in a new interpreter, so that a crash or a hang is only a finding."""
     try:
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-c", code],
@@ -54,9 +54,9 @@ def probe(code: str, timeout_s: float = 60.0) -> Probe:
             stdin=subprocess.DEVNULL,
         )
     except subprocess.TimeoutExpired:
-        return Probe(False, f"no answer within {timeout_s:.0f} s")
+        return Probe(False, f"no result within {timeout_s:.0f} s")
     except OSError as error:
-        return Probe(False, f"could not start an interpreter: {error.strerror}")
+        return Probe(False, f"cannot start an interpreter: {error.strerror}")
     if done.returncode == 0:
         return Probe(True, _last_line(done.stdout))
     if done.returncode < 0:

@@ -1,4 +1,4 @@
-"""Whether each engine works, asked in processes of their own: one step, one ray, one frame."""
+"""Checks of each engine in separate processes: one step, one ray, one frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ assert actor.pose.p[2] < 1.0, "the cube does not fall"
 print("sapien " + importlib.metadata.version("sapien") + ", a cube falls")
 """
 
-# A render system is created before anything is drawn, and it is what fails without a device.
+# Creating the render system is what fails without a device.
 _SAPIEN_RENDER = """
 import importlib
 sapien = importlib.import_module("sapien")
@@ -64,9 +64,9 @@ _MESA_MEND = (
 
 
 def engine_checks() -> list[Check]:
-    """Settlers, renderers, the ray caster and Ray. One working settler is enough."""
+    """Check settlers, renderers, the ray caster and Ray. One working settler is enough."""
     sapien, pybullet = probe(_SAPIEN_PHYSICS), probe(_PYBULLET)
-    # An engine that is lost is a loss; with both lost there is nothing left to settle scenes with.
+    # One broken settler is a warning; without any, scenes cannot be settled.
     lost = "warn" if sapien.succeeded or pybullet.succeeded else "fail"
     embree, ray = probe(_EMBREE), probe(_RAY)
     checks = [
@@ -81,5 +81,5 @@ def engine_checks() -> list[Check]:
 
 
 def probe_render_device() -> Probe:
-    """Whether SAPIEN finds a device to render with; says which, or why not."""
+    """Whether SAPIEN finds a render device; which, or why not."""
     return probe(_SAPIEN_RENDER)

@@ -1,4 +1,4 @@
-"""What the machine itself offers: interpreter, cores, memory, disks, limits, shared libraries, GPU."""
+"""Checks of the machine: interpreter, cores, memory, disks, limits, shared libraries, GPU."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from datagen.workers.content_cache import cache_folder
 GIB = 2**30
 CGROUP = Path("/sys/fs/cgroup")
 
-# A worker with houses, meshes and an engine loaded needs about half of this.
+# A worker with houses, meshes and an engine needs about half of this.
 ENOUGH_MEMORY_BYTES = 2 * GIB
 LEAST_MEMORY_BYTES = GIB // 2
 # 180,000 labels fit in 400 MB; the sealed store shares their files by hard links.
@@ -30,7 +30,7 @@ LEAST_DISK_BYTES = 100 * 2**20
 ENOUGH_SHM_BYTES = 256 * 2**20
 ENOUGH_OPEN_FILES = 4096
 
-# Library -> (what is lost without it, its Debian and Ubuntu package).
+# Library -> (what needs it, its Debian and Ubuntu package).
 LIBRARIES = {
     "libX11.so.6": ("the SAPIEN settler and renderer", "libx11-6"),
     "libGL.so.1": ("the SAPIEN settler and renderer", "libgl1"),
@@ -62,7 +62,7 @@ def cgroup_cores(group: Path = CGROUP) -> float | None:
 
 
 def check_python() -> Check:
-    """The interpreter. Installation already refused one that is too old."""
+    """The interpreter; pip refuses one that is too old."""
     return Check("python", "ok", f"{platform.python_version()} at {sys.executable}")
 
 
@@ -87,7 +87,7 @@ def check_cores(group: Path = CGROUP) -> Check:
 
 
 def check_memory(group: Path = CGROUP) -> Check:
-    """Memory that can still be used, with the container's limit."""
+    """Free memory, with the container's limit."""
     memory = psutil.virtual_memory()
     available = memory.available
     detail = f"{_gib(available)} of {_gib(memory.total)} free"
@@ -108,14 +108,14 @@ def check_disk(name: str, folder: Path, enough: int = ENOUGH_DISK_BYTES) -> Chec
     try:
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        return Check(name, "warn", f"{folder}: {error.strerror}", "Make the folder, or mount it.")
+        return Check(name, "warn", f"{folder}: {error.strerror}", "Create the folder, or mount it.")
     detail = f"{_gib(free)} free in {folder}"
     if free < LEAST_DISK_BYTES and name == "disk":
         return Check(name, "fail", detail, "Free some space, or work on another disk.")
     if free < enough:
         mend = "Free some space, or work on another disk."
         if name == "shared memory":
-            mend = "Start the container with --shm-size=1g; Ray falls back to slower files."
+            mend = "Start the container with --shm-size=1g; without it Ray is slower."
         return Check(name, "warn", detail, mend)
     return Check(name, "ok", detail)
 
@@ -138,12 +138,12 @@ def check_cache() -> Check:
         with tempfile.TemporaryFile(dir=existing):
             return Check("cache", "ok", str(folder))
     except OSError as error:
-        mend = "Name a folder that can be written in DATAGEN_CACHE; without one every worker parses anew."
+        mend = "Set DATAGEN_CACHE to a writable folder; without one every worker parses all files again."
         return Check("cache", "warn", str(error), mend)
 
 
 def check_libraries() -> list[Check]:
-    """Shared libraries that wheels expect of the system, each with the package that brings it."""
+    """Shared libraries that wheels need from the system, each with its package."""
     checks: list[Check] = []
     for library, (lost, package) in LIBRARIES.items():
         try:
@@ -166,7 +166,7 @@ def check_gpu() -> Check:
     try:
         done = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Check("gpu", "warn", f"nvidia-smi gave no answer: {type(error).__name__}", "Check the driver.")
+        return Check("gpu", "warn", f"nvidia-smi fails: {type(error).__name__}", "Check the driver.")
     names = "; ".join(line.strip() for line in done.stdout.splitlines() if line.strip())
     if done.returncode or not names:
         return Check("gpu", "warn", "nvidia-smi finds no device", "Check the driver, or ignore it.")
@@ -174,7 +174,7 @@ def check_gpu() -> Check:
 
 
 def host_checks() -> list[Check]:
-    """All of the above."""
+    """All checks of this module."""
     checks = [check_python(), check_platform(), check_cores(), check_memory()]
     checks += [check_disk("disk", Path.cwd()), check_disk("temporary files", Path(tempfile.gettempdir()))]
     if sys.platform == "linux":

@@ -1,8 +1,8 @@
-"""The smallest grasp trial: a Panda before a cube, planned along straight lines and executed in physics.
+"""The smallest grasp trial: a Panda lifts a cube along straight lines in physics.
 
     python -m datagen.doctor.lift
 
-The doctor runs it in a process of its own; it says how the trial ended and fails where it did not succeed.
+The doctor runs it in a separate process. It prints the outcome; exit code 1 unless the trial succeeds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PREGRASP_M, _LIFT_M = 0.08, 0.10
 
 
 def main() -> int:
-    """Run the trial and say how it ended."""
+    """Run the trial and print its outcome; the exit code."""
     robot = open_robot("panda", None, _BASE_HEIGHT_M)
     cube = _block(0.0, _CUBE_M, _CUBE_M, -_CUBE_M / 2, _CUBE_M / 2)
     table = _block(_AHEAD_M + 0.1, 0.4, 0.8, 0.0, _TABLE_M)
@@ -49,7 +49,7 @@ def main() -> int:
     T_world_base = translation(0, 0, _BASE_HEIGHT_M)
     plan = _plan(robot, translation(_AHEAD_M, 0, _TABLE_M + _CUBE_M / 2 - _BASE_HEIGHT_M) @ _DOWN)
     if plan is None:
-        sys.stderr.write("the arm finds no way to a cube before it\n")
+        sys.stderr.write("the arm finds no path to a cube in front of it\n")
         return 1
     undisturbed = Disturbance.none(prepared.params.object_friction)
     result = run_trial(prepared, T_world_base, plan, undisturbed)
@@ -68,7 +68,7 @@ def _block(ahead_m: float, x_m: float, y_m: float, low_m: float, high_m: float) 
 
 
 def _plan(robot: Robot, T_base_grasp: F64) -> MotionPlan | None:
-    """From a tucked pose over a grasp from above to a lift, by IK along straight lines."""
+    """A plan from a tucked pose to a grasp from above and a lift, by IK along straight lines."""
     for home, q_home in enumerate(robot.homes_rad):
         q_grasp = robot.ik(T_base_grasp, q_home)
         if q_grasp is None:
@@ -91,7 +91,7 @@ def _plan(robot: Robot, T_base_grasp: F64) -> MotionPlan | None:
 
 
 def _rise(robot: Robot, T_base_grasp: F64, q_grasp_rad: F64, height_m: float) -> F64 | None:
-    """Joints (11, A) from the grasp straight up."""
+    """Joint positions (11, A) from the grasp straight up."""
     rows = [q_grasp_rad]
     for z in np.linspace(0, height_m, 11)[1:]:
         q = robot.ik(translation(0, 0, z) @ T_base_grasp, rows[-1])

@@ -60,7 +60,7 @@ def draw_arm_picture(
 
 
 def best_success(samples: Columns) -> int | None:
-    """Row of the best success, or None: most often lifted, with fewest grasps, on the widest path."""
+    """Row of the best success, or None: most lifts, then fewest grasps, then the widest clearance."""
     rows = np.flatnonzero(samples["outcome"] == _SUCCESS)
     if not len(rows):
         return None
@@ -72,9 +72,9 @@ def best_success(samples: Columns) -> int | None:
 
 
 def reach_radius_m(robot: Robot, target_height_m: float) -> float:
-    """How far from the target the mount may stand, on the floor, before the arm is too short."""
+    """Largest horizontal distance (m) from mount to target within the arm's reach."""
     rise_m = target_height_m - robot.base_height_m - float(robot.shoulder_m[2])
-    # The robot faces the target, so a shoulder ahead of the mount reaches so much farther.
+    # The robot faces the target, so a shoulder in front of the mount adds to the reach.
     return float(np.sqrt(max(robot.reach_m**2 - rise_m**2, 0.0)) + robot.shoulder_m[0])
 
 

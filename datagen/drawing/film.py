@@ -1,4 +1,4 @@
-"""One trial as pictures: the recorded poses, seen from far and from near, without any render device."""
+"""One trial as images: the recorded poses in a far and a near view, rendered on the CPU."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from datagen.workers.trials.trial import Recording
 
 Rows = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-Told = tuple[tuple[int, str], ...]  # rows of a recording, and what they are
+Told = tuple[tuple[int, str], ...]  # rows of a recording, with their names
 
-_WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the middle of what it shows
+_WIDE_M, _NEAR_M = 1.9, 0.8  # from the camera to the centre of the view
 _LINK_M, _NEAR_HALF_M = 0.07, 0.08  # around link origins in the far view, around the target in the near one
 _FOLLOWED_M = 1.0  # a target that fell farther is not kept in the picture
 OUTLINE_RGB = ImageColor.getrgb(TARGET.colour)
 
-# Moments that tell a trial: phase, share of it, words.
+# Moments of a trial: phase, share of it, name.
 _MOMENTS = (
     ("reach", 0.0, "start"),
     ("reach", 0.5, "on the way"),
@@ -50,27 +50,27 @@ _PHASE_WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A trial that is ready to be looked at."""
+    """A trial with its cameras, ready to be rendered."""
 
     recalled: ReconstructedScene
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
-    told: Told  # the moments of a sheet
+    told: Told  # the moments of a filmstrip
     wide: Shot
     near: Shot
 
     def stage(self, moment: int) -> RayScene:
-        """Objects, then the robot's bodies, as they stand at a moment; no house."""
+        """Objects, then the robot's bodies, at a moment; without the house."""
         return _stage(self.recalled, self.bodies, self.T_world_base, self.recording, moment)
 
     def rise_m(self, moment: int) -> float:
-        """How far the target is above where it lay."""
+        """Rise of the target above its start (m)."""
         z = self.recording.T_world_object[:, 0, 2, 3]
         return float(z[moment] - z[0])
 
     def words(self, moment: int) -> str:
-        """The phase at a moment, in a word."""
+        """Name of the phase at a moment."""
         return _PHASE_WORDS.get(self.recording.phase[moment], self.recording.phase[moment])
 
 
@@ -83,7 +83,7 @@ def film_of(
     wide_px: tuple[int, int],
     near_px: tuple[int, int],
 ) -> Film:
-    """Choose both views of a trial of which the moments `told` matter; sizes are (width, height)."""
+    """Choose both views of a trial for the moments `told`; sizes are (width, height)."""
     named = {words: moment for moment, words in told}
     middle = len(recording.phase) // 2
     shown = sorted(
@@ -112,9 +112,9 @@ def film_of(
 
 
 def told_moments(recording: Recording) -> Told:
-    """The eight moments that tell a trial, as (row, words); fewer in a shorter recording.
+    """The eight moments of a filmstrip as (row, name); fewer in a shorter recording.
 
-    Where the trial ended early, the gaps between what there was are filled.
+    Where the trial ended early, further moments fill the gaps.
     """
     phase = np.array(recording.phase)
     told: dict[int, str] = {}
@@ -133,7 +133,7 @@ def told_moments(recording: Recording) -> Told:
 
 
 class Lens:
-    """One view at one resolution; the house, which stands still, is seen once."""
+    """One view at one resolution; the static house is rendered once."""
 
     def __init__(self, shot: Shot, sharpness: int, outlined: bool) -> None:
         self.sharpness, self.outlined = sharpness, outlined
@@ -148,7 +148,7 @@ class Lens:
         depth_m[depth_m == 0] = np.inf
         target = np.zeros(len(rgb), np.bool_)
         for k, T in enumerate(stage.T_world_object):
-            # Each body is looked for only where it can be: most cover a small part of the picture.
+            # Each body is rendered only within its bounds: most cover a small part of the image.
             rows = _window(self.camera, T[:3, 3], float(stage.radii_m[k]))
             alone = RayScene(self.nothing, [stage.objects[k]], stage.radii_m[k : k + 1], T[None])
             front = cast_pixels(alone, self.camera, rows)
@@ -199,13 +199,13 @@ def _around(centres_m: F64, half_m: float) -> F64:
 
 
 def _window(camera: Camera, centre_m: F64, radius_m: float) -> Rows:
-    """Flat pixels of a rectangle that holds the picture of a sphere."""
+    """Flat pixels of a rectangle around the image of a sphere."""
     T = camera.T_world_camera
     x, y, z = (float(v) for v in (centre_m - T[:3, 3]) @ T[:3, :3])
     w, h = camera.width_px, camera.height_px
-    if z < radius_m + 0.05:  # beside or behind the camera: no bound
+    if z < radius_m + 0.05:  # next to or behind the camera: no bound
         return np.arange(w * h)
-    # The sphere lies in its bounding cube, whose near and far faces bound what it covers.
+    # The near and far faces of the sphere's bounding cube bound its image.
     ends = [
         (v + side * radius_m) / (z + depth * radius_m)
         for v in (x, y)

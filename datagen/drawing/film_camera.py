@@ -1,4 +1,4 @@
-"""From where a trial is watched: the view that shows most of target, hand and arm, and no wall between."""
+"""Camera of a trial: the view that shows most of target, hand and arm, without walls in between."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from datagen.workers.rendering.frame import Camera
 from datagen.workers.rendering.rays import RayMesh, RayScene, occluded, ray_mesh
 
 _AZIMUTHS, _ELEVATIONS_DEG = 20, (20.0, 42.0)
-_PROBE_PX = 56  # width of the pictures by which views are compared
-_MARGIN = 0.86  # of half a picture, which what must be seen may fill
-_WALL_M = 0.5  # lower walls (and floors, which are walls to a loader) hide nothing
-_SIDEWAYS = 0.25  # what a view across the arm is worth beside one along it
+_PROBE_PX = 56  # width of the images that compare views
+_MARGIN = 0.86  # share of half an image that the visible points may fill
+_WALL_M = 0.5  # lower walls (and floors, which loaders return as walls) hide nothing
+_SIDEWAYS = 0.25  # weight of a view across the arm, compared with one along it
 
 Rows = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A camera, and the house without the walls that stand before it."""
+    """A camera, and the house without the walls in front of it."""
 
     camera: Camera
     house: RayMesh
@@ -35,11 +35,11 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What a view is chosen for.
+    """Criteria for a view.
 
-    `moments` are stages without a house; `focus` groups rows of their bodies, and a group counts
-    with its weight times the share of it that is seen. `points_m` (N, 3) must lie in the picture.
-    `forward` (3,) is the direction across which one should look.
+    `moments` are stages without a house; `focus` groups rows of their bodies, and a group counts with its
+    weight times its visible share. `points_m` (N, 3) must lie in the image. `forward` (3,) is the direction
+    that the view should cross.
     """
 
     moments: Sequence[RayScene]
@@ -50,13 +50,13 @@ class Subject:
 
 @lru_cache(maxsize=1)
 def nothing() -> RayMesh:
-    """A hierarchy that no ray meets: a speck far below the ground."""
+    """A ray mesh that no ray hits: a speck far below the ground."""
     speck = np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]], np.float32) - np.float32(1e4)
     return ray_mesh(Mesh(speck, np.array([[0, 1, 2]], np.int32), np.zeros((1, 3), np.uint8)))
 
 
 def choose_shot(house: House, subject: Subject, distance_m: float, width_px: int, height_px: int) -> Shot:
-    """The best of views all around, `distance_m` from the middle of what must be seen."""
+    """The best of the views all around, `distance_m` from the centre of the points."""
     walls = [body for body in house.bodies if _is_wall(body)]
     open_house = _rays_without(house, walls)
     middle_m = (subject.points_m.min(0) + subject.points_m.max(0)) / 2
@@ -78,7 +78,7 @@ def choose_shot(house: House, subject: Subject, distance_m: float, width_px: int
 
 
 def scaled_camera(camera: Camera, factor: int) -> Camera:
-    """The same view with `factor` times as many pixels a side."""
+    """The same view with `factor` times the pixels per side."""
     return _resized(camera, camera.width_px * factor)
 
 
@@ -92,7 +92,7 @@ def _resized(camera: Camera, width_px: int) -> Camera:
 
 
 def _framed(eye_m: F64, middle_m: F64, points_m: F64, width_px: int, height_px: int) -> Camera:
-    """A camera whose focal length just brings all points into the picture."""
+    """A camera whose focal length fits all points into the image."""
     T = look_at(eye_m, middle_m)
     local = (points_m - T[:3, 3]) @ T[:3, :3]
     spread = np.abs(local[:, :2] / np.maximum(local[:, 2:], 0.1)).max(0)
@@ -102,7 +102,7 @@ def _framed(eye_m: F64, middle_m: F64, points_m: F64, width_px: int, height_px: 
 
 
 def _share_seen(house: RayMesh, subject: Subject, probe: Camera) -> float:
-    """Weighted share of the focus groups that the probe sees, mean over the moments."""
+    """Weighted visible share of the focus groups, mean over the moments."""
     pixels = np.arange(probe.width_px * probe.height_px)
     total = 0.0
     for moment in subject.moments:
@@ -129,7 +129,7 @@ def _is_wall(body: StaticBody) -> bool:
 def _blocking(
     walls: Sequence[StaticBody], camera: Camera, points_m: F64, distance_m: float
 ) -> list[StaticBody]:
-    """Walls before what must be seen, or before the picture's middle ground."""
+    """Walls in front of the points, or of the centre of the view."""
     T = camera.T_world_camera
     half = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) / 2
     u, v = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.9, 0.9, 7)] * 2))

@@ -1,4 +1,4 @@
-"""A film laid out: eight moments on one sheet (.png), or all of it in motion (.gif)."""
+"""Layout of a film: eight moments on one sheet (.png), or an animation (.gif)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datagen.drawing.film_camera import Shot
 from datagen.schemas.styles import PHASE_COLOURS
 from datagen.workers.geometry.mesh import U8
 
-# Sizes of the far and the near view, (width, height), that suit a sheet and a film.
+# Sizes of the far and the near view, (width, height), of a sheet and of an animation.
 SHEET_WIDE_PX, SHEET_NEAR_PX = (460, 345), (460, 276)
 MOTION_WIDE_PX, MOTION_NEAR_PX = (520, 400), (340, 400)
 
@@ -28,7 +28,7 @@ _SHEET_TEXT_PX, _MOTION_TEXT_PX = 27, 15
 
 @dataclass(frozen=True)
 class Title:
-    """The heading: a chip of the outcome's colour, what it was, and lines of facts."""
+    """The heading: a patch in the outcome's colour, the outcome, and lines of facts."""
 
     colour: str
     head: str
@@ -61,7 +61,7 @@ def write_sheet(film: Film, title: Title, out: Path) -> None:
 
 
 def write_motion(film: Film, title: Title, out: Path) -> None:
-    """The whole recording in real time at up to ten frames a second; the last one stays a while."""
+    """The whole recording in real time at up to ten frames per second; the last one is shown longer."""
     recording = film.recording
     seconds = float(recording.time_s[-1] - recording.time_s[0])
     count = int(np.clip(round(seconds * _FRAMES_PER_S) + 1, 2, min(_MOST_FRAMES, len(recording.time_s))))
@@ -70,7 +70,7 @@ def write_motion(film: Film, title: Title, out: Path) -> None:
         _motion_frame(film, title, int(moment), wide, near)
         for moment, (wide, near) in zip(moments, pictures(film, list(moments), 1), strict=True)
     ]
-    # One palette for all, so that what stands still stays the same and costs nothing.
+    # One palette for all frames, so that static parts stay equal and compress well.
     sample = np.concatenate([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 4)]])
     palette = Image.fromarray(np.concatenate([sample, _swatches(title, sample.shape[1])])).quantize(256)
     shown = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -32,7 +32,7 @@ from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.houses.house import StaticBody
 from datagen.workers.scenes.recall import RecalledScene
 
-_HEAD_ROOM_M = 1.9  # what hangs higher, such as the wall over a door, hides nothing from above
+_HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
 _DOT_PT2 = 26
 _SMALL_PT2 = {"out_of_reach": 9, "base_collision": 13}  # what fills most of a grid and says little

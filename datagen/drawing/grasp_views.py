@@ -1,4 +1,4 @@
-"""The grasps that succeeded, as outlines of the hand around the target, seen from above and the side."""
+"""Successful grasps as outlines of the hand around the target, from above and from the side."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from datagen.workers.rendering.rays import RayScene, ray_mesh
 from datagen.workers.robots.robot import Gripper
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
-_SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles meet a grasp to 0.5 mm and 0.5 degrees only
-_FAR_M = 6.0  # so far away that the view is nearly parallel
+_SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles reach a grasp within 0.5 mm and 0.5 degrees
+_FAR_M = 6.0  # far enough for a nearly parallel view
 _HAND_M = 0.12  # room for hands around the target
 _WRIST_M = 0.05  # drawn behind the palm, to show where the hand comes from
 _SIZE_PX = 420
@@ -31,14 +31,14 @@ _SHEET_RGB = (214, 205, 190)
 
 @dataclass(frozen=True, eq=False)
 class UsedGrasps:
-    """G different grasps, most used first."""
+    """G different grasps, most frequent first."""
 
     T_target_tcp: F64  # (G, 4, 4)
     count: npt.NDArray[np.int64]  # (G,)
 
 
 def used_grasps(T_target_tcp: F32) -> UsedGrasps:
-    """The different ones among N grasps (N, 4, 4), each with how often it occurs."""
+    """The different ones among N grasps (N, 4, 4), with their counts."""
     rest = np.asarray(T_target_tcp, np.float64)
     kept: list[F64] = []
     counts: list[int] = []
@@ -73,9 +73,9 @@ def hand_outline(gripper: Gripper) -> F64:
 def draw_grasps(
     views: tuple[Axes, Axes], recalled: ReconstructedScene, support: Mesh, gripper: Gripper, used: UsedGrasps
 ) -> ScalarMappable | None:
-    """Draw the grasps from above and from the observer's side; returns the scale of the counts.
+    """Draw the grasps from above and from the observer's side; return the colour scale of the counts.
 
-    `support` (world frame) stands for the house, which would hide what happens on it.
+    `support` (world frame) replaces the house, which would hide the grasps.
     """
     centre_m = recalled.target_center_m
     half_m = float(recalled.models[0].radius_m) + _HAND_M
@@ -94,7 +94,7 @@ def draw_grasps(
         camera = _camera(eye_m, centre_m, half_m)
         axes.imshow(_faded(render_rays(stage, camera)))
         if scale is not None:
-            # The most used are drawn last, on top.
+            # The most frequent are drawn last, on top.
             T_world_tcp = recalled.T_world_object[0] @ used.T_target_tcp[::-1]
             _draw_hands(axes, camera, T_world_tcp, hand_outline(gripper), scale.to_rgba(used.count[::-1]))
         axes.set_title(title, fontsize=11)
@@ -106,7 +106,7 @@ def draw_grasps(
 
 
 def _faded(frame: Frame) -> U8:
-    """The picture in pale colours, paler still off the target, so that hands are read first."""
+    """The image in pale colours, paler off the target, so that hands stand out."""
     strength = np.where(frame.body == 1, 0.75, 0.4)[..., None]
     return (strength * frame.rgb + (1 - strength) * 255).astype(np.uint8)
 

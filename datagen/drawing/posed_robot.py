@@ -1,4 +1,4 @@
-"""A robot as bodies that rays can meet: its links at given joints, the hand's opening, the pedestal."""
+"""A robot as ray meshes: its links at given joints, the fingers, the pedestal."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import read_urdf
 
 _PEDESTAL_RGB, _PEDESTAL_SIDES = (196, 205, 216), 24
-_FINGER_RGB = (0, 185, 200)  # few objects have it, so one sees the fingers close
+_FINGER_RGB = (0, 185, 200)  # rare among objects, so that the fingers are visible
 
 
 @dataclass(frozen=True, eq=False)
 class RobotBodies:
-    """B bodies: the links that have a mesh, and the pedestal where the robot stands on one."""
+    """B bodies: the links that have a mesh, and the pedestal of robots that have one."""
 
     robot: Robot
     rays: tuple[RayMesh, ...]  # (B,)
     radii_m: F64  # (B,), around the bodies' origins
     link: I32  # (B,), row of the link; -1 for the pedestal
-    finger_side: I32  # (B,), +1 and -1 for what moves with finger 0 and 1, 0 for all else
+    finger_side: I32  # (B,), +1 and -1 for bodies that move with finger 0 and 1, else 0
 
     def poses(self, T_world_base: F64, q_rad: F64, opening_m: float) -> F64:
-        """Poses (B, 4, 4) in the world with the arm at the joints (A,) and the pads so far apart."""
+        """Poses (B, 4, 4) in the world for joints (A,) and the opening between the pads (m)."""
         T_base_link = self.robot.T_base_link(q_rad)
         T_base_tcp = self.robot.T_base_tcp(q_rad)
         out = np.empty((len(self.rays), 4, 4))
@@ -43,12 +43,12 @@ class RobotBodies:
 
     @property
     def hand(self) -> tuple[int, ...]:
-        """Rows of the fingers."""
+        """Rows of the finger bodies."""
         return tuple(int(k) for k in np.flatnonzero(self.finger_side))
 
 
 def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
-    """The robot's bodies; the pedestal is drawn under robots that have no base of their own."""
+    """The robot's bodies, with a pedestal for robots without a base of their own."""
     tree = read_urdf(robot.urdf)
     sides = {
         tree.joint(name).child: side for name, side in zip(robot.finger_joint_names, (1, -1), strict=True)

@@ -1,4 +1,4 @@
-"""One candidate of a stored scene, tried again as its label source tried it, with the poses kept."""
+"""The trial of one candidate of a stored scene, run again with its poses recorded."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.trial import Recording, TrialResult
 
 _STEP_S = 0.05  # between the moments of a plan that was not executed
-_STEP_RAD = 0.08  # that a plan advances meanwhile, over all joints
-_TRIES = 7  # poses shown of an arm that found no plan
+_STEP_RAD = 0.08  # advance of a plan in that time, over all joints
+_TRIES = 7  # poses to show of an arm without a plan
 
 
 @dataclass(frozen=True, eq=False)
 class Retrial:
-    """What happened to a candidate. `recording` holds a trial, a plan, or poses that were tried."""
+    """The trial of a candidate. `recording` holds a trial, a plan, or the poses that were tried."""
 
     robot: Robot
-    T_world_base: F64  # (4, 4), where the mount truly was
+    T_world_base: F64  # (4, 4), true pose of the mount
     trial: CandidateTrial
-    shown: int | None  # row of `trial.results` that the recording is of; None where none was executed
+    shown: int | None  # recorded row of `trial.results`; None where nothing was executed
     recording: Recording
-    told: Told  # the moments that matter
+    told: Told  # the moments to show
 
     @property
     def moves(self) -> bool:
-        """Whether the recording is a motion, and not poses that were tried."""
+        """Whether the recording is a motion; else it holds poses that were tried."""
         return bool(self.recording.time_s[-1] > self.recording.time_s[0])
 
     @property
     def result(self) -> TrialResult | None:
-        """The execution that is shown."""
+        """The execution to show."""
         return None if self.shown is None else self.trial.results[self.shown]
 
 
 def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
-    """Plan, and for `sim` execute, candidate `row`; the same outcome as stored, with its poses.
+    """Plan, and for `sim` execute, candidate `row` again, and record the poses.
 
-    Of several executions the last that ended as the candidate did is shown.
+    Of several executions, the last with the candidate's outcome is shown.
     """
     at = arm_in_scene(scene, candidates, row, spec, StageClock())
     trial = try_candidate(at, candidates, row, spec, record=True)
@@ -70,7 +70,7 @@ def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: 
 
 
 def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_object: F64) -> Recording:
-    """A plan as if it were executed without a flaw: the target goes with the hand once it is grasped."""
+    """A plan as if executed perfectly: the target moves with the hand once it is grasped."""
     q, phases = [plan.q_reach_rad[:1]], ["reach"]
     for phase, path in (
         ("reach", plan.q_reach_rad),
@@ -92,7 +92,7 @@ def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_ob
 
 
 def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Told]:
-    """The tucked arm, and where planning failed later the arm at grasps that it could have taken."""
+    """The tucked arm and, where planning failed later, the arm at grasps with an IK solution."""
     robot = at.robot
     q_rad, opening_m, words = [robot.homes_rad[0]], [robot.gripper.max_opening_m], ["tucked"]
     if trial.report is not None:
@@ -118,7 +118,7 @@ def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tu
 
 
 def _with_sense(recording: Recording) -> Recording:
-    """The part before any number stopped being finite: physics that lost its sense cannot be drawn."""
+    """The part of the recording with finite numbers; unstable physics cannot be drawn."""
     finite = np.isfinite(recording.q_rad).all(1) & np.isfinite(recording.T_world_object).all((1, 2, 3))
     n = int(np.argmin(np.append(finite, False)))
     return Recording(

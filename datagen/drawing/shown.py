@@ -1,4 +1,4 @@
-"""What `datagen show` can draw of one scene, each with the lines that go with it."""
+"""Pictures of one scene for `datagen show`, each with its lines of text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Lines = list[tuple[str, str]]
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A stored scene that is to be drawn."""
+    """A stored scene to draw."""
 
     run: str
     spec: Specification
@@ -38,7 +38,7 @@ class Shown:
         return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
 
     def place(self, row: int) -> str:
-        """Where a candidate's base is."""
+        """Position of a candidate's base as text."""
         x, y = self.rows.samples["base_xy_m"][row]
         return f"({x:.3f}, {y:.3f}) m"
 
@@ -49,7 +49,7 @@ class Shown:
 
 
 def draw_heuristic(shown: Shown, out: Path) -> Lines:
-    """Frame, depth, floor plans by label and by score, cloud, numbers."""
+    """Draw frame, depth, floor plans by label and by score, point cloud and numbers."""
     record, samples = shown.rows.record, shown.rows.samples
     tau = shown.spec.heuristic.tau
     draw_scene_picture(shown.title, shown.recalled, shown.frame, record, samples, tau, out)

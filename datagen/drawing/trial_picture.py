@@ -1,4 +1,4 @@
-"""What `datagen show --trial` draws: one candidate, tried again and seen."""
+"""Picture of one candidate's trial for `datagen show --trial`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from datagen.workers.scenes.reconstruct import reconstruct_candidates
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
-    """One candidate tried again: a filmstrip, or a film where `out` is a .gif; None takes the best success.
+    """Draw a candidate's trial as a filmstrip, or an animation where `out` is a .gif; None: the best success.
 
-    Raises InputError where there is no such candidate, no success, or no motion for a film.
+    Raises InputError where there is no such candidate, no success, or no motion to animate.
     """
     arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
@@ -38,7 +38,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     outcome, robot = retrial.trial.outcome, retrial.robot
     moving = out.suffix.lower() == ".gif"
     if moving and not retrial.moves:
-        problem = f"candidate {row} ended as {outcome} before the arm moved: there is no film"
+        problem = f"candidate {row} ended as {outcome} before the arm moved: there is nothing to animate"
         raise InputError(out, "--out", problem, "Give a name that ends in .png")
     stored = tuple(OUTCOMES)[int(shown.rows.samples["outcome"][row])]
     title = Title(
@@ -69,12 +69,12 @@ def _candidate(shown: Shown, candidate: int | None) -> int:
         if best is None:
             problem = f"no candidate of scene {scene} succeeded"
             raise InputError(
-                shown.run, "--trial", problem, f"Choose one from 0 to {count - 1} to see it fail"
+                shown.run, "--trial", problem, f"Give one from 0 to {count - 1} to see why it failed"
             )
         return best
     if not 0 <= candidate < count:
-        problem = f"{candidate} is no candidate of scene {scene}"
-        raise InputError(shown.run, "--trial", problem, f"Choose one from 0 to {count - 1}")
+        problem = f"{candidate} is not a candidate of scene {scene}"
+        raise InputError(shown.run, "--trial", problem, f"Give one from 0 to {count - 1}")
     return candidate
 
 

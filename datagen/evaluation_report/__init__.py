@@ -1,1 +1,1 @@
-"""What `datagen evaluate` opens, tells and draws; the numbers come from train.evaluation."""
+"""Inputs, tables and pages of `datagen evaluate`; the numbers come from train.evaluation."""

@@ -24,7 +24,7 @@ NONE = "none"
 
 @dataclass(frozen=True, eq=False)
 class BaselineMethods:
-    """Baselines in their order, those left out with the cause, and the houses that numbers come from."""
+    """Baselines in their order, those omitted with the reason, and the houses they were fitted on."""
 
     baselines: tuple[EvaluatedMethod, ...]
     left_out: dict[str, str]
@@ -32,19 +32,19 @@ class BaselineMethods:
 
 
 def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
-    """The rule's parameters in a file that `datagen calibrate` wrote.
+    """Read the rule's parameters from a file of `datagen calibrate`.
 
-    InputError where it has none, and where it says that they were fitted to one of `runs`.
+    InputError where it has none, or where they were fitted on one of `runs`.
     """
-    mend = "Give the file that `datagen calibrate` wrote"
+    mend = "Give a file of `datagen calibrate`"
     section = read_toml(path, mend).get("heuristic")
     if not isinstance(section, dict):
-        raise InputError(path, "heuristic", "there is no such section", mend)
+        raise InputError(path, "heuristic", "is missing", mend)
     fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
     for run in runs:
         if not allow_seen_houses and any(spec.hash() in fitted_to for spec in run.specs):
-            problem = f"its rule was fitted to the labels of {run.place}"
-            raise InputError(path, "heuristic", problem, "Calibrate to runs of another split")
+            problem = f"was fitted on the labels of {run.run}"
+            raise InputError(path, "heuristic", problem, "Calibrate on runs of another split")
     try:
         return HeuristicParams.model_validate(section)
     except ValidationError as error:
@@ -62,13 +62,13 @@ def baseline_methods(
     allow_incomplete: bool = False,
     json: bool = False,
 ) -> BaselineMethods:
-    """The baselines asked for; for None all, but for those that have to be fitted where `fit` is empty.
+    """Return the requested baselines; for None all, except those that need --fit where `fit` is empty.
 
-    InputError where one that was asked for cannot be had, and where a house of `fit` is one of `runs`.
+    InputError where a requested one is not available, or where `fit` and `runs` share a house.
     """
     if asked and NONE in asked:
         if len(asked) > 1:
-            raise InputError("--baselines", NONE, "stands beside others", "Give none alone, or leave it out")
+            raise InputError("--baselines", NONE, "is given with others", "Give only none, or omit it")
         return BaselineMethods((), {}, frozenset())
     names = list(dict.fromkeys(asked or BASELINES))
     made = make_baselines(names, detector, heuristic, seed)
@@ -96,13 +96,13 @@ def baseline_methods(
                 step()
         made = fitted
     else:
-        why = "its numbers are fitted, and no run to fit them on is named (--fit)"
+        why = "needs runs to fit its parameters on (--fit)"
         left_out = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
         if asked and left_out:
             name = next(iter(left_out))
             raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
         made = [b for b in made if not b.needs_fit]
-    # What has to be said of a name stands in brackets behind it.
+    # The note of a method follows its name in brackets.
     told = [(b, *b.name.partition(" (")[::2]) for b in made]
     return BaselineMethods(
         tuple(EvaluatedMethod(name, b, state=b.state(), note=note.rstrip(")")) for b, name, note in told),

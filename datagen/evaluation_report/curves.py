@@ -1,4 +1,4 @@
-"""What an evaluation looks like: methods with their intervals, ROC, precision and recall, reliability."""
+"""Figures of an evaluation: intervals, ROC, precision and recall, reliability."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def looks_of(records: Sequence[Report]) -> dict[str, dict[str, Any]]:
 
 
 def draw_intervals(report: Report, told: Report) -> Figure:
-    """Each method as a dot with its interval, by metric; the paper's accuracy as a bar."""
+    """Draw each method as a dot with its interval, by metric; the paper's accuracy as a bar."""
     records = report["methods"]
     figure = new_figure(12, 1.1 + 0.36 * len(records))
     looks = looks_of(records)
@@ -67,7 +67,7 @@ def _draw_estimate(ax: Axes, y: int, estimate: Report, look: dict[str, Any]) -> 
 
 
 def draw_curves(report: Report, told: Report) -> Figure:
-    """ROC, precision over recall and reliability of every method, side by side."""
+    """Draw ROC, precision-recall and reliability curves of every method side by side."""
     records = report["methods"]
     figure = new_figure(12, 5.6)
     roc, pr, reliability = figure.subplots(1, 3)

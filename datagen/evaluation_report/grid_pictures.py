@@ -1,4 +1,4 @@
-"""Whole grids of a few scenes: what is good there, and what each method scores and picks."""
+"""Whole grids of a few scenes: labels, and the scores and the choice of each method."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def draw_examples(
 ) -> Figure:
     """One row per scene: the cloud from above, the truth, and each method's scores with its pick.
 
-    Shown are the methods that were trained, and of the baselines the first, up to five in all.
+    Up to five methods are shown: the models, then the first baselines.
     """
     order = sorted(records, key=lambda record: record["regime"] is None)[:_MOST_METHODS]
     names = [record["name"] for record in order]
@@ -65,10 +65,10 @@ def draw_examples(
 
 
 def _cells(grid: Columns, values: F64) -> tuple[F64, tuple[float, float, float, float]]:
-    """Values (N,) as an image (rows by y), and where its edges lie; the N candidates fill a square grid."""
+    """Values (N,) as an image (rows by y) and its extent; the N candidates fill a square grid."""
     side = round(len(grid) ** 0.5)
     order = np.lexsort([grid.base_xy_m[:, 0], grid.base_xy_m[:, 1]])
-    # Rows of a grid have one y but for the last bits of sums in float32.
+    # Cells of a row have equal y except for float32 rounding.
     image = np.empty((side, side))
     by_row = order.reshape(side, side)
     for k, row in enumerate(by_row):
@@ -129,7 +129,7 @@ def _draw_scores(ax: Axes, grid: Columns, score: F64) -> None:
 
 
 def _draw_reach(ax: Axes, grid: Columns) -> None:
-    """Where on the floor the arm reaches the target at all: its reach, less the rise to the target."""
+    """Horizontal distance (m) within the arm's reach of the target."""
     reach_m, mount_m, planar_m = (float(a[0]) for a in (grid.reach_m, grid.mount_distance_m, grid.distance_m))
     left_m2 = reach_m**2 - max(mount_m**2 - planar_m**2, 0.0)
     if left_m2 > 0:

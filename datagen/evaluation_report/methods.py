@@ -16,16 +16,16 @@ from datagen.train.scorers import ModelScorer, Scorer
 if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
 
-# What a checkpoint's stage is called as a regime of training: stage 2 is the end of two.
+# Training regime of a checkpoint's stage: stage 2 is the second of two stages.
 REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedMethod:
-    """One method with where it comes from.
+    """One method and its origin.
 
-    Models have a place and a checkpoint, baselines their fitted numbers. `note` is what else has to be
-    said of it wherever it is named.
+    Models have a path and a checkpoint, baselines their fitted numbers. `note` is printed wherever the method
+    is named.
     """
 
     name: str
@@ -37,34 +37,34 @@ class EvaluatedMethod:
 
     @property
     def regime(self) -> str:
-        """How the model was trained; "" of a baseline."""
+        """Training regime of a model; "" for a baseline."""
         return REGIMES.get(self.head.stage, self.head.stage) if self.head else ""
 
     @property
     def origin(self) -> TrainedBy:
-        """What trained it, for comparisons of like with like."""
+        """Key of the training, for comparisons of equal ones."""
         if self.head is None:
             return NO_TRAINING
         return TrainedBy(self.regime, self.head.model, house_share(self.head))
 
     @property
     def method(self) -> Method:
-        """As metrics know it."""
+        """The method for the metrics."""
         is_probability = self.head is not None or isinstance(self.scorer, Scalars)
         return Method(self.name, self.scorer.threshold, self.origin, is_probability)
 
     @property
     def houses(self) -> frozenset[str]:
-        """Houses that it was trained on, or by which its best epoch was chosen."""
+        """Houses of its training and validation."""
         return frozenset(self.head.house_ids + self.head.val_house_ids) if self.head else frozenset()
 
     @property
     def objects(self) -> frozenset[str]:
-        """Digests of the objects that it was trained on."""
+        """Digests of the objects of its training."""
         return frozenset(self.head.object_digests) if self.head else frozenset()
 
     def record(self) -> dict[str, Any]:
-        """What the report says of it."""
+        """Its entry in the report."""
         base = {
             "name": self.name,
             "regime": self.regime or None,
@@ -92,7 +92,7 @@ class EvaluatedMethod:
 
 
 def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
-    """The models of these checkpoints, named by their regimes, and by what else tells equal ones apart."""
+    """The models of these checkpoints, with unique names from their regimes."""
     if not places:
         return []
     from datagen.train.training.checkpoints import load_model
@@ -102,7 +102,7 @@ def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
     by_digest: dict[str, str] = {}
     for place, _, head in loaded:
         if head.digest in by_digest:
-            raise InputError(place, "", f"the same checkpoint as {by_digest[head.digest]}", "Name it once")
+            raise InputError(place, "", f"is the same checkpoint as {by_digest[head.digest]}", "Name it once")
         by_digest[head.digest] = place
     return [
         EvaluatedMethod(name, ModelScorer(model, name, only_clear=True), place, head)
@@ -111,7 +111,7 @@ def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
 
 
 def house_share(head: CheckpointHead) -> float:
-    """Of the houses that it could have learned from, the share that it did learn from."""
+    """Share of the available houses that the model was trained on."""
     share = head.options.get("house_share", 1.0)
     return float(share) if isinstance(share, (int, float)) else 1.0
 

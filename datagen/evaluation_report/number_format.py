@@ -1,4 +1,4 @@
-"""Numbers of an evaluation as people read them, on a terminal and on a page."""
+"""Numbers of an evaluation as text, for terminal and page."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ METRIC_WORDS = {
     "accuracy": "accuracy",
     "balanced_accuracy": "balanced accuracy",
     "area_under_roc": "AUC",
-    "best_pick": "best pick good",
-    "good": "good picks",
+    "best_pick": "best choice positive",
+    "good": "positive choices",
     "mean_average_precision": "mAP",
 }
 SET_WORDS = {
     "in-range": "clear and within reach",
     "clear": "clear",
-    "grid": "all cells, also where the base collides, which all are told",
+    "grid": "all cells; methods know where the base collides",
 }
 
 
@@ -44,22 +44,22 @@ def metres_with_interval(estimate: Report) -> str:
 
 
 def method_label(record: Report) -> str:
-    """A method's name, with a mark where it has no threshold."""
+    """A method's name, with * where it has no threshold."""
     return record["name"] + (" *" if record["threshold"] is None else "")
 
 
 def paper_accuracy(record: Report, paper: Report) -> float | None:
-    """What the paper states for the same method or regime, if it does."""
+    """The paper's number for the same method or regime, if there is one."""
     return paper["accuracy"].get(record["regime"] or record["name"])
 
 
 def models_first(records: Sequence[Report]) -> list[Report]:
-    """Methods with those that were trained before the baselines."""
+    """Methods, models before baselines."""
     return sorted(records, key=lambda record: record["regime"] is None)
 
 
 def compared(differences: Sequence[Report], metric: str, name: str) -> dict[str, list[str]]:
-    """Whom a method is `above`, `below` and `open` to by a metric; + where the intervals are disjoint too."""
+    """Methods that one is `above`, `below` and `open` to by a metric; + where intervals are disjoint."""
     found: dict[str, list[str]] = {"above": [], "open": [], "below": []}
     other_way = {"above": "below", "below": "above", "open": "open"}
     for d in differences:
@@ -72,16 +72,16 @@ def compared(differences: Sequence[Report], metric: str, name: str) -> dict[str,
 
 
 def candidates_line(told: Report) -> str:
-    """How large a set is: 1,200 candidates of 80 scenes (clear), 31.0% good."""
+    """Size of a set: 1,200 candidates of 80 scenes (clear), 31.0% positive."""
     share = percent(told["positives"] / told["count"])
     words = SET_WORDS[told["candidates"]]
-    return f"{told['count']:,} candidates of {told['scenes']:,} scenes ({words}), {share}% good"
+    return f"{told['count']:,} candidates of {told['scenes']:,} scenes ({words}), {share}% positive"
 
 
 def grids_line(grids: Report) -> str:
-    """How many whole grids there are, and what choosing blindly would give."""
+    """Number of whole grids, and the result of a random choice."""
     counted = grids["scenes"] - grids["scenes_without_positive"]
     return (
-        f"{counted:,} whole grids with a good candidate, {grids['scenes_without_positive']:,} without; "
-        f"of their clear candidates {percent(grids['any_clear'])}% are good"
+        f"{counted:,} whole grids with a positive candidate, {grids['scenes_without_positive']:,} without; "
+        f"{percent(grids['any_clear'])}% of their clear candidates are positive"
     )

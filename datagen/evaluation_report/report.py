@@ -1,4 +1,4 @@
-"""The evaluation as plain values: who, on what, and every number with its interval."""
+"""The evaluation as plain values: methods, runs, and every number with its interval."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _part(
     seed: int,
     is_one_of_two: bool,
 ) -> dict[str, Any]:
-    """The tables of some scenes. One side of two may be too small for a set, which is then left out."""
+    """The tables of some scenes. A set with too few scenes on one side is omitted."""
     told: dict[str, Any] = {}
     left_out: dict[str, str] = {}
     for name, runs in sets.items():
@@ -92,12 +92,12 @@ def _part(
             left_out[name] = error.problem
     grids, why = None, None
     if not columns.is_grid.any():
-        why = "no scene has every cell of its grid for one robot: submit sim with --candidates-per-scene grid"
+        why = "no scene has a whole grid of one robot: submit sim with --candidates-per-scene grid"
     else:
         whole = columns.of_scenes(columns.is_grid)
         grids = evaluate_grids(whole, methods, weights_for(whole, resamples, seed))
         if grids["scenes"] == grids["scenes_without_positive"]:
-            grids, why = None, f"none of {grids['scenes']} whole grids has a good candidate"
+            grids, why = None, f"none of {grids['scenes']} whole grids has a positive candidate"
     return {
         "scenes": columns.n_scenes,
         "house_count": len(set(columns.house.tolist())),
@@ -110,7 +110,7 @@ def _part(
 
 
 def paper_record() -> dict[str, Any]:
-    """The paper's own numbers, as the report holds them."""
+    """The paper's numbers for the report."""
     return {
         "source": paper_results.SOURCE,
         "accuracy": dict(paper_results.ACCURACY),

@@ -1,4 +1,4 @@
-"""The tables of an evaluation, as a terminal and a page both show them."""
+"""The tables of an evaluation, for terminal and page."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DECISIONS = ("accuracy", "balanced_accuracy", "area_under_roc")
 CHOICE = ("best_pick", "mean_average_precision")
 TABLE_I = (*DECISIONS, *CHOICE)
 TABLE_III = ("good", "mean_average_precision")
-# What regimes are held against each other by.
+# Metrics that compare regimes.
 _COMPARED = ("accuracy", "balanced_accuracy", "good", "mean_average_precision")
 
 
@@ -37,7 +37,7 @@ class TitledTable:
 
 
 def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_I) -> TitledTable:
-    """Table I: these metrics of every method, with the paper's accuracy."""
+    """Return Table I: these metrics of every method, with the paper's accuracy."""
     rows = [
         (
             method_label(record),
@@ -51,7 +51,7 @@ def accuracy_table(report: Report, told: Report, metrics: Sequence[str] = TABLE_
 
 
 def choice_table(report: Report, told: Report) -> TitledTable:
-    """How each method chooses among a robot's candidates of a set, and orders them."""
+    """Return the table of choices among a robot's candidates of a set, and of their order."""
     rows = [
         (record["name"], *(with_interval(told["methods"][record["name"]][metric]) for metric in CHOICE))
         for record in report["methods"]
@@ -61,22 +61,22 @@ def choice_table(report: Report, told: Report) -> TitledTable:
 
 
 def comparison_table(comparisons: Sequence[Report], where: str) -> TitledTable:
-    """What regimes add to each other, and the best model to the best baseline, scene by scene."""
+    """Return the paired differences between regimes, and between the best model and the best baseline."""
     rows = [
         (f"{d['first']} - {d['second']}", METRIC_WORDS[d["metric"]], with_interval(d, signed=True),
-         d["verdict"] if d["verdict"] != "open" else "not told apart")
+         d["verdict"] if d["verdict"] != "open" else "not significant")
         for kind in ("regimes", "best")
         for d in comparisons
         if d["kind"] == kind and d["metric"] in _COMPARED
     ]  # fmt: skip
-    title = f"differences over the same resampled scenes ({where}): regimes, and best model - best baseline"
+    title = f"paired differences ({where}): regimes, and best model - best baseline"
     return TitledTable(title, ("difference", "by", "points", ""), rows)
 
 
 def order_tables(
     records: Sequence[Report], differences: Sequence[Report], metrics: Sequence[str], where: str
 ) -> Iterator[TitledTable]:
-    """Whom each of these methods is above and below, by metric; none where nobody else is there."""
+    """Return which methods each method is above and below, by metric; empty for one method."""
     for metric in metrics:
         rows = [
             (record["name"], *("; ".join(names) or "-" for names in said.values()))
@@ -85,11 +85,11 @@ def order_tables(
         ]
         if rows:
             title = f"by {METRIC_WORDS[metric]} ({where}): + where the two intervals are disjoint as well"
-            yield TitledTable(title, ("method", "above", "not told apart from", "below"), rows)
+            yield TitledTable(title, ("method", "above", "not significant", "below"), rows)
 
 
 def reach_table(report: Report, told: Report) -> TitledTable | None:
-    """Table II: accuracy within and beyond reach; None where nothing is beyond."""
+    """Return Table II: accuracy within and beyond reach; None where no candidate is beyond."""
     inside, outside = told["in_reach"], told["out_of_reach"]
     if not outside["count"]:
         return None
@@ -112,7 +112,7 @@ def reach_table(report: Report, told: Report) -> TitledTable | None:
 
 
 def grids_table(report: Report, grids: Report) -> TitledTable:
-    """Table III: what the best-scored clear candidate of a grid is, and the order of all of them."""
+    """Return Table III: label of the best-scored clear candidate of a grid, and the order of all."""
     rows = [
         (
             record["name"],
@@ -129,24 +129,24 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
         ("paper, two-stage", percent(paper["grid_selection"]), f"{paper['grid_miss_m']:.2f}", "-",
          f"{paper['seconds_per_600']:g}")
     )  # fmt: skip
-    heads = ("method", "best clear one good (%)", "else missed by (m)",
+    heads = ("method", "choice positive (%)", "else missed by (m)",
              f"{METRIC_WORDS['mean_average_precision']} (%)", "time per 600 (s)")  # fmt: skip
     return TitledTable(f"Table III: {grids_line(grids)}", heads, rows)
 
 
 def calibration_table(report: Report, told: Report) -> TitledTable:
-    """How far said probabilities can be believed; without rows where no method says any."""
+    """Return the table of calibration errors; without rows where no method predicts probabilities."""
     rows = [
         (record["name"], f"{said['brier']:.4f}", f"{said['expected_calibration_error']:.4f}")
         for record in report["methods"]
         if (said := told["methods"][record["name"]])["brier"] is not None
     ]
-    heads = ("method", "Brier score", "expected calibration error")
+    heads = ("method", "Brier score", "calibration error (ECE)")
     return TitledTable(f"probabilities ({told['candidates']})", heads, rows)
 
 
 def breakdown_tables(report: Report, told: Report, most_methods: int | None = None) -> Iterator[TitledTable]:
-    """Accuracy by kinds of candidates, of so many methods."""
+    """Return tables of accuracy by groups of candidates, for some methods."""
     names = [record["name"] for record in models_first(report["methods"])][:most_methods]
     for heading in dict.fromkeys(row["by"] for row in told["breakdown"]):
         rows = [
@@ -164,25 +164,25 @@ def breakdown_tables(report: Report, told: Report, most_methods: int | None = No
 
 
 def notes(report: Report) -> list[tuple[str, str]]:
-    """What has to be said beside the numbers: (of what, what)."""
+    """Return the notes on the numbers: (subject, note)."""
     boot = report["bootstrap"]
     found = [
         (
             "intervals",
             f"{100 * boot['level']:g}% by {boot['resamples']:,} resamples of scenes, seed {boot['seed']}",
         ),
-        ("clearance", "every method is told where the base fits, and says bad where it does not"),
+        ("clearance", "every method knows where the base is clear, and predicts negative elsewhere"),
         ("paper", f"{report['paper']['source']}: other houses, arms and candidates"),
     ]
     if any(record["threshold"] is None for record in report["methods"]):
-        found.append(("*", "has no threshold: its pick of a robot's candidates is good, all others are bad"))
+        found.append(("*", "has no threshold: its choice for each robot is positive, the rest negative"))
     found += [(record["name"], record["note"]) for record in report["methods"] if record["note"]]
-    return found + [(name, f"left out: {why}") for name, why in report["left_out"].items()]
+    return found + [(name, f"omitted: {why}") for name, why in report["left_out"].items()]
 
 
 def part_title(report: Report, part: Report) -> str | None:
-    """Whose houses the scenes of a part lie in; None where that goes without saying."""
+    """Heading of a part by its houses; None where there is one part."""
     if len(report["parts"]) == 1 and part["houses"] != "seen":
         return None
-    trained = "that were trained on" if part["houses"] == "seen" else "that nobody was trained on"
-    return f"{part['scenes']:,} scenes in houses {trained}"
+    kind = "training" if part["houses"] == "seen" else "other"
+    return f"{part['scenes']:,} scenes in {kind} houses"

@@ -1,4 +1,4 @@
-"""Figures as SVG that stands in a page: no outer file, the same bytes for the same numbers."""
+"""Figures as inline SVG: no external file, the same bytes for the same numbers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ LINES = ("--", "-.", ":")
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that lays itself out."""
+    """An empty figure with constrained layout."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasSVG(figure)
     return figure
 
 
 def svg_of(figure: Figure, name: str) -> str:
-    """The `<svg>` element; `name` keeps its inner names apart from those of other figures on the page."""
+    """The `<svg>` element; `name` makes its ids unique on the page."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})

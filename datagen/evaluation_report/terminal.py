@@ -22,11 +22,11 @@ def print_evaluation(report: Report) -> None:
             for shown in tables.order_tables(models, told["differences"], tables.DECISIONS[:2], name):
                 _print(shown)
         for name, why in part["left_out"].items():
-            print_rows(f"Table I: {name} is left out", [("", why)])
+            print_rows(f"Table I: {name} is omitted", [("", why)])
         for told in part["sets"].values():
             _print(tables.reach_table(report, told))
         if (grids := part["grids"]) is None:
-            print_rows("Table III: left out", [("", part["no_grids"])])
+            print_rows("Table III: omitted", [("", part["no_grids"])])
         else:
             _print(tables.grids_table(report, grids))
             _print(tables.comparison_table(grids["comparisons"], "whole grids"))
@@ -34,7 +34,7 @@ def print_evaluation(report: Report) -> None:
                 _print(shown)
         for told in part["sets"].values():
             _print(tables.calibration_table(report, told))
-        # The narrowest set is the one on which methods differ.
+        # Methods differ most on the narrowest set.
         for told in list(part["sets"].values())[:1]:
             _print(tables.choice_table(report, told))
             for shown in tables.breakdown_tables(report, told, _MOST_COLUMNS):

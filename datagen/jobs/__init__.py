@@ -1,1 +1,1 @@
-"""Jobs: what `submit`, `resume` and `extend` let run, here, on a cluster or detached, and its records."""
+"""Jobs of `submit`, `resume` and `extend`: on this machine, on a cluster or detached."""

@@ -1,4 +1,4 @@
-"""A command handed over to Ray: it goes on there when the shell that gave it has ended."""
+"""Run a command as a Ray job, which continues after the shell has ended."""
 
 from __future__ import annotations
 
@@ -26,24 +26,23 @@ _LOOK_S = 0.3
 
 
 def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> int:
-    """Let the command of these words run as a Ray job, and say how to follow it.
+    """Run the command of these words as a Ray job, and print how to follow it.
 
-    With the address `local`, on a head of this machine that is started where none runs. Comes back once
-    the command has begun, or waits for room on its cluster. InputError where the cluster cannot be
-    reached or refuses it.
+    With the address `local`, it runs on a Ray head of this machine, which is started if needed. Returns once
+    the command has begun or is queued. InputError where the cluster cannot be reached or refuses the job.
     """
     submission = f"datagen-{new_job_id()}"
     address = [] if job_options.workers == 0 else ["--address", "auto"]
     if job_options.address == "local":
         head = ensure_head(job_options.workers or len(os.sched_getaffinity(0)))
         jobs = open_ray_jobs(head.jobs_api, head.token)
-        # The very program that was called: the head runs on its machine, for its user.
+        # The program that was called: the head runs on this machine, as this user.
         entrypoint = shlex.join([sys.executable, "-m", "datagen.cli", *words, *address])
         file = hand_over(jobs, Path(head.folder), submission)
         environment = {SUBMISSION: submission, JOBS_API: jobs.url, JOB_ENVIRONMENT: str(file)}
     else:
         jobs = open_ray_jobs(job_options.address)
-        entrypoint = shlex.join(["datagen", *words, *address])  # as the cluster's image has it
+        entrypoint = shlex.join(["datagen", *words, *address])  # as installed on the cluster
         environment = {SUBMISSION: submission, JOBS_API: jobs.url}
     jobs.submit(entrypoint, submission, environment)
     state = _await_begin(jobs, submission)
@@ -56,28 +55,28 @@ def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> int
         ("stop", command_line(["cancel", place])),
     ]
     if job_options.address == "local":
-        rows.append(("Ray stays", f"for later jobs; {command_line(['cancel', '--head'])} ends it"))
+        rows.append(("Ray", f"keeps running for later jobs; stop it: {command_line(['cancel', '--head'])}"))
     print_rows(f"detached: {command_line(words)}", rows)
     return 0
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
-    """Write what this shell says of stores and caches for one job; return the file.
+    """Write the environment variables of stores and caches for one job; return the file.
 
-    The job removes it at its end. Those of jobs that were killed are removed here.
+    The job removes it at its end. Files of killed jobs are removed here.
     """
     for left in folder.glob("datagen-*.json"):
         if jobs.state(left.stem) in ENDED:
             left.unlink(missing_ok=True)
     file = folder / f"{submission}.json"
-    own = (SUBMISSION, JOBS_API, JOB_ENVIRONMENT)  # where this shell is itself a detached job
+    own = (SUBMISSION, JOBS_API, JOB_ENVIRONMENT)  # set where this process is itself a detached job
     given = {n: value for n, value in os.environ.items() if is_of_the_shell(n) and n not in own}
     write_private(file, json.dumps(given))
     return file
 
 
 def detached_words() -> list[str]:
-    """In a detached job, the options with which its command would be handed over in the same way again."""
+    """In a detached job, the options that detach its command again in the same way."""
     jobs_api = os.environ.get(JOBS_API, "")
     if not jobs_api:
         return []
@@ -91,12 +90,12 @@ def _await_begin(jobs: RayJobs, submission: str) -> str:
         if state in ("FAILED", "STOPPED"):
             said = jobs.output(submission).strip().splitlines()
             why = said[-1].removeprefix("error: ") if said else jobs.message(submission)
-            raise InputError(submission, "", f"it ended at once: {why}", "Correct it and submit again")
+            raise InputError(submission, "", f"ended at once: {why}", "Correct the command and submit again")
         if state != "PENDING" or time.monotonic() >= until_s:
             return state
         time.sleep(_LOOK_S)
 
 
 def jobs_api_of(url: str) -> RayJobs:
-    """The Jobs API where a detached job was handed over. InputError where it does not answer."""
+    """The Jobs API of a detached job. InputError where it does not answer."""
     return open_ray_jobs(url, head_token(url))

@@ -1,4 +1,4 @@
-"""A job: missing shards made, here or on a cluster, watched in the run, and told of at the end."""
+"""A job: make the missing shards on this machine or a cluster, publish its status, print a summary."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.job_recorder import JobRecorder
 from datagen.jobs.options import JobOptions
+from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
@@ -38,23 +39,23 @@ from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
 
-# Set for the driver of a detached job: its name at the Jobs API, and where that listens.
+# Set for the driver of a detached job: its name at the Jobs API, and the address of that.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """One run of a job, and where its sources lie."""
+    """One run of a job, and its sources."""
 
     run: Run
     houses: str  # source references, absolute
     objects: str
-    scenes_from: str = ""  # the run whose scenes are labelled again; "" draws new ones
+    scenes_from: str = ""  # the run whose scenes are labelled again; "" for new scenes
 
 
 @dataclass(frozen=True, eq=False)
 class JobPlan:
-    """What a job does: the missing shards of one run, or of the parts of a merged place."""
+    """The work of a job: the missing shards of one run, or of the parts of merged runs."""
 
     storage: Storage  # where the job's records and the sealed store go
     path: str  # as the user wrote it
@@ -65,7 +66,7 @@ class JobPlan:
 
 
 def run_job(plan: JobPlan) -> int:
-    """Make every missing shard, seal, and say how it went; the exit code.
+    """Make every missing shard, seal, and print a summary; return the exit code.
 
     While it works, the job is known there, and handles requests to stop that are left there.
     """
@@ -95,7 +96,7 @@ def _end_of(error: BaseException) -> tuple[JobEnd, int]:
 
 
 def open_recorder(plan: JobPlan) -> JobRecorder:
-    """Make the job known in its place."""
+    """Publish the job's record."""
     record = JobRecord(
         id=new_job_id(),
         command=("datagen", *sys.argv[1:]),
@@ -116,7 +117,7 @@ def _count_missing(plan: JobPlan) -> int:
 
 
 def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
-    """Drive one run after the other on one set of workers; how that ended."""
+    """Drive one run after the other on one set of workers; return the summary."""
     missing = [job_run.run.missing() for job_run in plan.runs]
     job_options, stop = plan.options, StopRequest()
     policy = RetryPolicy(max_quarantined_share=job_options.max_quarantined)
@@ -134,7 +135,7 @@ def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
                 recorder.add(whole.totals)
         whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
     for job_run in plan.runs:
-        # What a killed driver left open is closed last: its workers may outlive it and still commit.
+        # Attempts of killed drivers are closed last: their workers may still commit.
         close_lost_attempts(job_run.run)
     return whole
 
@@ -177,9 +178,9 @@ def _drive(
 
 
 def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
-    """Judge a job that left nothing to do by the share of the whole run that is given up.
+    """Decide whether a finished job failed, by the quarantined share of the whole run.
 
-    The driver knows its own shards alone, which may be the last two of a thousand.
+    The driver knows only its own shards, which may be the last two of a thousand.
     """
     if summary.end not in ("complete", "failed") or summary.remaining:
         return summary
@@ -204,22 +205,23 @@ def _executor(job_options: JobOptions, shards: int, stack: ExitStack, shown: Pro
 
 
 class _CannotContinue(InputError):
-    """The job met what no retry cures."""
+    """The job met an error that no retry can fix."""
 
 
 def _finish(plan: JobPlan, summary: JobSummary) -> int:
-    """Seal what there is, say how it went and how to go on; return the exit code."""
+    """Seal the run, print a summary and how to continue; return the exit code."""
     totals, runs, path = summary.totals, [job_run.run for job_run in plan.runs], plan.path
     n, resume = sum(run.n for run in runs), command_line(plan.resume)
     given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
     if totals.shards:
-        labels = f"{totals.labels:,} new, {n:,} wanted"
+        labels = f"{totals.labels:,} new of {n:,} wanted"
     elif given_up:
-        labels = f"nothing to do: the shards of {n:,} labels are made or given up"
+        labels = f"nothing to do: the shards of {n:,} labels are committed or quarantined"
     else:
-        labels = f"nothing to do: all {n:,} labels are there"
+        labels = f"nothing to do: all {n:,} labels are committed"
     rows = [
         ("labels", labels),
+        ("made from", made_from(run.manifest for run in runs)),
         ("positive", f"{100 * totals.positives / totals.labels:.1f}%" if totals.labels else "-"),
         ("time", _time(summary)),
         ("retries", str(totals.retries)),
@@ -227,21 +229,21 @@ def _finish(plan: JobPlan, summary: JobSummary) -> int:
     if given_up:
         again = command_line(["resume", path, "--quarantined"])
         those = f"{counted(len(given_up), 'shard')} ({listed([shard for _, shard in given_up])})"
-        shown = f"{those}: {again} tries again"
+        shown = f"{those}; try again: {again}"
         rows.append(("quarantined", shown))
     if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
         sealed = seal(plan.storage)
         rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
     print_rows(f"{summary.end}: {path}", rows)
     if summary.end == "aborted":
-        raise _CannotContinue(path, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
+        raise _CannotContinue(path, "", f"the job cannot continue: {summary.cause}", f"Then resume: {resume}")
     if summary.end == "failed":
         causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
         most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
         see = command_line(["status", path])
-        sys.stderr.write(one_line(f"error: {path}: too many shards failed{most}. See: {see}") + "\n")
+        sys.stderr.write(one_line(f"error: {path}: too many shards are quarantined{most}. See: {see}") + "\n")
     if summary.end == "interrupted":
-        say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", plan.resume)
+        say_interrupted(f"; {counted(summary.remaining, 'shard')} left", plan.resume)
     return summary.exit_code
 
 

@@ -1,4 +1,4 @@
-"""Jobs of a place as plain values, and what their ends and silences mean in words."""
+"""Jobs of a run as plain values and as lines of text."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from datagen.schemas.storage import Storage
 
 
 def jobs_report(place: Storage) -> list[dict[str, Any]]:
-    """Every job that began at the place, the oldest first."""
+    """Every job of the run, the oldest first."""
     return [job_report(job) for job in Jobs(place).all()]
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:
-    """One job: its record, its last state, and whether it lives."""
+    """One job: its record, its last state, and its health."""
     record, state = job.record, job.state
     told = state.model_dump(mode="json", exclude={"format_version", "id"}) if state else {}
     return {
@@ -28,22 +28,22 @@ def job_report(job: StoredJob) -> dict[str, Any]:
 
 
 def health_line(job: StoredJob) -> str:
-    """One line: who it is, how it is."""
+    """One line on a job: state, progress, host and process."""
     record, state, health = job.record, job.state, job.health()
     where = f"{record.host}, process {record.pid}"
     if record.submission:
         where += f", submitted as {record.submission}"
     if health == "ended" and state is not None:
         return f"ended {state.end}, exit code {state.exit_code} ({where})"
-    heard = f"heard {seconds(job.silence().total_seconds())} ago"
+    heard = f"last sign {seconds(job.silence().total_seconds())} ago"
     if health == "dead":
-        return f"dead: its process is gone, {heard} ({where})"
+        return f"dead: its process has ended, {heard} ({where})"
     if state is None or state.phase == "starting":
         return f"{'silent' if health == 'silent' else 'starting'}, {heard} ({where})"
     left = "?" if state.left_s is None else seconds(state.left_s)
     doing = "sealing" if state.phase == "sealing" else f"{state.labels_per_s:,.1f} labels/s, {left} left"
     if state.stopping:
-        doing = f"stopping, {state.in_flight} in flight"
+        doing = f"stopping, {state.in_flight} running"
     elif job.order is not None:
         doing += ", asked to stop"
     silent = "silent, " if health == "silent" else ""

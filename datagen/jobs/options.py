@@ -1,4 +1,4 @@
-"""Options of the verbs that run jobs, and the words that say them again."""
+"""Options of the verbs that run jobs, and their words for the command that resumes."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from datagen.schemas.progress import Progress
 
 DEFAULT_SHARE = 0.01
 _DETACH = (
-    "Hand the job to Ray and come back: it goes on when this shell ends. With --address, to that cluster "
-    "(its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine."
+    "Run as a Ray job that continues after this shell ends: on the cluster of --address (its dashboard "
+    "http://HOST:8265 or the cluster itself), else on a Ray head of this machine."
 )
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class JobOptions:
-    """Where and how a job runs; nothing of this changes a sample."""
+    """Where and how a job runs; no option changes a sample."""
 
     workers: Annotated[
         int | None,
         WHOLE_NUMBER,
-        Parameter(help="Worker processes [one a core]; 0 works in this process, for debuggers."),
+        Parameter(help="Worker processes [one per core]; 0: this process, for debuggers."),
     ] = None
-    address: Annotated[str, Parameter(help="local, or the address of a running Ray cluster.")] = "local"
+    address: Annotated[str, Parameter(help="local, or the address of a Ray cluster.")] = "local"
     max_quarantined: Annotated[
-        float, Parameter(help="Share of the run's shards that may be given up before the job has failed.")
+        float, Parameter(help="Largest quarantined share of the run's shards in a successful job.")
     ] = DEFAULT_SHARE
     detach: Annotated[bool, Parameter(negative=(), help=_DETACH)] = False
-    json: Annotated[bool, Parameter(negative=(), help="Report progress as JSON lines on standard error.")] = (
+    json: Annotated[bool, Parameter(negative=(), help="Print progress as JSON lines to standard error.")] = (
         False
     )
 
     def refuse_bad(self) -> None:
-        """Raise InputError for values out of range and, unless detached, for a cluster that is not there."""
+        """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
         if self.workers is not None and not 0 <= self.workers <= 4096:
-            mend = "Leave it out for one a core"
+            mend = "Omit it for one per core"
             raise InputError("--workers", str(self.workers), "is not between 0 and 4096", mend)
         if not 0 <= self.max_quarantined <= 1:
             given = str(self.max_quarantined)
@@ -55,12 +55,12 @@ class JobOptions:
             refuse_unusable(self.address)
 
     def words(self) -> list[str]:
-        """The options that say the same again, without --detach and --address."""
+        """The words of these options, without --detach and --address."""
         share = None if self.max_quarantined == DEFAULT_SHARE else self.max_quarantined
         return words_of({"--workers": self.workers, "--max-quarantined": share, "--json": self.json})
 
     def address_words(self) -> list[str]:
-        """--address, where it is not `local`."""
+        """The words of --address, where it is not `local`."""
         return words_of({"--address": None if self.address == "local" else self.address})
 
 
@@ -68,16 +68,16 @@ HERE = JobOptions()
 
 
 def refuse_odd_n(n: int) -> None:
-    """Raise InputError for a number of labels that no run has."""
+    """Raise InputError for a number of labels out of range."""
     if not 1 <= n <= 10**12:
-        raise InputError("--n", str(n), "is not between 1 and 10^12", "Say how many labels you want")
+        raise InputError("--n", str(n), "is not between 1 and 10^12", "Give the number of labels wanted")
 
 
 @contextmanager
 def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
-    """Show that sources are being opened, and tell whoever interrupts that how to go on.
+    """Show the phase in which sources are opened, and print how to resume when it is interrupted.
 
-    Gives the moment at which it began, by the monotonic clock.
+    Gives its start by the monotonic clock.
     """
     began_s = time.monotonic()
     with resumable([*words, *job_options.address_words()]), Progress(job_options.json) as shown:
@@ -88,13 +88,13 @@ def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
 def absolute_source(ref: str) -> str:
     """A source reference with its file or folder made absolute: workers run elsewhere."""
     kind, _, text = ref.partition(":")
-    # What names no file is a parameter of the source, as in builtin:400.
+    # Text that is not an existing path is a parameter of the source, as in builtin:400.
     is_path = bool(text) and kind != "builtin" and Path(text).expanduser().exists()
     return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
 
 
 def absolute_place(place: str) -> str:
-    """A run's address as every folder and machine understands it."""
+    """A run's absolute path or its address, valid in every folder."""
     if "://" in place and not place.startswith("file://"):
         return place
     return str(Path(place.removeprefix("file://")).expanduser().absolute())

@@ -1,4 +1,4 @@
-"""What `submit`, `resume` and `extend` share: an existing run's sources opened, and its job begun."""
+"""Open the sources of an existing run and start its job, for `submit`, `resume` and `extend`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from datagen.workers.robots import gripper_of
 
 
 def source_words(given: Sources) -> list[str]:
-    """The options that say the same again, from any folder."""
+    """The options for the same sources, with absolute paths."""
     return words_of(
         {
             "--houses": given.houses and absolute_source(given.houses),
@@ -35,18 +35,18 @@ def source_words(given: Sources) -> list[str]:
 
 
 def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
-    """An existing run with its sources, checked to be those that it was made from.
+    """Return an existing run with its sources, after a check that they are those it was made from.
 
-    InputError where they are not there, or where another engine is installed than the run was made with:
-    its shards would then be of another kind than those that are there.
+    InputError where they are missing or differ, or where another version of an engine is installed: new
+    shards would not fit the existing ones.
     """
     spec, known = run.manifest.spec, run.manifest.sources
     refuse_missing_packages(spec.label_source)
     load_label_source(spec.label_source)
-    _ = run.schema  # refuses a run of another schema version
+    _ = run.schema  # InputError for an unknown schema version
     if given.scenes_from is not None and spec.scenes_from is None:
-        problem = f"{run.storage.url} draws its own scenes"
-        raise InputError("--scenes-from", given.scenes_from, problem, "Take --scenes-from out")
+        problem = f"{run.storage.url} has its own scenes"
+        raise InputError("--scenes-from", given.scenes_from, problem, "Omit --scenes-from")
     _refuse_other_engines(run)
     open_sources(run, given)
     refuse_unusable_engines(spec, address)
@@ -66,7 +66,7 @@ def start_job(
     began_s: float,
     given: Sources = AS_FOUND,
 ) -> int:
-    """Run the job of what is missing; the exit code. `path` is the run as the user wrote it."""
+    """Make the missing shards; return the exit code. `path` is the path as the user wrote it."""
     words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
     words += detached_words() or job_options.address_words()
     with resumable(words):
@@ -74,13 +74,13 @@ def start_job(
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:
-    """Raise InputError for a robot or a renderer with which every shard would fail."""
+    """Raise InputError for a robot or a renderer that does not work on this machine."""
     if spec.arm is not None:
         gripper_of(spec.arm.robot)
     if address == "local" and spec.scenes_from is None and spec.observation.renderer == "sapien":
         device = probe_render_device()
         if not device.succeeded:
-            problem, mend = f"no render device here ({device.text})", "Take embree, or see `datagen doctor`"
+            problem, mend = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
             raise InputError("--renderer", "sapien", problem, mend)
 
 
@@ -88,14 +88,12 @@ def _refuse_other_engines(run: Run) -> None:
     spec = run.manifest.spec
     try:
         here = label_engines(spec.label_source)
-        if spec.scenes_from is None:  # stored scenes are what they are, whatever drew them
+        if spec.scenes_from is None:  # stored scenes need no scene engines
             here |= scene_engines(spec)
     except PackageNotFoundError as error:
-        raise InputError(
-            run.storage.url, "engines", f"{error.name} is not installed here", "Install it"
-        ) from None
+        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", "Install it") from None
     made = {name: version for name, version in spec.engines.items() if name in here}
-    rows = [f"{name}: it has {a}, here is {b}" for name, a, b in different_fields(made, here)]
+    rows = [f"{name}: the run has {a}, this machine {b}" for name, a, b in different_fields(made, here)]
     if rows:
-        place, mend = f"{run.storage.url}/manifest.json", "Install what it has, or start a new run"
+        place, mend = f"{run.storage.url}/manifest.json", "Install the run's versions, or start a new run"
         raise InputError(place, "engines", "; ".join(rows), mend)

@@ -1,1 +1,1 @@
-"""Shards and scenes made again from their records: for resumed jobs, checks, repairs and replays."""
+"""Make shards and scenes again from their records, for checks, repairs and replays."""

@@ -1,7 +1,6 @@
-"""Deep checks of a run: samples recomputed from their stored poses, scenes drawn again from their seeds.
+"""Deep checks of a run: samples recomputed from stored poses, scenes sampled again from their seeds.
 
-Digests say that bytes are those that were written; these checks say that what was written is what the
-specification means.
+Digests show that bytes are unchanged; these checks show that they follow from the specification.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ from datagen.schemas.keys import shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
 
-_MEND = "Trust neither it nor its neighbours: find out what made it"
-# Candidates of a drawn scene that are labelled where a label is a plan or a trial.
+_MEND = "Do not use this run; find the cause in its code version, libraries or machine"
+# Candidates of a scene to label again where a label is a plan or a trial.
 _TRIED = 4
 
 
 def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Generator) -> Iterator[Finding]:
-    """What is wrong with k random committed samples and k random committed scenes of a run.
+    """Yield findings on k random committed samples and k random committed scenes of a run.
 
     The samples are recomputed from their stored poses, the scenes are drawn again from their seeds.
     Bit for bit where machine and versions are those that made them; elsewhere samples within the stated
@@ -68,7 +67,7 @@ def deep_findings(run: Run, k: int, origin: OpenedSources, rng: np.random.Genera
 
 
 def _checked(run: Run, scene: int, findings: Iterator[Finding]) -> Iterator[Finding]:
-    """The findings; what refuses the stored rows is one of them."""
+    """Yield the findings; an InputError on the stored rows is one of them."""
     try:
         yield from findings
     except InputError as error:
@@ -99,9 +98,9 @@ def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator
     kept = chosen_rows(stored, rows)
     stages = tuple(STAGES)
     if what_differs_here(run, shard):
-        # Physics that ends otherwise may ask for another try, and then all draws are others.
+        # Other physics results may cause a resampling, after which all draws differ.
         stages = DRAWN[:1] if int(made.record["retry"]) == int(stored.record["retry"]) else ()
-    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, stages), "drawn again")
+    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, stages), "sampled again")
 
 
 def _of_stages(

@@ -1,4 +1,4 @@
-"""Scenes of a run made again: drawn from their seeds, or reconstructed from what is stored, and labelled."""
+"""Make scenes of a run again, from their seeds or from the stored poses, and label them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from datagen.workers.world import World, assemble_world
 class Replayer:
     """A run opened to make its scenes again.
 
-    `drawing` draws its scenes; None where they come from another run that is not there any more.
+    `drawing` samples its scenes; None where they come from another run that does not exist any more.
     """
 
     run: Run
@@ -37,10 +37,9 @@ class Replayer:
     drawing: World | None
 
     def redraw(self, scene: int, rows: Sequence[int] | None = None) -> SceneRows:
-        """Scene `scene` drawn from its seeds as a worker does, redraws included, and labelled.
+        """Sample scene `scene` from its seeds as a worker does, rejections included, and label it.
 
-        `rows` chooses the candidates that are labelled; by default all. Raises InputError where the
-        scene cannot be drawn.
+        `rows` selects the candidates to label; by default all. Raises InputError where no scene can be made.
         """
         if self.drawing is None:
             raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _MEND)
@@ -49,15 +48,15 @@ class Replayer:
         fields = self.run.schema.scene_fields
         record = {f.name: np.array(plain[f.name], object if f.is_text else f.dtype) for f in fields}
         settled: SettledScene = drawn
-        if self.drawing is not self.world:  # another run drew it: it reaches the labels as a record
+        if self.drawing is not self.world:  # the scene of another run is labelled from its record
             settled = reconstruct_scene(self.world, record)
         chosen = range(len(candidates)) if rows is None else rows
         return SceneRows(record, self._samples(settled, candidates, chosen))
 
     def recompute(self, stored: SceneRows, rows: Sequence[int]) -> SceneRows:
-        """The candidates `rows` of a stored scene, labelled again from the stored poses.
+        """Label the candidates `rows` of a stored scene again from the stored poses.
 
-        InputError where the record names what is not there, or poses that nothing can have.
+        InputError where the record names a missing house or object, or has invalid poses.
         """
         scene = reconstruct_scene(self.world, stored.record)
         candidates = reconstruct_candidates(stored.samples, scene)
@@ -71,12 +70,12 @@ class Replayer:
         return chosen | source.columns(scene, candidates, spec, rows)
 
 
-_NO_DRAWING = "the run that drew the scenes is not there any more"
-_MEND = "Give --scenes-from the run that drew them"
+_NO_DRAWING = "the run that made the scenes does not exist any more"
+_MEND = "Give that run with --scenes-from"
 
 
 def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
-    """A run opened to make its scenes again from its origin, where whatever drew them is there."""
+    """Open a run to make its scenes again from its sources."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
         drawn_by = _source_if_there(drawn_by)
@@ -102,10 +101,10 @@ def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:
 
 
 def what_differs_here(run: Run, shard: int | None = None) -> list[str]:
-    """In what this machine differs from the one that made the run, as far as bits depend on it.
+    """Differences of this machine from the one that made the run that can change bits.
 
-    Empty where a replay must be equal bit for bit. With `shard`, the processor of its commit counts too:
-    what its vector units make of a sum may differ.
+    Empty where a replay must be equal bit for bit. With `shard`, the processor of its commit counts too: sums
+    may depend on its vector units.
     """
     manifest = run.manifest
     found: list[str] = []
@@ -134,6 +133,6 @@ def _differing(made: Mapping[str, str], here: Mapping[str, str]) -> list[tuple[s
 
 
 def _platform_name(text: str) -> tuple[str, str]:
-    """System, and machine with its C library: what the kernel's version between them does not change."""
+    """The platform string without the version of the kernel."""
     machine = platform.machine()
     return text.partition("-")[0], text.rpartition(machine)[2] if machine in text else text

@@ -1,4 +1,4 @@
-"""A shard computed again, in this process and in memory: for checks, repairs and replays."""
+"""Compute a shard again in this process, for checks, repairs and replays."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from datagen.workers.world import World, open_world
 
 @dataclass(frozen=True, eq=False)
 class OpenedSources:
-    """What a run's shards are made from, opened."""
+    """The opened sources of a run's shards."""
 
     world: World
     scenes: Run | None  # the run whose scenes are labelled again
 
 
 def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> OpenedSources:
-    """Open the run's sources: those given, or else where the run found them.
+    """Open the run's sources: those given, else those in its manifest.
 
-    InputError where they are not there any more, or are not those that the run was made from. Without
-    `needs_scenes` the run that drew the scenes may be gone, unless it is given: what is stored is enough to
-    work out labels again.
+    InputError where they do not exist, or differ from those that the run was made from. Without
+    `needs_scenes` the run of --scenes-from may be missing, unless it is given: stored poses suffice to label
+    again.
     """
     spec, known = run.manifest.spec, run.manifest.sources
     world = open_world(
@@ -43,11 +43,11 @@ def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True)
 
 
 def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
-    """The run whose scenes this one labelled. InputError where it is not there, or has other scenes."""
+    """The run whose scenes this one labelled. InputError where it is missing or has other scenes."""
     place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
-    mend = "Give --scenes-from the run that this one was started with"
+    mend = "Give --scenes-from with the run that this one was started with"
     if not place:
-        raise InputError(run.storage.url, "scenes_from", "the run does not say where its scenes lie", mend)
+        raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", mend)
     source = Run.open(place)
     if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
         raise InputError(place, "spec_hash", "has other scenes than this run", mend)
@@ -55,7 +55,7 @@ def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
 
 
 def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
-    """The shard's rows, computed anew. Raises whatever the computation does."""
+    """Compute the shard's rows again; exceptions of the computation are not caught."""
     first = shard * run.layout.scenes_per_shard
     scenes = range(first, first + run.layout.scenes_per_shard)
     stored = None if origin.scenes is None else read_scenes(origin.scenes, scenes)
@@ -63,5 +63,5 @@ def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult
 
 
 def regenerated_files(run: Run, made: ShardResult) -> dict[str, bytes]:
-    """The shard's files, by path in its attempt's folder, as an attempt writes them."""
+    """Compute the shard's files again, by path in the attempt's folder."""
     return encode_shard(run.schema, run.layout, run.manifest.spec_hash, made.scene, made.sample)

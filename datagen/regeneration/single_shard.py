@@ -1,4 +1,4 @@
-"""One shard run alone in this process, with nothing caught: what a debugger and a traceback need."""
+"""Run one shard in this process without catching exceptions, for debuggers and tracebacks."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from datagen.workers.run_shard import ShardResult
 
 
 class ShardFailed(Exception):
-    """A replayed shard broke one of its own rules. Not input that is wrong, so it keeps its traceback."""
+    """A replayed shard failed. This is a defect and not bad input, so it keeps its traceback."""
 
 
 def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: bool = False) -> int:
-    """Print what is known of the shard's failures, and make it again; the exit code.
+    """Print the shard's recorded failures, and make it again; return the exit code.
 
-    Whatever the computation raises leaves this function as it is, or with `ShardFailed` around an
-    InputError. A made shard is compared with the committed files, where there are any. Nothing is written.
+    Exceptions of the computation are not caught; an InputError is wrapped in `ShardFailed`. The shard is
+    compared with its committed files, if any. No file is written.
     """
     planned = run.planned()
     if shard not in planned:
-        mend = f"Choose one from 0 to {len(planned) - 1}"
+        mend = f"Give one from 0 to {len(planned) - 1}"
         raise InputError(place, "--shard", f"{shard} is not in this run", mend)
     record = next((r for r in run.quarantine_records() if r.shard == shard), None)
     failed = _recorded(run, shard, record)
     if not json:
         _print_recorded(place, shard, record, failed)
     if sys.__stderr__ is not None:
-        faulthandler.enable(sys.__stderr__)  # a native crash leaves its stack too
+        faulthandler.enable(sys.__stderr__)  # also prints the stack of a native crash
     made = _make(run, shard, origin)
     differing = _differing_files(run, shard, made)
     report: dict[str, Any] = {
@@ -61,7 +61,7 @@ def _make(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
     try:
         return regenerate_shard(run, shard, origin)
     except InputError as error:
-        # The command line would make one line of it, and the defect is where it was raised.
+        # The command line would reduce it to one line and hide where it was raised.
         raise ShardFailed(str(error)) from error
     except KeyboardInterrupt:
         traceback.print_exc()  # where it hung
@@ -69,7 +69,7 @@ def _make(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
 
 
 def _differing_files(run: Run, shard: int, made: ShardResult) -> list[str] | None:
-    """Files of the made shard that are not those that were committed; None where nothing was."""
+    """Files of the shard that differ from the committed ones; None where it is not committed."""
     if shard not in run.committed():
         return None
     entries = {entry.path: entry.sha256 for entry in run.commit_of(shard).files}
@@ -78,7 +78,7 @@ def _differing_files(run: Run, shard: int, made: ShardResult) -> list[str] | Non
 
 
 def _recorded(run: Run, shard: int, record: QuarantineRecord | None) -> list[dict[str, str]]:
-    """Failed attempts at the shard: attempt, outcome, cause, stack."""
+    """Failed attempts of the shard: attempt, outcome, cause, stack."""
     if record is not None and record.causes:
         each = zip(record.attempts, record.causes, record.stacks, strict=False)
         return [{"attempt": a, "cause": c, "stack": s} for a, c, s in each]
@@ -92,20 +92,20 @@ def _recorded(run: Run, shard: int, record: QuarantineRecord | None) -> list[dic
 def _print_recorded(
     place: str, shard: int, record: QuarantineRecord | None, failed: list[dict[str, str]]
 ) -> None:
-    state = "" if record is None else f", in quarantine since {record.created}"
+    state = "" if record is None else f", quarantined at {record.created}"
     print_rows(f"shard {shard} of {place}{state}", [(f["attempt"], f["cause"]) for f in failed])
     stacks = [f["stack"].rstrip() for f in failed if f["stack"].strip()]
     if stacks:
         print_lines(f"the last recorded stack:\n{stacks[-1]}")
-    print_lines("now here:")
+    print_lines("now on this machine:")
 
 
 def _print_made(place: str, report: dict[str, Any]) -> None:
-    rows = [("made", f"{report['labels']} labels, {report['positives']} positive; nothing was written")]
+    rows = [("made", f"{report['labels']} labels, {report['positives']} positive; no file was written")]
     if report["committed"]:
         apart = report["differing_files"]
         same = "equal, bit for bit" if not apart else f"{len(apart)} differ, first {apart[0]}"
         rows.append(("committed files", same))
     if report["mend"]:
         rows.append(("to try it again", report["mend"]))
-    print_rows(f"shard {report['shard']} of {place}: it runs here", rows)
+    print_rows(f"shard {report['shard']} of {place}: runs without failure", rows)

@@ -1,4 +1,4 @@
-"""Where the sources of an existing run lie now, if they have moved: options of several verbs."""
+"""Options for the sources of an existing run after they have moved."""
 
 from __future__ import annotations
 
@@ -11,23 +11,19 @@ from cyclopts import Parameter
 @Parameter(name="*")
 @dataclass(frozen=True)
 class AssetSources:
-    """References of houses and objects as the user gives them; None is where the run found them."""
+    """References of houses and objects from the command line; None: those in the run's manifest."""
 
-    houses: Annotated[str | None, Parameter(help="Where the houses lie now [where the run found them].")] = (
-        None
-    )
-    objects: Annotated[
-        str | None, Parameter(help="Where the objects lie now [where the run found them].")
-    ] = None
+    houses: Annotated[str | None, Parameter(help="New location of the houses [as in the run].")] = None
+    objects: Annotated[str | None, Parameter(help="New location of the objects [as in the run].")] = None
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Sources(AssetSources):
-    """The same, and the place whose scenes a run labelled again."""
+    """The same, and the run whose scenes a run labelled again."""
 
     scenes_from: Annotated[
-        str | None, Parameter(help="Where the run lies whose scenes are labelled again [where it was found].")
+        str | None, Parameter(help="New location of the run with the scenes [as in the run].")
     ] = None
 
 

@@ -1,4 +1,4 @@
-"""What each stage of a shard writes, and how stored rows are compared with rows that were computed again."""
+"""The fields of each stage of a shard, and comparisons of stored rows with recomputed ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datagen.workers.labels.distance_visibility_score import heuristic
 
 Array = np.ndarray[Any, Any]
 
-# Stage -> the fields that it decides, in the order in which stages run.
+# Stage -> its fields, in the order in which stages run.
 STAGES: dict[str, tuple[str, ...]] = {
     "draw": (
         "scene_index", "retry", "redraws", "house_id", "house_digest", "room_id", "room_type", "support_id",
@@ -42,9 +42,9 @@ STAGES: dict[str, tuple[str, ...]] = {
         "heuristic_score", "heuristic_label", "outcome", "label", "label_source", "label_version",
     ),
 }  # fmt: skip
-# What drawing a scene decides; the rest follows from it and its candidates.
+# Stages of sampling a scene; the others follow from it and its candidates.
 DRAWN = ("draw", "settle", "observe", "candidates")
-# What is worked out again from stored poses.
+# Stages that are computed again from stored poses.
 RECOMPUTED = ("candidates", "visibility", "grasps", "plan", "execute", "labels")
 
 # What rows of another platform or version may differ by (docs/explanation/determinism.md).
@@ -55,7 +55,7 @@ SCORE_TOLERANCE = 2e-5
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """How one field differs: in so many values, by at most `largest`; None where it holds names."""
+    """Difference of one field: the number of differing values and the largest; None for names."""
 
     field: str
     unit: str
@@ -71,7 +71,7 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class StageComparison:
-    """One stage of stored rows beside the same stage computed again."""
+    """The comparison of one stage of stored rows with the recomputed one."""
 
     stage: str
     fields: int
@@ -86,9 +86,9 @@ class StageComparison:
 def compare_stages(
     schema: RecordSchema, stored: SceneRows, made: SceneRows, stages: Sequence[str] = tuple(STAGES)
 ) -> list[StageComparison]:
-    """Stored rows with those computed again, stage by stage, bit for bit.
+    """Compare stored rows with recomputed ones, stage by stage, bit for bit.
 
-    Both hold the same samples in the same order. Stages that the schema stores nothing of are left out.
+    Both hold the same samples in the same order. Stages without stored fields are omitted.
     """
     fields = {f.name: f for f in (*schema.scene_fields, *schema.sample_fields)}
     found: list[StageComparison] = []
@@ -118,14 +118,14 @@ def _difference(field: Field, stored: Array, made: Array) -> FieldDifference | N
     with np.errstate(invalid="ignore", over="ignore"):
         gaps = np.abs(stored.astype(np.float64) - made.astype(np.float64))
     finite = gaps[np.isfinite(gaps)]
-    if field.name == "sample_id":  # a gap between hashes says nothing
+    if field.name == "sample_id":  # the size of a difference between hashes is meaningless
         finite = finite[:0]
     largest = float(finite.max()) if finite.size else None
     return FieldDifference(field.name, field.unit, int(apart.sum()), largest)
 
 
 def _bits(values: Array, field: Field) -> Array:
-    """The values' bytes as whole numbers, so that 0 is not -0 and a NaN is itself."""
+    """The values' bytes as integers, so that 0 differs from -0 and NaN equals itself."""
     plain = np.ascontiguousarray(values, np.dtype(field.dtype).newbyteorder("="))
     return plain.view(f"u{plain.dtype.itemsize}").reshape(values.shape)
 
@@ -133,11 +133,11 @@ def _bits(values: Array, field: Field) -> Array:
 def beyond_tolerance(
     spec: Specification, stored: Mapping[str, Array], made: Mapping[str, Array]
 ) -> list[str]:
-    """How samples break what holds across platforms and versions; nothing where they keep to it.
+    """Return how samples exceed the tolerances between platforms and versions; empty where they do not.
 
-    `stored` and `made` are columns of equal rows. Compared are pixel counts, rho and distances; score and
-    heuristic label are worked out from the stored columns themselves, so that a rho that moved by a pixel
-    does not hide a score that is wrong.
+    `stored` and `made` are columns of equal rows. Pixel counts, rho and distances are compared; score and
+    heuristic label are computed from the stored columns, so that a rho that differs by a pixel does not hide
+    a wrong score.
     """
     problems: list[str] = []
 
@@ -165,6 +165,6 @@ def beyond_tolerance(
     within("heuristic_score", gap, SCORE_TOLERANCE, "")
     label = (stored["heuristic_score"] >= np.float32(spec.heuristic.tau)).astype(np.int64)
     name = "heuristic_label" if "heuristic_label" in stored else "label"
-    if name != "label" or spec.label_source == "heuristic":  # else it is by another rule than this
+    if name != "label" or spec.label_source == "heuristic":  # other labels follow another rule
         within(name, np.abs(label - stored[name]), 0, "")
     return problems

@@ -1,1 +1,1 @@
-"""Labels by another rule over the files of a run."""
+"""Relabel runs by other parameters of the heuristic, sharing their files."""

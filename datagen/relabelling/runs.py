@@ -1,4 +1,4 @@
-"""All committed shards of runs by another rule, in a place of their own."""
+"""Relabel all committed shards of runs into a new run."""
 
 from __future__ import annotations
 
@@ -35,55 +35,54 @@ from datagen.workers.labels import load_label_source
 
 @dataclass
 class Relabelled:
-    """What a call did, over all runs of the place."""
+    """The result of a call, over all runs."""
 
     runs: list[Run] = field(default_factory=list)
     summary: JobSummary = field(default_factory=empty_summary)
     flips: Flips = field(default_factory=Flips)
-    absent: int = 0  # planned shards that the source has not
+    absent: int = 0  # planned shards that the source lacks
 
 
 def relabelled_specification(
     source: Run, options: dict[str, Any], config: Path | None = None
 ) -> Specification:
-    """The specification of `submit heuristic --scenes-from SOURCE` with other parameters of the rule.
+    """Return the specification of `submit heuristic --scenes-from SOURCE` with other parameters of the rule.
 
     `options` are dotted names. InputError for another label source, for a configuration that would change
-    more than the rule, and for visibilities that another version of the label code counted.
+    more than the rule, and for visibilities from another version of the label code.
     """
     before, place = source.manifest.spec, source.storage.url
     if before.label_source != "heuristic":
-        problem = f"{before.label_source} labels do not follow from distance and visibility"
+        problem = f"is {before.label_source}: such labels cannot be computed from distance and visibility"
         mend = f"Relabel a heuristic run of these scenes: datagen submit heuristic --scenes-from {place}"
         raise InputError(place, "label_source", problem, mend)
     sources = source.manifest.sources
     stored = StoredScenes(source, sources.get("houses", "builtin"), sources.get("objects", "builtin"))
     spec = specify_again("heuristic", stored, config, options=options)
     if spec.visibility != before.visibility:
-        problem = "decides visibilities, which are those that the run stores"
-        mend = "Take it out, or cast rays again: datagen submit heuristic --scenes-from"
+        problem = "would change visibilities, which are stored"
+        mend = "Remove it, or cast rays again: datagen submit heuristic --scenes-from RUN"
         raise InputError(str(config), "visibility", problem, mend)
     version = str(load_label_source("heuristic").version)
     if (made := before.engines.get("labels")) != version:
-        problem = f"its visibilities are of version {made} of the label code, and this is {version}"
-        mend = "Cast rays again: datagen submit heuristic --scenes-from"
+        problem = f"visibilities are of version {made} of the label code, not {version}"
+        mend = "Cast rays again: datagen submit heuristic --scenes-from RUN"
         raise InputError(place, "engines.labels", problem, mend)
-    # What moved the bits of rho and distance is what moved them then, whatever is installed here.
+    # rho and distance were computed with the source's versions, whatever is installed here.
     return spec.model_copy(update={"engines": dict(before.engines)})
 
 
 def relabel_all(
     place: Storage, sources: Sequence[Run], specs: Sequence[Specification], json: bool = False
 ) -> Relabelled:
-    """Relabel every committed shard of the runs that is not there yet, and seal.
+    """Relabel every committed shard of the runs that is missing at `place`, and seal.
 
-    One specification gives a run at `place`, several give merged runs. InputError when something else
-    is at `place`.
+    One specification gives a run, several give merged runs. InputError when something else is at `place`.
     """
     for source in sources:
         if not source.committed():
             raise InputError(source.storage.url, "commits", "no shard is committed", "Resume the run first")
-    # Runs of the same scenes by different rules become one by one rule: the longest stands for them.
+    # Runs of the same scenes by different rules become one run: the longest represents them.
     longest: dict[str, tuple[Run, Specification]] = {}
     for source, spec in zip(sources, specs, strict=True):
         found = longest.get(spec.hash())
@@ -117,20 +116,20 @@ def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
     )
     run = Run.create_or_open(place, manifest, source.n)
     if run.layout != source.layout:
-        problem = f"{run.layout.scenes_per_shard} scenes a shard, where the source has others"
+        problem = f"is {run.layout.scenes_per_shard}, unlike in the source"
         mend = "Choose another --out: files can be shared only shard by shard"
         raise InputError(f"{place.url}/manifest.json", "layout.scenes_per_shard", problem, mend)
     return run
 
 
 def _refuse_other_place(place: Storage, hashes: Sequence[str]) -> None:
-    """Refuse, before a part is begun there, a place that holds anything but these very runs."""
+    """Raise InputError where a place holds anything but these runs, before a part is started."""
     if place.exists("manifest.json"):
-        problem = f"holds one run, and {len(hashes)} would be written"
+        problem = f"holds one run, but {len(hashes)} would be written"
         raise InputError(place.url, "manifest.json", problem, "Choose another --out")
     stored = place.get(MERGED, MAX_RECORD_BYTES)
     if stored is None:
-        # A call that was cut short may have left parts, and a draft of the record.
+        # An interrupted call may have left parts, and a draft of the record.
         refuse_foreign(place, "parts/", MERGED)
     elif stored != _merged_record(hashes):
         raise _other_runs(place)
@@ -141,21 +140,21 @@ def _merged_record(hashes: Sequence[str]) -> bytes:
 
 
 def _other_runs(place: Storage) -> InputError:
-    return InputError(f"{place.url}/{MERGED}", "parts", "other runs were merged here", "Choose another --out")
+    return InputError(f"{place.url}/{MERGED}", "parts", "has other merged runs", "Choose another --out")
 
 
 def _write_merged(place: Storage, hashes: Sequence[str]) -> None:
     record = _merged_record(hashes)
     if place.get(MERGED, MAX_RECORD_BYTES) in (None, record):
         publish(place, MERGED, record)
-    if place.get(MERGED, MAX_RECORD_BYTES) != record:  # also where somebody else was faster
+    if place.get(MERGED, MAX_RECORD_BYTES) != record:  # also where another process was faster
         raise _other_runs(place)
 
 
 def _relabel_run(
     run: Run, source: Run, missing: Sequence[int], stop: StopRequest, flips: Flips, shown: Progress
 ) -> JobSummary:
-    """The shards of one run, one after the other in this process: files are linked, not computed."""
+    """Relabel the shards of one run in this process; files are linked, not computed."""
 
     def work(task: RelabelTask, meter: Meter) -> AttemptResult:
         return relabel_shard(run, source, task, meter, flips)

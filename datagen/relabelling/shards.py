@@ -1,4 +1,4 @@
-"""One shard of a run with other labels: its distances and visibilities stay, and so do its files."""
+"""Relabel one shard; its distances, visibilities and files are kept."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _READ = (
 
 @dataclass(frozen=True)
 class RelabelTask:
-    """One attempt at relabelling one shard, in this process."""
+    """Relabels one shard in this process."""
 
     shard: int
     attempt: str
@@ -41,7 +41,7 @@ class RelabelTask:
 
 @dataclass
 class Flips:
-    """Labels that came out otherwise than in the source, counted over shards."""
+    """Counts of changed labels over shards."""
 
     to_good: int = 0
     to_bad: int = 0
@@ -50,8 +50,8 @@ class Flips:
 def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips: Flips) -> AttemptResult:
     """Label a committed shard of `source` by the rule of `run`, and commit it there.
 
-    Files whose bytes stay are adopted; written are labels, scores and ids. Raises InputError for a
-    damaged file, JobCannotContinue for a full or forbidden disk.
+    Labels, scores and ids are written, all other files are linked. Raises InputError for a damaged file,
+    JobCannotContinue for a full or read-only disk.
     """
     clock = StageClock()
     with ends_job():
@@ -74,7 +74,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
         scenes=before.scenes,
         samples=before.samples,
         positives=positives,
-        redraws={},  # nothing was drawn
+        redraws={},  # nothing was sampled
         files=entries,
         cost=cost,
         host=this_host(),
@@ -88,7 +88,7 @@ def relabel_shard(run: Run, source: Run, task: RelabelTask, meter: Meter, flips:
 
 
 def _relabelled(run: Run, stored: Columns) -> Columns:
-    """The columns that another rule changes."""
+    """The columns that depend on the rule."""
     score, label = formula.heuristic(
         stored["distance_m"],
         stored["mount_distance_m"],
@@ -111,7 +111,7 @@ def _relabelled(run: Run, stored: Columns) -> Columns:
 
 
 def _made_files(run: Run, made: Columns) -> dict[str, bytes]:
-    """Metadata and the chunks of the columns, by path within the attempt's folder."""
+    """Metadata and chunks of the columns, by path within the attempt's folder."""
     schema, layout = run.schema, run.layout
     files = dict(group_metadata(schema, layout, run.manifest.spec_hash))
     rows = layout.samples_per_shard
@@ -127,7 +127,7 @@ def _made_files(run: Run, made: Columns) -> dict[str, bytes]:
 def _write(
     run: Run, source: Run, before: Commit, attempt: str, files: dict[str, bytes]
 ) -> tuple[tuple[FileEntry, ...], int]:
-    """Put the files whose bytes are new and adopt the others; the commit's entries, and bytes put."""
+    """Write the new files and link the others; return the commit's entries and the bytes written."""
     old, new = shard_folder(before.shard, before.attempt), shard_folder(before.shard, attempt)
     entries: list[FileEntry] = []
     kept: list[tuple[str, str]] = []

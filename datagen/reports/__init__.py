@@ -1,1 +1,1 @@
-"""What runs say of themselves, as plain values and as tables: progress, cost, agreement."""
+"""Reports on runs as plain values and as tables: progress, cost, agreement."""

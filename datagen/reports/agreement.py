@@ -1,4 +1,4 @@
-"""How labels of the same candidates agree, and of what kind they are: arrays in, plain values out."""
+"""Agreement of labels of the same candidates, and statistics of outcomes: arrays to plain values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEIGHT_EDGES_M: Edges = (0.0, *TENTHS[5:], None)
 
 @dataclass(frozen=True, eq=False)
 class Labelled:
-    """N candidates with a label, and what they are sorted by. Arrays are (N,)."""
+    """N candidates with a label and the quantities to group them by. Arrays are (N,)."""
 
     scene: npt.NDArray[np.int64]
     candidate: npt.NDArray[np.int32]
@@ -51,24 +51,24 @@ class Labelled:
         return Labelled(**cut, outcome=None if self.outcome is None else self.outcome[rows])
 
     def is_in(self, candidates: str) -> Bools:
-        """Which (N,) belong to a set of CANDIDATE_SETS."""
+        """Mask (N,) of the candidates in a set of CANDIDATE_SETS."""
         return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
 
 
-# The arrays that every label has.
+# The arrays that every label source has.
 ROWS = tuple(f.name for f in fields(Labelled) if f.name != "outcome")
 
 
 def common_candidates(a: Labelled, b: Labelled) -> tuple[Labelled, Labelled]:
-    """The candidates that both labelled, by scene and index, row by row the same."""
-    # No run has 2^32 candidates a scene.
+    """The candidates that both labelled, by scene and index, in the same order."""
+    # A scene has fewer than 2^32 candidates.
     keys = [side.scene * 2**32 + side.candidate for side in (a, b)]
     _, rows_a, rows_b = np.intersect1d(*keys, assume_unique=True, return_indices=True)
     return a.at(rows_a), b.at(rows_b)
 
 
 def confusion(said: Bools, true: Bools) -> dict[str, int]:
-    """Counts of right and wrong positives and negatives of `said` (N,) against `true` (N,)."""
+    """Confusion counts of predicted labels `said` (N,) and reference labels `true` (N,)."""
     return {
         "true_positive": int((said & true).sum()),
         "false_positive": int((said & ~true).sum()),
@@ -78,10 +78,10 @@ def confusion(said: Bools, true: Bools) -> dict[str, int]:
 
 
 def agreement(said: Bools, true: Bools) -> dict[str, Any]:
-    """Counts, shares and accuracies; None where nothing can be said.
+    """Counts, shares and accuracies; None where they are undefined.
 
-    Balanced accuracy is the mean of the shares of positives and of negatives that are found: 0.5 for
-    a rule that looks at nothing, however rare positives are.
+    Balanced accuracy is the mean of sensitivity and specificity: 0.5 for a constant rule, however rare
+    positives are.
     """
     n, positives = len(true), int(true.sum())
     found = float(said[true].mean()) if positives else None
@@ -96,7 +96,7 @@ def agreement(said: Bools, true: Bools) -> dict[str, Any]:
 
 
 def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
-    """How the labels of `said` stand to those of `true`; both hold the same candidates, row by row."""
+    """Compare the labels of `said` with those of `true`, for the same candidates in the same order."""
 
     def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
         return [
@@ -120,7 +120,7 @@ def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
 
 
 def _by_outcome(said: Labelled, true: Labelled) -> list[dict[str, Any]]:
-    """For each outcome of `true`, how many there are and how many of them were said to be good."""
+    """For each outcome of `true`, its count and the number of predicted positives."""
     if true.outcome is None:
         return []
     return [
@@ -131,7 +131,7 @@ def _by_outcome(said: Labelled, true: Labelled) -> list[dict[str, Any]]:
 
 
 def outcome_report(labelled: Labelled) -> dict[str, Any]:
-    """Outcomes and deciding stages with count and share, and the share of positives by band."""
+    """Return outcomes and deciding stages with count and share, and the share of positives by band."""
     assert labelled.outcome is not None
     n = len(labelled)
     counts = np.bincount(labelled.outcome, minlength=len(OUTCOMES))
@@ -140,7 +140,7 @@ def outcome_report(labelled: Labelled) -> dict[str, Any]:
         for name, count in zip(OUTCOMES, counts, strict=True)
         if count
     ]
-    # A success is decided last; what is left are failures, by the stage that found them.
+    # Failures by the stage that decided them.
     stages = dict.fromkeys(OUTCOMES.values(), 0)
     for row in outcomes:
         if row["outcome"] != "success":

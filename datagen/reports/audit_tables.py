@@ -8,20 +8,21 @@ from datagen.console.printing import print_rows, seconds, size
 
 
 def print_source(report: dict[str, Any], candidates: str) -> None:
-    """The account of one label source."""
+    """Print the costs of one label source."""
     labels, useful, before = report["labels"], report["useful"], report["relabelled_from"]
     if not labels:
-        print_rows(f"audit of {report['label_source']} labels", [("labels", "none committed yet")])
+        print_rows(f"audit of {report['label_source']} labels", [("labels", "none committed")])
         return
     redraws = ", ".join(f"{cause} {count}" for cause, count in report["redraws"].items()) or "none"
     print_rows(
         f"audit of {report['label_source']} labels",
         [
             ("labels", f"{labels:,} in {report['scenes']:,} scenes"),
+            ("made from", report["made_from"]),
             ("positive", f"{report['positives']:,} ({100 * report['positive_share']:.1f}%)"),
             ("redraws", redraws),
             ("worker time", _worker_time(useful)),
-            *([("labels it came from", _worker_time(before))] if before["wall_s"] else []),
+            *([("relabelled files", _worker_time(before))] if before["wall_s"] else []),
             (
                 "per label",
                 f"{1000 * report['wall_s_per_label']:.3f} ms, {report['bytes_per_label']:.0f} bytes",
@@ -32,7 +33,7 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
     )
     whole = useful["wall_s"]
     print_rows(
-        "where the time goes",
+        "time by stage",
         [
             (
                 stage,
@@ -42,14 +43,14 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
             )
             for stage, spent in report["stages"].items()
         ],
-        ("stage", "wall ms/label", "CPU ms/label", "share"),
+        ("stage", "wall (ms/label)", "CPU (ms/label)", "share"),
     )
     waste = [
         (outcome, str(account["attempts"]), seconds(account["wall_s"]), str(account["without_account"]))
         for outcome, account in report["waste"].items()
     ]
     if waste:
-        print_rows("waste", waste, ("outcome", "attempts", "wall", "without account"))
+        print_rows("waste", waste, ("outcome", "attempts", "wall time", "cost unknown"))
     _print_projection(report["projection"], report["waste_share"])
     if "outcomes" in report:
         _print_outcomes(report["outcomes"], candidates)
@@ -63,19 +64,19 @@ def _print_projection(projection: dict[str, Any], waste_share: float) -> None:
     days, paper_days = projection["worker_days"], projection["paper_days"]
     rows = [("this machine", f"{days:.4f} worker-days ({days / 7:.4f} weeks), {size(projection['bytes'])}")]
     if paper_days is not None:
-        bound = "an upper bound it states" if paper_days < 7 else "a lower bound it states"
+        bound = "upper bound" if paper_days < 7 else "lower bound"
         rows += [
             ("the paper", f"{paper_days:.0f} GPU-days ({paper_days / 7:.1f} weeks; RTX A5000, {bound})"),
             ("ratio", f"{paper_days / days:.0f} times fewer days"),
         ]
-    rows.append(("waste", f"{100 * waste_share:.1f}% of the time paid"))
+    rows.append(("waste", f"{100 * waste_share:.1f}% of the worker time"))
     print_rows(f"projection to {projection['labels']:,} labels", rows)
 
 
 def _print_outcomes(report: dict[str, Any], candidates: str) -> None:
     n = report["count"]
     if not n:
-        print_rows("outcomes", [("candidates", f"none in the set {candidates}")])
+        print_rows("outcomes", [("candidates", f"none are {candidates}")])
         return
     title = f"outcomes of {n:,} candidates ({_set(candidates)})"
     rows = [(o["outcome"], o["stage"], f"{o['count']:,}", _percent(o["share"])) for o in report["outcomes"]]
@@ -84,17 +85,17 @@ def _print_outcomes(report: dict[str, Any], candidates: str) -> None:
         rows = [
             (_band(band), f"{band['count']:,}", _percent(band["positive"] / band["count"])) for band in bands
         ]
-        print_rows(f"positive by {name}", rows, ("m", "count", "positive"))
+        print_rows(f"positive by {name}", rows, (f"{name} (m)", "count", "positive"))
 
 
 def print_ratios(ratios: list[dict[str, Any]]) -> None:
-    """What a label of one source costs in labels of another."""
+    """Print the ratios of costs per label between label sources."""
     rows = [(f"{r['source']} / {r['over']}", f"{r['cost_ratio']:,.1f}") for r in ratios]
-    print_rows("cost of a label, as a ratio", rows)
+    print_rows("ratio of costs per label", rows)
 
 
 def print_pair(pair: dict[str, Any]) -> None:
-    """How two runs that labelled the same candidates agree."""
+    """Print the agreement of two runs with labels of the same candidates."""
     said, true = (_name(pair[side]) for side in ("said_by", "true_by"))
     if said == true:
         said, true = "first", "second"
@@ -119,7 +120,7 @@ def print_pair(pair: dict[str, Any]) -> None:
     )
     costs = pair["wall_s_per_correct_label"]
     spent = [
-        (f"a correct label by {side}", f"{1000 * cost:.3f} ms" if cost is not None else "-")
+        (f"cost of a correct label, {side}", f"{1000 * cost:.3f} ms" if cost is not None else "-")
         for side, cost in ((said, costs["said_by"]), (true, costs["true_by"]))
     ]
     print_rows(
@@ -160,7 +161,7 @@ def _name(who: dict[str, Any]) -> str:
 
 
 def _set(candidates: str) -> str:
-    return "all there are" if candidates == "grid" else candidates
+    return "all" if candidates == "grid" else candidates
 
 
 def _percent(share: float | None) -> str:

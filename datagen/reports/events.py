@@ -1,4 +1,4 @@
-"""What happened in a run, from its records: jobs, failed attempts, retries, shards given up."""
+"""Events of a run from its records: jobs, failed attempts, retries, quarantined shards."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _GOOD = ("committed", "superseded")
 
 @dataclass(frozen=True)
 class Event:
-    """One line: when, what, and all that is known of it. Events of one key are one."""
+    """One event: time, text and details. Events of equal key are the same."""
 
     at: str  # UTC, ISO 8601; "" where it is not known
-    key: str  # of the record that says so, and what it says
+    key: str  # of the record, and the kind of event
     what: str
     text: str
     stack: str = ""
@@ -32,20 +32,20 @@ _NOTHING = Event("", "", "", "")
 
 
 class Known:
-    """Events that were read before: ledger entries are read once, however long one follows."""
+    """Events of earlier calls: ledger entries are read once while events are followed."""
 
     def __init__(self) -> None:
         self._events: dict[str, Event] = {}
 
     def once(self, key: str, read: Callable[[], Event]) -> Event:
-        """The event of this key, read if it is new."""
+        """The event of this key, read where it is new."""
         if key not in self._events:
             self._events[key] = read()
         return self._events[key]
 
 
 def events_of(place: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
-    """What the records of a place say, in order of time; `known` is what earlier calls have read."""
+    """Return the events of a run, or of merged runs, in order of time; `known` holds earlier ones."""
     known = known or Known()
     found = _job_events(place) if shard is None else []
     runs = open_runs(place)
@@ -65,7 +65,7 @@ def _job_events(place: Storage) -> list[Event]:
         text = f"job {job.id} began {where}: {' '.join(record.command)}"
         events.append(Event(record.started, f"{job.id} began", "job_began", text))
         if order is not None:
-            how = "at once" if order.now else "when what is in flight has ended"
+            how = "at once" if order.now else "after the running attempts"
             text = f"job {job.id} is asked to stop {how}, from {order.host}"
             events.append(Event(order.asked, f"{job.id} asked {order.now}", "stop_asked", text))
         if state is not None and state.end:
@@ -76,7 +76,7 @@ def _job_events(place: Storage) -> list[Event]:
             )
             events.append(Event(state.updated, f"{job.id} ended", "job_ended", text))
         elif job.health() == "dead":
-            text = f"job {job.id} is dead: last heard of then, and its process is gone"
+            text = f"job {job.id} is dead: its process has ended; this was its last sign"
             heard = state.updated if state else record.started
             events.append(Event(heard, f"{job.id} dead", "job_dead", text))
     return events
@@ -112,9 +112,9 @@ def _end_event(run: Run, part: str, attempt: str, key: str) -> Event:
 
 def _start_event(run: Run, part: str, attempt: str, key: str) -> Event:
     start = run.ledger.start_of(attempt)
-    if start is None or not start.started:  # no worker came to it, or it is not known when: its end says all
+    if start is None or not start.started:  # no worker began it, or the time is unknown: its end is reported
         return _NOTHING
-    text = f"{part}shard {start.shard} begins on {start.host or 'a host unknown'} ({attempt})"
+    text = f"{part}shard {start.shard} begins on {start.host or 'an unknown host'} ({attempt})"
     return Event(start.started, key, "attempt_begins", text, "", start.shard)
 
 
@@ -124,10 +124,10 @@ def _quarantine_events(run: Run, part: str, shard: int | None) -> list[Event]:
         for record in records:
             if shard is not None and record.shard != shard:
                 continue
-            last = record.causes[-1] if record.causes else "for no cause that is known"
-            since = ", and was taken out of it later" if lifted else ""
+            last = record.causes[-1] if record.causes else "unknown cause"
+            since = " (tried again later)" if lifted else ""
             tried = counted(len(record.attempts), "attempt")
-            text = f"{part}shard {record.shard} is given up after {tried}{since}: {last}"
+            text = f"{part}shard {record.shard} is quarantined after {tried}{since}: {last}"
             key = f"{run.storage.url} {record.shard} given up {record.created}"
             stack = record.stacks[-1] if record.stacks else ""
             events.append(Event(record.created, key, "quarantined", text, stack, record.shard))

@@ -1,4 +1,4 @@
-"""Labels of runs as arrays, from all that is committed."""
+"""Labels of runs as arrays, from all committed shards."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _COLUMNS = {
 
 
 def read_labelled(run: Run) -> Labelled | None:
-    """All committed candidates of a run, also those beyond n; None where there are none.
+    """Read all committed candidates of a run, also those beyond n; None where there are none.
 
-    InputError names a missing, foreign or damaged file.
+    InputError for a missing, foreign or damaged file.
     """
     has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
     names = [*_COLUMNS, "object_name", *(["outcome"] if has_outcome else [])]
@@ -49,7 +49,7 @@ def read_labelled(run: Run) -> Labelled | None:
 
 
 def join_labelled(parts: list[Labelled]) -> Labelled:
-    """Candidates of several runs of one schema, for what does not depend on whose they are."""
+    """Join candidates of several runs of one schema."""
     rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
     outcomes = [part.outcome for part in parts if part.outcome is not None]
     return Labelled(**rows, outcome=np.concatenate(outcomes) if outcomes else None)

@@ -1,4 +1,4 @@
-"""How far runs are, as plain values: sums over commits and ledger, from their summaries."""
+"""Status of runs as plain values: sums over commits and ledger, from their summaries."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 from datagen.cluster.retry_policy import RetryPolicy
+from datagen.reports.specification_summary import made_from
 from datagen.schemas.lineage import lineage_summary
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lifted_records
@@ -18,7 +19,7 @@ from datagen.schemas.summaries import Summaries
 
 _SHOWN = 20  # causes and stacks
 _GOOD = ("committed", "superseded", "cancelled")
-# Of what a shard may spend in one job; crash, hang and failure have one budget together.
+# Attempts that a shard may use in one job; crash, hang and failure share one budget.
 _BUDGETS: dict[Outcome, int] = {
     "failed": RetryPolicy.max_failures,
     "crashed": RetryPolicy.max_failures,
@@ -29,14 +30,14 @@ _BUDGETS: dict[Outcome, int] = {
 
 
 def runs_report(place: Storage, stacks: bool = False) -> dict[str, Any]:
-    """The state of the run at a place, or of several that were merged: their sums, and each under `parts`."""
+    """Return the status of a run, or of merged runs: their sums, and each under `parts`."""
     runs, root = open_runs(place), sealed_root(place)
     reports = [status_report(run, root, stacks) for run in runs]
     return reports[0] if len(reports) == 1 else _sum(place, reports)
 
 
 def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False) -> dict[str, Any]:
-    """The state of a run. `root` is of the store that holds it, by default the run's own."""
+    """Return the status of a run. `root` describes the store that holds it, by default its own."""
     summaries, n = Summaries(run), run.n
     planned, committed = ShardRanges.of(range(run.layout.shards_for(n))), ShardRanges.of(summaries.shards)
     given_up = run.quarantine_records()
@@ -68,11 +69,12 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         "run": run.storage.url,
         "label_source": run.manifest.spec.label_source,
         "spec_hash": run.manifest.spec_hash,
+        "made_from": made_from([run.manifest]),
         "scenes_from": run.manifest.sources.get("scenes_from"),
         "created": run.manifest.created,
         "n": n,
         "labels": labels,
-        # Commits count whole shards, and so more than n where the last one is cut.
+        # Commits count whole shards, hence more than n where the last one is cut.
         "labels_made": labels_made,
         "positives": positives,
         "shards": {
@@ -104,7 +106,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
         ],
         "taken_out_of_quarantine": len(lifted_records(run)),
         "lineage": lineage_summary(run),
-        # An older seal, of a shorter run or with fewer shards, does not count.
+        # A store of a shorter run or of fewer shards does not count.
         "sealed": part is not None and part.n == n and absent == part.missing_shards,
         "sealed_labels": _sealed_labels(run, part) if part else None,
         "complete": not absent,
@@ -116,7 +118,7 @@ def status_report(run: Run, root: SealedRoot | None = None, stacks: bool = False
 
 
 def _sealed_labels(run: Run, part: SealedPart) -> int:
-    """Rows of a run in a store that was sealed without some of its shards."""
+    """Rows of a run in a store that lacks some of its shards."""
     return part.n - sum(run.layout.rows_wanted(shard, part.n)[1] for shard in part.missing_shards)
 
 
@@ -125,6 +127,7 @@ def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
         "run": place.url,
         "label_source": parts[0]["label_source"],
         "spec_hash": "",
+        "made_from": "; ".join(dict.fromkeys(part["made_from"] for part in parts)),
         "scenes_from": None,
         "created": min(part["created"] for part in parts),
         "complete": all(part["complete"] for part in parts),
@@ -138,7 +141,7 @@ def _sum(place: Storage, parts: list[dict[str, Any]]) -> dict[str, Any]:
         total[key] = dict(counts.most_common(_SHOWN))
     shards = [part["shards"] for part in parts]
     counted = {key: sum(s[key] for s in shards) for key in ("planned", "committed", "missing")}
-    # A shard's number says nothing without its part.
+    # A shard's number is ambiguous without its part.
     given_up = [f"{number}:{shard}" for number, s in enumerate(shards) for shard in s["quarantined"]]
     total["shards"] = counted | {"quarantined": given_up}
     total["quarantine"] = [

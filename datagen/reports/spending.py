@@ -1,4 +1,4 @@
-"""What the ledger and the commits of runs say together: labels, cost and waste."""
+"""Labels, cost and waste of runs, from their ledgers and commits."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from datagen.schemas.summaries import Summaries
 
 @dataclass
 class Account:
-    """Sums over some attempts; seconds, bytes."""
+    """Sums over attempts; seconds and bytes."""
 
     attempts: int = 0
-    unaccounted: int = 0  # attempts that left no account of their cost
+    unaccounted: int = 0  # attempts without a recorded cost
     wall_s: float = 0.0
     cpu_s: float = 0.0
     stage_wall_s: Counter[str] = field(default_factory=Counter)
     stage_cpu_s: Counter[str] = field(default_factory=Counter)
-    source_s: Counter[str] = field(default_factory=Counter)  # by wall and cpu: what was taken over had cost
+    source_s: Counter[str] = field(default_factory=Counter)  # "wall" and "cpu": cost of relabelled files
     written_bytes: int = 0
     peak_rss_bytes: int = 0
 
@@ -48,7 +48,7 @@ class Account:
 
 @dataclass
 class Spending:
-    """All that was paid for a set of runs, split into what became data and what did not."""
+    """The cost of a set of runs, split into committed attempts and waste."""
 
     labels: int = 0
     positives: int = 0
@@ -61,21 +61,20 @@ class Spending:
 
     @property
     def wall_s_per_label(self) -> float | None:
-        """Seconds of workers for a label, waste and the labels it was made from included."""
+        """Worker seconds per label, waste and relabelled files included."""
         return (self.total_wall_s + self.useful.source_s["wall"]) / self.labels if self.labels else None
 
     @property
     def total_wall_s(self) -> float:
-        """Seconds of workers that these runs themselves took."""
+        """Worker seconds of these runs themselves."""
         return self.useful.wall_s + sum(a.wall_s for a in self.waste.values())
 
 
 def account_for(runs: Iterable[Run]) -> Spending:
-    """Read commits and ledgers. A committed attempt is counted from its commit, once.
+    """Add up commits and ledgers. A committed attempt is counted once, from its commit.
 
-    The ledger's other entries are waste by their outcome: ledger = commits + waste. An attempt
-    whose commit exists and whose ledger entry does not (the driver died between the two) is useful
-    all the same.
+    The other entries of the ledger are waste by their outcome: ledger = commits + waste. An attempt with a
+    commit but without a ledger entry (the driver died between the two) counts as useful.
     """
     spending = Spending()
     for run in runs:

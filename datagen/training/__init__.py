@@ -1,1 +1,1 @@
-"""What the verb `train` reads from its options."""
+"""Options of `datagen train`."""

@@ -1,4 +1,4 @@
-"""Options of `datagen train` that hold more than a number: sizes of a model, augmentation, threads."""
+"""Options of `datagen train` with structure: sizes of a model, augmentation, threads."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from datagen.schemas.errors import InputError, choices
 if TYPE_CHECKING:
     from datagen.train.augment import Augmentation
 
-_MEND = "Give a TOML file as docs/guides/train.md shows it"
+_MEND = "Give a TOML file as in docs/guides/train.md"
 
 
 def model_sizes(words: Sequence[str]) -> dict[str, Any]:
-    """The fields that files and `field=value` words name; later ones win. Values are read as TOML's."""
+    """Read fields from files and `field=value` words; later ones override. Values are TOML."""
     sizes: dict[str, Any] = {}
     for word in words:
         name, equals, text = word.partition("=")
@@ -35,7 +35,7 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
 
 
 def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, Any]]:
-    """What `--augment` asks for, by names of effects or in a TOML file, and the same as plain data."""
+    """Read `--augment`, names of effects or a TOML file; return it also as plain data."""
     if word is None:
         return None, {}
     from datagen.train.augment import Augmentation
@@ -47,10 +47,10 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     effects: dict[str, Any] = {}
     for name, values in asked.items():
         if name not in kinds:
-            raise InputError("--augment", name, "no such effect", choices(kinds))
+            raise InputError("--augment", name, "is not an effect", choices(kinds, name))
         known = {f.name for f in fields(kinds[name])}
         if not isinstance(values, dict) or not values.keys() <= known:
-            raise InputError("--augment", name, "not a section of its numbers", choices(known))
+            raise InputError("--augment", name, "is not a section of the file", choices(known, name))
         try:
             effects[name] = TypeAdapter(kinds[name]).validate_python(values)
         except ValidationError as error:
@@ -61,10 +61,11 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
 
 
 def share_cores(processes: int | None, threads: int | None) -> int:
-    """Threads for each process: those asked for, or the cores shared out. Call it before torch is loaded.
+    """Return the threads of each process: those given, or an equal share of the cores.
 
-    One process that takes all cores has its threads bound to them: unbound, two of them were seen to share
-    a core for minutes. Several processes are left to the system, since each would be bound to the first core.
+    Call it before torch is imported. The threads of a single process are bound to cores, since unbound ones
+    may share a core for minutes; those of several processes are not, since each would start at the first
+    core.
     """
     cores = len(os.sched_getaffinity(0))
     for option, value in (("--processes", processes), ("--threads", threads)):

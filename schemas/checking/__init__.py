@@ -1,1 +1,1 @@
-"""Checks of a run on disk that need nothing but the run: records, files, rows, ledger, sealed store."""
+"""Checks of a run on disk without its sources: records, files, rows, ledger, sealed store."""

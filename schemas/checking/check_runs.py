@@ -1,4 +1,4 @@
-"""A whole place checked: a run, or several that were merged, a shard at a time."""
+"""Check a run, or merged runs, one shard at a time."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.storage import Storage
 
-_THREADS = 4  # hashing and unpacking leave Python's lock
-_REMOTE_THREADS = 16  # requests wait for each other's answers
+_THREADS = 4  # hashing and decompression release the GIL
+_REMOTE_THREADS = 16  # requests mostly wait for the server
 
 
 @dataclass
 class Checked:
-    """What was looked at, for the report; grows while the findings are taken."""
+    """Counts of what was checked, for the report; they grow while findings are consumed."""
 
     shards: int = 0
     files: int = 0
@@ -44,7 +44,7 @@ class Checked:
 
 @dataclass(frozen=True, eq=False)
 class _CheckedRun:
-    """One run of the place, and what all checks of its shards share."""
+    """One run, and the data shared by all checks of its shards."""
 
     place: Storage
     run: Run
@@ -55,7 +55,7 @@ class _CheckedRun:
 
 @dataclass(frozen=True, eq=False)
 class _CheckedShard:
-    """What came of one shard."""
+    """The result for one shard."""
 
     shard: int
     commit: Commit | None
@@ -65,10 +65,10 @@ class _CheckedShard:
 def check_runs(
     place: Storage, checked: Checked, seen: Callable[[int, int], None] = lambda done, total: None
 ) -> Iterator[Finding]:
-    """Everything that is wrong at `place`, as it is found.
+    """Yield every problem at `place`, as it is found.
 
-    `checked` is filled on the way; `seen` hears how many of how many shards are done. Every file is read
-    once. InputError where there is no run, or it is of another format or schema.
+    `checked` is filled meanwhile; `seen(done, total)` is called for shards. Every file is read once.
+    InputError where there is no run, or one of another format or schema.
     """
     roots = open_roots(place)
     yield from roots.findings
@@ -111,17 +111,17 @@ def check_runs(
 
 
 def _shards_of(run: Run, slice_: SealedSlice | None) -> list[int]:
-    """Shards that are committed, or that the sealed store has."""
+    """Shards that are committed or in the sealed store."""
     return sorted(run.committed() | (slice_.positions.keys() if slice_ else set()))
 
 
 def _look_at(subject: _CheckedRun, shard: int) -> _CheckedShard:
-    """One shard: its commit, its account, its files and rows, its chunks in the sealed store."""
+    """Check one shard: commit, ledger entries, files, rows, and chunks in the sealed store."""
     run, prefix = subject.run, subject.prefix
     folder = f"shards/{shard:06d}"
     try:
         listed = {file.key: file for file in run.storage.list(folder)}
-    except InputError as error:  # something in it is no file: nothing there is trusted
+    except InputError as error:  # it holds something that is not a file: the shard is not trusted
         key = error.place.removeprefix(f"{run.storage.url}/")
         return _CheckedShard(
             shard, None, [below(prefix, Finding(key, "foreign", error.problem, error.mend, shard))]
@@ -139,7 +139,7 @@ def _look_at(subject: _CheckedRun, shard: int) -> _CheckedShard:
 
 
 def _rest(subject: _CheckedRun, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:
-    """What is left of a run after its shards: the waste in the ledger, lost commits, the quarantine."""
+    """Check the rest of a run: the waste in the ledger, lost commits, the quarantine."""
     run, prefix, totals = subject.run, subject.prefix, checked.totals
     totals.lost_shards = {}
     yield from (below(prefix, finding) for finding in check_rest(run, committed, totals))

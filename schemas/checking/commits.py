@@ -1,4 +1,4 @@
-"""The records of a committed shard: its commit, the copy beside its files, its account in the ledger."""
+"""Checks of the records of a committed shard: its commit, the copy of it, its entries in the ledger."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ROUNDING_S = 1e-3  # of clocks
 
 @dataclass(frozen=True, eq=False)
 class CommittedShard:
-    """A shard that is or was committed: its commit, where one of its two files is sound."""
+    """A shard that is or was committed, with its commit where one of the two files is undamaged."""
 
     shard: int
     commit: Commit | None
@@ -31,9 +31,9 @@ class CommittedShard:
 
 
 def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> CommittedShard:
-    """The shard's commit and its copy, among the files listed below the shard's folder.
+    """Check the shard's commit and its copy, among the files listed below the shard's folder.
 
-    Without a commit's file, a sound copy counts only where the caller knows that there was one.
+    Without a commit file, a copy counts only where the caller knows that there was a commit.
     """
     ours = read(run.storage, commit_key(shard), Commit, lambda c: foreign_to(run, shard, c))
     if ours.record is not None:
@@ -43,24 +43,24 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Committ
         copies = [] if is_won else sound_copies(run, shard, listed)
         if not any(c.record and _says_committed(run, shard, c.record.attempt) for c in copies):
             return CommittedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
-        # The record of a loser, or of another run of the specification, has taken its place.
-        ours = Read(ours.key, ours.data, None, "is not that of the attempt that won")
+        # The record of a superseded attempt, or of another run of the specification, replaced it.
+        ours = Read(ours.key, ours.data, None, "is not that of the committed attempt")
     copies = sound_copies(run, shard, listed)
-    if len(copies) > 1:  # losers that were killed left theirs too
+    if len(copies) > 1:  # killed superseded attempts left theirs too
         copies = [c for c in copies if c.record and _says_committed(run, shard, c.record.attempt)]
     if len(copies) == 1:
         return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
-        return CommittedShard(shard, None, ())  # there is nothing that it could have committed
-    mend = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard anew"
+        return CommittedShard(shard, None, ())  # there is nothing to commit
+    mend = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard again"
     if ours.data is None and ours.problem == "missing":
-        mend = "Make it anew with `datagen resume`: the shard is open"
-    problem = f"{ours.problem}, and {'no copy of it' if not copies else 'several attempts left copies'}"
+        mend = "Make the shard again with `datagen resume`"
+    problem = f"{ours.problem}, and {'there is no copy' if not copies else 'several attempts left copies'}"
     return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, mend, shard),))
 
 
 def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Read[Commit]]:
-    """The sound copies of commits in the folders of a shard's attempts."""
+    """The undamaged copies of commits in the folders of a shard's attempts."""
     found: list[Read[Commit]] = []
     for key in sorted(listed):
         names = key.split("/")
@@ -79,13 +79,13 @@ def _copy(run: Run, shard: int, attempt: str) -> Read[Commit]:
 
 
 def foreign_to(run: Run, shard: int, commit: Commit) -> str:
-    """Why a commit cannot be this shard's, or ""."""
+    """Why a commit cannot belong to this shard, or ""."""
     found = foreign_field(run.manifest, shard, commit)
     return ": ".join(found) if found else ""
 
 
 def check_account(run: Run, commit: Commit) -> list[Finding]:
-    """The start and the end of a committed attempt: both there, the end at the commit's cost."""
+    """Check the start and the end of a committed attempt: both exist, the end has the commit's cost."""
     shard = commit.shard
     start = read(run.storage, start_key(commit.attempt), AttemptStart)
     end = read(run.storage, end_key(commit.attempt), LedgerEntry)
@@ -100,25 +100,25 @@ def check_account(run: Run, commit: Commit) -> list[Finding]:
             ("cost", noted.cost, commit.cost),
         ):
             if ours != wanted:
-                problem = f"{field}: is not that of the attempt's commit"
+                problem = f"{field}: differs from the attempt's commit"
     if problem:
         known = end_from_commit(commit, start.record.started if start.record else "")
-        problem = f"{problem}; it is known from the commit"
+        problem = f"{problem}; the commit has it"
         findings.append(account_finding(run.storage, end, problem, known, shard))
     problem = start.problem
     if start.record is not None and (start.record.attempt, start.record.shard) != (commit.attempt, shard):
-        problem = "is not that of this attempt"
+        problem = "belongs to another attempt"
     if problem:
         known = start_from_end(end_from_commit(commit, end.record.started if end.record else ""))
         findings.append(account_finding(run.storage, start, problem, known, shard))
     if odd := odd_cost(commit.cost):
-        mend = "Look at what wrote it: the record is as it was written"
+        mend = "Find out which program wrote it: the record is undamaged"
         findings.append(Finding(commit_key(shard), "account", odd, mend, shard))
     return findings
 
 
 def odd_cost(cost: Cost | None) -> str:
-    """Why a cost does not add up, or ""."""
+    """Why a cost is inconsistent, or ""."""
     if cost is None:
         return ""
     for name, stages, whole in (
@@ -127,7 +127,7 @@ def odd_cost(cost: Cost | None) -> str:
     ):
         total = sum(stages.values())
         if total > whole * (1 + _ROUNDING) + _ROUNDING_S:
-            return f"cost.stage_{name}_s: the stages have {total:g} s, and the whole attempt {whole:g} s"
+            return f"cost.stage_{name}_s: the stages sum to {total:g} s, but the attempt has {whole:g} s"
     return ""
 
 
@@ -139,7 +139,7 @@ def _says_committed(run: Run, shard: int, attempt: str) -> bool:
 def account_finding(
     storage: Storage, found: Read[Any], problem: str, known: BaseModel, shard: int
 ) -> Finding:
-    """A record of the ledger that is wrong: cured by what is known, unless it is all there is of another."""
+    """The finding for a wrong ledger record; not repairable where it is the only copy of another record."""
     try:
         other = decode_record("", found.data or b"", AnyRecord).model_extra or {}
     except InputError:
@@ -147,5 +147,5 @@ def account_finding(
     key_of = end_key if "outcome" in other else start_key
     home = key_of(str(other.get("attempt"))[:100])
     if "attempt" in other and home != found.key and read(storage, home, AnyRecord).data != found.data:
-        return Finding(found.key, "account", problem, f"It belongs at {home}: put each back", shard)
+        return Finding(found.key, "account", problem, f"Move it to {home} and restore this file", shard)
     return curable(found.key, "account", problem, Restore(encode_record(known)), shard)

@@ -1,4 +1,4 @@
-"""What a check found: where, what is wrong, and what would mend it."""
+"""A finding of a check: the file, the problem and the fix."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Literal
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry
 
-# record: a JSON record is damaged, missing, or unlike its copy. account: the ledger does not add up.
-# file: a committed file is missing or has other bytes. rows: what was committed breaks the schema.
-# lost: a commit is gone, and its copy too. foreign: a file that no record knows. sealed: data.zarr is
-# not what its shards are. deep: recomputed rows are others. stale: data.zarr is older than its run.
+# record: a JSON record is damaged, missing, or differs from its copy. account: the ledger is inconsistent.
+# file: a committed file is missing or has other bytes. rows: committed rows break the schema. lost: a
+# commit and its copy are missing. foreign: a file that no record names. sealed: data.zarr differs from
+# its shards. deep: recomputed rows differ. stale: data.zarr is older than its run.
 Kind = Literal["record", "account", "file", "rows", "lost", "foreign", "sealed", "deep", "stale"]
 
 REPAIR = "Run datagen repair"
@@ -19,9 +19,9 @@ REPAIR = "Run datagen repair"
 
 @dataclass(frozen=True)
 class Restore:
-    """Put these bytes: they come from a second copy, or follow from other records.
+    """Write these bytes, which come from a second copy or follow from other records.
 
-    `is_guess` where whoever is still at work may write the truth: then only a missing file is made.
+    `is_guess` where a running process may still write the true record: then only a missing file is written.
     """
 
     data: bytes
@@ -30,7 +30,7 @@ class Restore:
 
 @dataclass(frozen=True)
 class Regenerate:
-    """Compute the shard of this run again; its file must have the committed size and digest."""
+    """Compute the shard again; its file must have the committed size and digest."""
 
     run: Run
     shard: int
@@ -39,9 +39,9 @@ class Regenerate:
 
 @dataclass(frozen=True)
 class Reseal:
-    """Seal the place anew; or, where that cannot be done at once, mend this file of the store.
+    """Seal again; or, where that cannot be done in one step, repair this file of the store.
 
-    It is a copy of the file `source` below the place, or has these bytes, or must not be there.
+    The file is a copy of `source`, or has these bytes, or must not exist.
     """
 
     source: str = ""
@@ -53,7 +53,7 @@ Cure = Restore | Regenerate | Reseal
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong. `key` is the file or folder below the place that was checked."""
+    """One problem. `key` is the file or folder, relative to the checked path."""
 
     key: str
     kind: Kind
@@ -64,10 +64,10 @@ class Finding:
 
     @property
     def is_damage(self) -> bool:
-        """Whether something is wrong; an old sealed store is only behind."""
+        """Whether data is damaged; an outdated sealed store is not damage."""
         return self.kind != "stale"
 
 
 def curable(key: str, kind: Kind, problem: str, cure: Cure, shard: int | None = None) -> Finding:
-    """A finding that `datagen repair` mends."""
+    """A finding that `datagen repair` fixes."""
     return Finding(key, kind, problem, REPAIR, shard, cure)

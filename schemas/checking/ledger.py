@@ -1,4 +1,4 @@
-"""The rest of the ledger, without the accounts of committed attempts: ends, starts, what is lost."""
+"""Checks of the ledger except the records of committed attempts, and of the quarantine."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from datagen.schemas.record_files import encode_record, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
 
-_GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, at a cost unknown"
+_GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, with unknown cost"
 
 
 @dataclass
 class LedgerTotals:
-    """Wall seconds as the records have them: the ledger's must be the commits' and the waste's."""
+    """Sums of wall seconds in the records: the ledger's must equal commits plus waste."""
 
     committed_wall_s: float = 0.0
     wasted_wall_s: float = 0.0
     attempts: int = 0
     without_account: int = 0
-    unfinished: int = 0  # began, left no end, and may still run
-    lost_shards: dict[int, str] = field(default_factory=dict[int, str])  # committed by the ledger alone
+    unfinished: int = 0  # began, not ended, and may still run
+    lost_shards: dict[int, str] = field(default_factory=dict[int, str])  # committed only by the ledger
 
 
 def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> Iterator[Finding]:
-    """Every ledger record but those of `committed` attempts (shard -> attempt); adds to the totals."""
+    """Check every ledger record except those of `committed` attempts (shard -> attempt); add to the sums."""
     names: set[str] = set()
     for file in run.storage.list("ledger"):
         name = file.key.removeprefix("ledger/")
         if name.endswith(".json") and "/" not in name:
             names.add(name.removesuffix(".json"))
-        elif not name.endswith(".part"):  # what a killed writer left
-            yield Finding(file.key, "foreign", "is no record of the ledger", "Move it away")
+        elif not name.endswith(".part"):  # left by a killed writer
+            yield Finding(file.key, "foreign", "is not a record of the ledger", "Move it out of the run")
     done = set(committed.values())
     ends = {name for name in names if not name.endswith(".start")}
     starts = {name.removesuffix(".start") for name in names if name.endswith(".start")}
@@ -65,7 +65,7 @@ def _check_end(
     if start.record is None:
         yield account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
     if odd := odd_cost(noted.cost):
-        mend = "Look at what wrote it: the record is as it was written"
+        mend = "Find out which program wrote it: the record is undamaged"
         yield Finding(end.key, "account", odd, mend, noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
@@ -84,7 +84,7 @@ def _check_unfinished(
         yield Finding(start.key, "account", start.problem, _GONE)
     elif start.record.shard in committed or start.record.shard in quarantined:
         shard = start.record.shard
-        problem = "missing, though its shard is decided; what it cost is lost"
+        problem = "missing, but its shard is decided; the cost is unknown"
         totals.without_account += 1
         cure = Restore(encode_record(lost_end(start.record, utc_now())), is_guess=True)
         yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
@@ -93,7 +93,7 @@ def _check_unfinished(
 
 
 def check_quarantine(run: Run) -> Iterator[Finding]:
-    """The records of shards that were given up."""
+    """Check the records of quarantined shards."""
     mend = "Restore the file from a backup; or remove it: the shard is then tried again"
     for file in run.storage.list("quarantine"):
         name = file.key.removeprefix("quarantine/")

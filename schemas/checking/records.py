@@ -1,4 +1,4 @@
-"""Records read with suspicion: signed, valid, written as this program writes, equal to their copies."""
+"""Checks of JSON records: signature, schema, canonical form, and equality with their copies."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ BACKUP = "Restore the file from a backup"
 
 
 class AnyRecord(BaseModel):
-    """A record of which only the signature is checked: nothing about data rests on it."""
+    """A record of which only the signature is checked, since no data depends on it."""
 
     model_config = ConfigDict(extra="allow")
 
 
 @dataclass(frozen=True, eq=False)
 class Read(Generic[Record]):
-    """One record's file: its bytes where there are any, and the record or what is wrong with it."""
+    """One record file: its bytes, if any, and the record or its problem."""
 
     key: str
     data: bytes | None
@@ -37,9 +37,9 @@ class Read(Generic[Record]):
 def read(
     storage: Storage, key: str, model: type[Record], refuse: Callable[[Record], str] = lambda record: ""
 ) -> Read[Record]:
-    """Read a record; never raises for what the file holds.
+    """Read a record; bad content does not raise.
 
-    `refuse` says what is wrong with a record that is valid in itself, or "".
+    `refuse` returns the problem of an otherwise valid record, or "".
     """
     try:
         data = storage.get(key, MAX_RECORD_BYTES)
@@ -51,9 +51,9 @@ def read(
         record = decode_record(key, data, model)
     except InputError as error:
         return Read(key, data, None, f"{error.field}: {error.problem}" if error.field else error.problem)
-    # Fields that later versions add are not in it, and are not expected.
+    # Fields of later versions are not expected in it.
     if signed_json(record.model_dump(mode="json", exclude_unset=True)) != data:
-        return Read(key, data, None, "signed, but not written as this program writes it")
+        return Read(key, data, None, "signed, but not in the form that datagen writes")
     problem = refuse(record)
     return Read(key, data, None if problem else record, problem)
 
@@ -61,22 +61,22 @@ def read(
 def compare(
     ours: Read[Record], copy: Read[Record], shard: int | None = None, mend: str = BACKUP
 ) -> list[Finding]:
-    """What is wrong with a record and its second copy; each restores the other.
+    """Check a record and its second copy; each restores the other.
 
-    `mend` is for two that are sound and differ.
+    `mend` is the fix where both are valid but differ.
     """
     if ours.record is not None and copy.record is not None:
         if ours.data == copy.data:
             return []
-        return [Finding(ours.key, "record", f"is not what its copy {copy.key} holds", mend, shard)]
+        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", mend, shard)]
     if ours.record is not None and ours.data is not None:
         return [curable(copy.key, "record", copy.problem, Restore(ours.data), shard)]
     if copy.record is not None and copy.data is not None:
         return [curable(ours.key, "record", ours.problem, Restore(copy.data), shard)]
     bad = [one for one in (ours, copy) if one.problem != "missing"]
-    return [Finding(one.key, "record", f"{one.problem}; so is its copy", BACKUP, shard) for one in bad]
+    return [Finding(one.key, "record", f"{one.problem}, as is its copy", BACKUP, shard) for one in bad]
 
 
 def sound(ours: Read[Record], copy: Read[Record]) -> Record | None:
-    """The record, from whichever of the two files is sound."""
+    """The record from whichever of the two files is undamaged."""
     return ours.record if ours.record is not None else copy.record

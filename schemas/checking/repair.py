@@ -1,7 +1,6 @@
-"""What checks found, repaired: from second copies, from other records, or by making shards again.
+"""Repair the findings of checks: from second copies, from other records, or by making shards again.
 
-Every file is replaced by one atomic put of bytes that are known to be the right ones, so that a repair
-that is broken off has only less repaired, and the next goes on.
+Every file is replaced by one atomic put of verified bytes, so that an interrupted repair can be run again.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from datagen.schemas.shard_files import chunk_key
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.schemas.storage import Storage, StoredFile
 
-# Mending a record shows what rests on it: commits, then files, then the sealed store.
+# Repairing a record reveals what depends on it: commits, then files, then the sealed store.
 _PASSES = 5
-# Findings on which it depends what rows there are.
+# Findings that decide which rows there are.
 _UNDECIDED = ("record", "lost", "foreign", "sealed")
 
 RegenerateShard = Callable[[Run, int], Mapping[str, bytes]]
@@ -38,9 +37,9 @@ Seen = Callable[[int, int], None]
 
 @dataclass
 class Repaired:
-    """What a repair did, and what it left."""
+    """The result of a repair."""
 
-    records: list[str] = field(default_factory=list[str])  # keys that were put, by what they were put from
+    records: list[str] = field(default_factory=list[str])  # keys of the written files
     copied_files: list[str] = field(default_factory=list[str])
     regenerated_files: list[str] = field(default_factory=list[str])
     regenerated_shards: list[int] = field(default_factory=list[int])
@@ -48,33 +47,33 @@ class Repaired:
     resealed: bool = False
     left: list[Finding] = field(default_factory=list[Finding])
     checked: Checked = field(default_factory=Checked)
-    untouched: int = 0  # files as old and as long as before; their digests were checked
-    changed: list[str] = field(default_factory=list[str])  # others that changed meanwhile, though not by this
+    untouched: int = 0  # files with unchanged time and size; their digests were checked
+    changed: list[str] = field(default_factory=list[str])  # others that another process changed meanwhile
 
     @property
     def written(self) -> set[str]:
-        """Keys of all files that were put."""
+        """Keys of all written files."""
         return {*self.records, *self.copied_files, *self.regenerated_files, *self.sealed_files}
 
 
 def repair_runs(
     place: Storage, regenerate: RegenerateShard, workers: int = 1, seen: Seen = lambda done, total: None
 ) -> Repaired:
-    """Check the place, mend what can be repaired, and check again until nothing more can be.
+    """Check, repair what can be repaired, and check again, until no more can be repaired.
 
-    `regenerate` gives all files of a shard by path, and raises where it cannot; several shards are made at a
-    time with more `workers`. A regenerated file is written only where it has the committed digest, and only
-    where all bad files of its shard have. What is left is in the result. InputError as `check_runs`.
+    `regenerate` returns all files of a shard by path, or raises; with more `workers` several shards are made
+    concurrently. A regenerated file is written only where all bad files of its shard have the committed digests.
+    The result holds the remaining findings. InputError as `check_runs`.
     """
     repaired = Repaired()
     before = {file.key: _state(file) for file in place.list("")}
-    refused: dict[str, str] = {}  # key -> why; not tried twice
+    refused: dict[str, str] = {}  # key -> reason; not tried again
     for _ in range(_PASSES):
         found = _pass(place, regenerate, workers, seen, repaired, refused)
         if not found:
             break
     written = repaired.written
-    for file in place.list(""):  # in a second dictionary the files of a large run would not fit
+    for file in place.list(""):  # a second dictionary of all files would not fit into memory for a large run
         state = before.pop(file.key, None)
         if state is None or _is_ours(file.key, written, repaired.resealed):
             continue
@@ -87,7 +86,7 @@ def repair_runs(
 
 
 def _state(file: StoredFile) -> int:
-    """When a file was written, and its size, as one number; what links to it does not matter."""
+    """Time of change and size of a file as one number; links to it do not change it."""
     return hash((file.modified_s, file.size))
 
 
@@ -103,7 +102,7 @@ def _pass(
     repaired: Repaired,
     refused: dict[str, str],
 ) -> bool:
-    """Check once and mend what is found; whether anything was repaired."""
+    """Check once and repair the findings; return whether any was repaired."""
     repaired.checked, repaired.left = Checked(), []
     bad: dict[tuple[str, int], list[Finding]] = {}
     sealed: list[Finding] = []
@@ -123,7 +122,7 @@ def _pass(
         files = _repair_files(place, regenerate, workers, bad, repaired, refused)
     relink = bool(files) and repaired.checked.is_sealed and place.folder is not None
     if any(finding.kind in _UNDECIDED for finding in repaired.left):
-        why = "Mend the other findings first: nothing is sealed until they are decided"
+        why = "Repair the other findings first: the run cannot be sealed before"
         repaired.left += [replace(finding, mend=why, cure=None) for finding in sealed]
     elif sealed or relink:
         done |= _repair_sealed(place, sealed, repaired, refused)
@@ -146,7 +145,7 @@ def _put(
     refused: dict[str, str],
     is_guess: bool = False,
 ) -> bool:
-    """Write the right bytes; whether the place changed. A guess gives way to what was written since."""
+    """Write the restored bytes; return whether a file changed. A guess does not replace an existing file."""
     if finding.key not in refused:
         try:
             if is_guess:
@@ -172,7 +171,7 @@ def _repair_files(
     repaired: Repaired,
     refused: dict[str, str],
 ) -> int:
-    """Files of shards from the sealed store, from their schema, or regenerated; how many were put."""
+    """Restore files of shards from the sealed store, from the schema, or regenerated; return their number."""
     slices, put = _slices(place), 0
     to_make: list[tuple[Run, int, list[Finding]]] = []
     for (_, shard), findings in bad.items():
@@ -200,14 +199,14 @@ def _repair_files(
 
 
 def _slices(place: Storage) -> Mapping[str, SealedSlice]:
-    """What the sealed store has of each run, by specification hash."""
+    """Shards in the sealed store, by specification hash."""
     runs = open_roots(place).runs
     root, _ = read_root(place, runs, {run.manifest.spec_hash: run.n for run in runs})
     return slices_of(root, runs) if root else {}
 
 
 def _second_source(place: Storage, slices: Mapping[str, SealedSlice], finding: Finding) -> bytes | None:
-    """The committed bytes of a file where they are known without making the shard again."""
+    """The committed bytes of a file where they can be restored without making the shard again."""
     cure = finding.cure
     if not isinstance(cure, Regenerate):
         return None
@@ -239,7 +238,7 @@ def _has_digest(data: bytes, entry: FileEntry) -> bool:
 def _regenerated(
     regenerate: RegenerateShard, to_make: Iterable[tuple[Run, int, list[Finding]]], workers: int
 ) -> Iterator[tuple[Run, int, list[Finding], Mapping[str, bytes] | str]]:
-    """Each shard with its regenerated files, or with why there are none."""
+    """Yield each shard with its regenerated files, or with the reason why there are none."""
 
     def make(one: tuple[Run, int, list[Finding]]) -> Mapping[str, bytes] | str:
         try:
@@ -254,25 +253,25 @@ def _regenerated(
         yield from ((*one, make(one)) for one in shards)
         return
     with ThreadPoolExecutor(workers) as pool:
-        # So many results in memory, and no more.
+        # Bounds the number of results in memory.
         for one, files in zip(shards, concurrent_map(pool, workers, make, shards), strict=True):
             yield (*one, files)
 
 
 def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:
-    """Why regenerated files are not to be written, or ""."""
+    """Why regenerated files must not be written, or ""."""
     for finding in findings:
         if isinstance(finding.cure, Regenerate):
             data = files.get(finding.cure.entry.path)
             if data is None or not _has_digest(data, finding.cure.entry):
-                return "Restore the file from a backup: made again here, the shard has other bytes"
+                return "Restore the file from a backup: on this machine the remade shard has other bytes"
     return ""
 
 
 def _repair_sealed(
     place: Storage, findings: list[Finding], repaired: Repaired, refused: dict[str, str]
 ) -> bool:
-    """Mend the sealed store: as a whole where one rename does it, else file by file."""
+    """Repair the sealed store: at once where one rename does it, else file by file."""
     roots = {SEALED, f"{SEALED}/{ROOT}"}
     try:
         _refuse_fewer_rows(place)
@@ -282,7 +281,7 @@ def _repair_sealed(
             seal(place)
             repaired.resealed = True
             return True
-        # The root last: it is what opens the store.
+        # The root last: it makes the store readable.
         for finding in sorted(findings, key=lambda f: f.key in roots):
             if isinstance(finding.cure, Reseal):
                 _repair_one(place, finding.key, finding.cure)
@@ -295,17 +294,17 @@ def _repair_sealed(
 
 
 def _refuse_fewer_rows(place: Storage) -> None:
-    """Raise InputError where sealing would leave out rows that the store has by all of its arrays."""
+    """Raise InputError where sealing would drop rows that all arrays of the store have."""
     contents = read_contents(place, check=False)
     names = [field.name for field in contents.schema.sample_fields]
     try:
         sealed = ShardPlace(place, SEALED, 0, 0, 0, 0, 0).metadata(names)
         held = min(array.shape[0] for array in sealed.values())
     except InputError:
-        return  # what is damaged says nothing
+        return  # a damaged store does not count
     if (rows := contents.rows("sample")) < held:
-        problem = f"has {held} samples, and {rows} are committed and wanted"
-        mend = "Restore the plans or commits that it was laid over, or drop it with `datagen unseal`"
+        problem = f"has {held} samples, but {rows} are committed and wanted"
+        mend = "Restore the plans or commits of its shards, or remove it with `datagen unseal`"
         raise InputError(f"{place.url}/{SEALED}", "", problem, mend)
 
 

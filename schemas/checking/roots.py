@@ -1,4 +1,4 @@
-"""The records at a run's root, and those at the root of a merged place, with their second copies."""
+"""Checks of the records at the root of a run, or of merged runs, with their second copies."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged
 from datagen.schemas.storage import Storage
 
 _MANIFEST = "manifest.json"
-_BROKEN_OFF = "Merge the runs again: a merge was broken off, and the next one finishes it"
+_BROKEN_OFF = "Merge the runs again: it finishes a merge that was interrupted"
 
 
 @dataclass
 class Roots:
-    """The runs at a place as far as they can be opened, and what is wrong with the records at its root."""
+    """The runs at a path that can be opened, and findings on the records at its root."""
 
     runs: list[Run] = field(default_factory=list[Run])
     is_merged: bool = False
     findings: list[Finding] = field(default_factory=list[Finding])
 
     def folder_of(self, run: Run) -> str:
-        """The run's folder below the place, with its closing slash."""
+        """The run's folder relative to the path, with a trailing slash."""
         return f"{part_folder(run.manifest.spec_hash)}/" if self.is_merged else ""
 
 
 def open_roots(place: Storage) -> Roots:
-    """The run, or the parts, at `place`, opened from whichever of two copies is sound.
+    """Open the run, or the parts, at `place` from undamaged copies of the records.
 
-    InputError where there is none, or it is of another format.
+    InputError where there is no run, or one of another format.
     """
     parts, findings = _merged_parts(place)
     if parts is None:
@@ -51,7 +51,7 @@ def open_roots(place: Storage) -> Roots:
         if next(iter(place.list(folder)), None) is not None:
             run, found = _open_run(place.below(folder), spec_hash)
         if run is None and not found:
-            found = [Finding(_MANIFEST, "record", "missing, and so is its copy", "Merge the runs again")]
+            found = [Finding(_MANIFEST, "record", "missing, as is its copy", "Merge the runs again")]
         roots.findings += [below(folder + "/", finding) for finding in found]
         if run is not None:
             roots.runs.append(run)
@@ -59,7 +59,7 @@ def open_roots(place: Storage) -> Roots:
 
 
 def below(prefix: str, finding: Finding) -> Finding:
-    """The finding as one of the place that has the run in the folder `prefix`."""
+    """The finding with its key relative to the merged runs, which hold this run in the folder `prefix`."""
     if not prefix:
         return finding
     return Finding(
@@ -68,7 +68,7 @@ def below(prefix: str, finding: Finding) -> Finding:
 
 
 def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
-    """Specification hashes of the parts, or None where this is no merged place."""
+    """Specification hashes of the parts, or None where these are not merged runs."""
     ours, copy = read(place, MERGED, Merged), read(place, copy_key(MERGED), Merged)
     merged = sound(ours, copy)
     if merged is not None:
@@ -82,19 +82,19 @@ def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]
     if ours.data is None and ours.problem == "missing" and len(hashes) < 2:
         return None, []
     if len(hashes) < 2:
-        problem = f"{ours.problem}, and its parts do not tell what it held"
+        problem = f"{ours.problem}, and cannot be restored from the parts"
         return (), [Finding(MERGED, "record", problem, "Merge the runs again")]
     parts = tuple(sorted(hashes))
     data = encode_record(Merged(parts=parts))
-    return parts, [curable(MERGED, "record", f"{ours.problem}; its parts tell what it held", Restore(data))]
+    return parts, [curable(MERGED, "record", f"{ours.problem}; the parts restore it", Restore(data))]
 
 
 def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | None, list[Finding]]:
-    """The run, of this specification where one is given."""
+    """Open the run; it must have this specification where one is given."""
 
     def refuse(manifest: Manifest) -> str:
         if spec_hash not in (None, manifest.spec_hash):
-            return "is that of another run"
+            return "belongs to another run"
         return _bad_hash(manifest)
 
     ours = read(storage, _MANIFEST, Manifest, refuse)
@@ -111,7 +111,7 @@ def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | Non
 
 
 def _named(storage: Storage) -> set[str]:
-    """The specifications that the commits and the plans of a run name."""
+    """The specification hashes in the commits and plans of a run."""
     commits = (read(storage, file.key, Commit).record for file in storage.list("commits"))
     plans = (read(storage, file.key, Plan).record for file in storage.list("plans"))
     return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}
@@ -119,7 +119,7 @@ def _named(storage: Storage) -> set[str]:
 
 def _bad_hash(manifest: Manifest) -> str:
     if manifest.format_version == FORMAT_VERSION and manifest.spec.hash() != manifest.spec_hash:
-        return "spec_hash: not the hash of the specification beside it"
+        return "spec_hash: is not the hash of the specification in the record"
     return ""
 
 
@@ -131,7 +131,7 @@ def _refuse_other_format(storage: Storage, key: str, version: int) -> None:
 
 
 def check_plans(run: Run) -> tuple[int, list[Finding]]:
-    """The samples wanted, and what is wrong with plans: each has its copy, and wants more than the last."""
+    """Return the samples wanted, and findings on plans: each has its copy, and a larger n than the last."""
     findings: list[Finding] = []
     numbers = {0}
     for folder in ("plans", copy_key("plans")):
@@ -140,10 +140,10 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
             if name.isascii() and name.isdigit() and len(name) < 10 and f"{folder}/{name}.json" == file.key:
                 numbers.add(int(name))
     n = 0
-    mend = "Restore the file from a backup, or say with `datagen extend` what was wanted"
+    mend = "Restore the file from a backup, or set the number again with `datagen extend`"
     if max(numbers) > 10 * len(numbers) + 1000:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
-        return 0, [Finding("plans", "record", problem, "Move it away")]
+        return 0, [Finding("plans", "record", problem, "Move it out of the run")]
     for number in range(1, max(numbers) + 1):
         key = f"plans/{number}.json"
         ours, copy = (
@@ -152,14 +152,14 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
         )
         found, plan = compare(ours, copy), sound(ours, copy)
         if plan is None and not found:
-            found = [Finding(key, "record", "missing, and so is its copy", mend)]
+            found = [Finding(key, "record", "missing, as is its copy", mend)]
         elif plan is not None and plan.n <= n:
-            problem = f"n: {plan.n}, no more than the plan before"
+            problem = f"n: {plan.n} is not more than in the plan before"
             found.append(Finding(key, "record", problem, "Remove the plan"))
         findings += found
         n = max(n, plan.n if plan else 0)
     if not n:
-        findings.append(Finding("plans", "record", "no plan says how many samples are wanted", mend))
+        findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", mend))
     return n, findings
 
 
@@ -168,12 +168,12 @@ def _foreign_plan(run: Run, number: int, plan: Plan) -> str:
 
 
 def check_notes(storage: Storage) -> Iterator[Finding]:
-    """Records on which no row rests: of jobs, and of where merged shards came from."""
+    """Check records that no row depends on: of jobs, and of the origins of merged shards."""
     key = LINEAGE
     lineage, copy = read(storage, key, Lineage), read(storage, copy_key(key), Lineage)
     if {lineage.problem, copy.problem} != {"missing"}:
         yield from compare(lineage, copy, mend=_BROKEN_OFF)
-    mend = "Restore the file from a backup, or remove it: no sample rests on it"
+    mend = "Restore the file from a backup, or remove it: no sample depends on it"
     for file in storage.list("jobs"):
         if file.key.endswith(".json") and (problem := read(storage, file.key, AnyRecord).problem):
             yield Finding(file.key, "record", problem, mend)

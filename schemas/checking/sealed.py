@@ -1,4 +1,4 @@
-"""The sealed store against the shards that it was laid over."""
+"""Checks of the sealed store against its shards."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from datagen.schemas.storage import Storage
 
 @dataclass(frozen=True)
 class SealedSlice:
-    """The shards of one run in the store by its own word: where each stands, and what the last is cut to."""
+    """The shards of one run that the store names: the position of each, and the cut of the last."""
 
     n: int
     missing: tuple[int, ...]
-    positions: Mapping[int, int]  # shard -> its place among all shards of the store
-    cut: Mapping[int, tuple[int, int]]  # shard -> (scenes, samples) where it is not there whole
+    positions: Mapping[int, int]  # shard -> its position in the store
+    cut: Mapping[int, tuple[int, int]]  # shard -> (scenes, samples) where it is cut
 
     def wanted(self, shard: int, run: Run) -> tuple[int, int]:
-        """(scenes, samples) that the store has of a shard."""
+        """(scenes, samples) of a shard in the store."""
         return self.cut.get(shard, (run.layout.scenes_per_shard, run.layout.samples_per_shard))
 
 
 @dataclass
 class SealedTally:
-    """What the store must say of itself, gathered shard by shard in their order."""
+    """The expected content of the store, collected shard by shard in order."""
 
     digest: RowsDigest = field(default_factory=RowsDigest)
     shards: list[SealedShard] = field(default_factory=list[SealedShard])
-    lost: int = 0  # shards whose commit is gone
-    unknown: int = 0  # shards of which there is nothing at all
+    lost: int = 0  # shards without a commit
+    unknown: int = 0  # shards without any file
 
     def add(self, run: Run, slice_: SealedSlice, shard: int, commit: Commit | None, known: bool) -> None:
-        """Count one shard of the store; `known` where it has files, though no commit."""
+        """Count one shard of the store; `known` where it has files but no commit."""
         if commit is None:
             self.lost, self.unknown = self.lost + known, self.unknown + (not known)
             return
@@ -56,9 +56,9 @@ class SealedTally:
 def read_root(
     place: Storage, runs: Iterable[Run], wanted: Mapping[str, int]
 ) -> tuple[SealedRoot | None, list[Finding]]:
-    """What data.zarr says of itself; a finding where it is there and that cannot be so.
+    """Return the metadata of data.zarr; a finding where it exists and is impossible.
 
-    `wanted` are the samples that the newest plans want, by specification hash.
+    `wanted` are the samples of the newest plans, by specification hash.
     """
     key = f"{SEALED}/{ROOT}"
     try:
@@ -67,23 +67,23 @@ def read_root(
     except InputError as error:
         return None, [curable(key, "sealed", error.problem, Reseal())]
     if root is None:
-        if there:  # in an object store also one that was not finished
-            return None, [curable(key, "sealed", "missing, or does not say what was sealed", Reseal())]
+        if there:  # in an object store, possibly unfinished
+            return None, [curable(key, "sealed", "missing, or without the list of its shards", Reseal())]
         return None, []
     told = {part.spec_hash: part.n for part in root.parts}
     if told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
-        problem = "says that it holds other rows than any plan wants"
+        problem = "names rows that no plan wants"
         return None, [curable(key, "sealed", problem, Reseal())]
     layouts = {run.manifest.spec_hash: run.layout for run in runs}
     held = sum(layouts[part.spec_hash].shards_for(part.n) - len(part.missing_shards) for part in root.parts)
-    if held > MOST_SHARDS:  # before so many places are set aside
-        problem = f"says that it holds {held} shards, more than any store does"
+    if held > MOST_SHARDS:  # before memory is allocated for them
+        problem = f"names {held} shards, more than a store can have"
         return None, [curable(key, "sealed", problem, Reseal())]
     return root, []
 
 
 def slices_of(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedSlice]:
-    """What the store holds of each run, by specification hash."""
+    """The shards of each run in the store, by specification hash."""
     found: dict[str, SealedSlice] = {}
     before = 0
     last: tuple[str, int] | None = None
@@ -110,7 +110,7 @@ def slices_of(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedSlice]:
 def check_chunks(
     place: Storage, prefix: str, run: Run, form: ShardForm, slice_: SealedSlice, commit: Commit
 ) -> Iterator[Finding]:
-    """The store's chunks of one shard: links to its files, or equal bytes."""
+    """Check the store's chunks of one shard: links to its files, or equal bytes."""
     folder = f"{prefix}{shard_folder(commit.shard, commit.attempt)}"
     entries = {entry.path: entry for entry in commit.files}
     wanted = dict(zip(TABLES, slice_.wanted(commit.shard, run), strict=True))
@@ -148,7 +148,7 @@ def _other_bytes(place: Storage, key: str, size: int, digest: str) -> str:
         return error.problem
     if data is None:
         return "missing"
-    return "" if sha256(data).hexdigest() == digest else "other bytes than its shard has"
+    return "" if sha256(data).hexdigest() == digest else "has other bytes than its shard"
 
 
 def check_store(
@@ -158,11 +158,11 @@ def check_store(
     slices: Mapping[str, SealedSlice],
     tally: SealedTally,
 ) -> Iterator[Finding]:
-    """The store's metadata, files that are too many, and whether it is behind its runs."""
+    """Check the store's metadata, extra files, and whether it is outdated."""
     if tally.unknown:
-        problem = f"holds {tally.unknown} shards of which the run has nothing"
+        problem = f"holds {tally.unknown} shards without any file in the run"
         yield curable(SEALED, "sealed", problem, Reseal())
-    if tally.lost:  # their rows are whole here: nothing is sealed over them
+    if tally.lost:  # their rows exist only here: do not seal again
         problem = f"holds {tally.lost} shards whose commits are lost: it cannot be checked"
         mend = "Make the shards again with `datagen resume`, which seals them with the others"
         yield Finding(SEALED, "sealed", problem, mend)
@@ -182,15 +182,15 @@ def check_store(
             there = place.get(key, MAX_RECORD_BYTES)
             problem = "missing" if there is None else ""
             if there is not None and not same_json(there, data):
-                problem = "is not what sealing writes for these shards"
+                problem = "differs from what sealing these shards writes"
         except InputError as error:
             problem = error.problem
         if problem:
             yield curable(key, "sealed", problem, Reseal(data=data))
     yield from _foreign_files(contents)
     if any(_is_behind(run, wanted[run.manifest.spec_hash], slices) for run in runs):
-        mend = "Run datagen seal to bring it up to date; nothing is damaged"
-        yield Finding(SEALED, "stale", "is older than what is committed now", mend)
+        mend = "Run datagen seal to update it; nothing is damaged"
+        yield Finding(SEALED, "stale", "is older than the committed shards", mend)
 
 
 def _is_behind(run: Run, n: int, slices: Mapping[str, SealedSlice]) -> bool:
@@ -205,7 +205,7 @@ def _foreign_files(contents: Contents) -> Iterator[Finding]:
     for table in TABLES:
         for array in contents.schema.table(table):
             known.add(f"{SEALED}/{array.name}/zarr.json")
-            # Only the last shard is cut, so that chunks are numbered without gaps.
+            # Only the last shard is cut, so chunks are numbered without gaps.
             counts[array.name] = sum(1 for _ in contents.chunks(array))
     for file in contents.place.list(SEALED):
         if file.key in known:
@@ -214,5 +214,5 @@ def _foreign_files(contents: Contents) -> Iterator[Finding]:
         number = names[2].split(".")[1] if len(names) == 3 and names[2].startswith("c.") else ""
         array = fields.get(names[1]) if number.isascii() and number.isdigit() and len(number) < 16 else None
         if array is None or names[2] != chunk_key(array, int(number)) or int(number) >= counts[array.name]:
-            problem = "is no file of the sealed store"
+            problem = "is not a file of the sealed store"
             yield curable(file.key, "sealed", problem, Reseal())

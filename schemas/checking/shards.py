@@ -1,4 +1,4 @@
-"""The files of a committed shard: their bytes, and the rows in them."""
+"""Checks of the files of a committed shard, and of the rows in them."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ from datagen.schemas.shard_files import (
 from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from datagen.schemas.storage import StoredFile
 
-_WRITTEN_SO = "It was written so: remove the commit and its copy, and `datagen resume` makes it anew"
-# What the checks of a shard's rows need together; every other array is looked at by itself.
+_WRITTEN_SO = "It is undamaged but wrong: remove the commit and its copy, and `datagen resume` makes it again"
+# Arrays that are checked together; every other array is checked by itself.
 _KEYS = ("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label")
 
 
 @dataclass(frozen=True, eq=False)
 class ShardForm:
-    """What every shard of a run must look like."""
+    """The required form of every shard of a run."""
 
     schema: RecordSchema
     metadata: Mapping[str, bytes]
-    chunks: Mapping[str, tuple[str, ...]]  # of each array, by its name: paths in the order of rows
+    chunks: Mapping[str, tuple[str, ...]]  # paths of each array's chunks, in order of rows
     arrays: Mapping[str, StoredArray]
 
     def most_bytes(self, path: str) -> int:
-        """More than a file of a shard can have."""
+        """An upper bound of the size of a file."""
         array = self.arrays.get(path.split("/")[0])
         if array is None or path in self.metadata:
             return MAX_META_BYTES
         count = array.chunk_rows * math.prod(array.shape[1:])
         item = 4 + MAX_TEXT_BYTES if array.is_text else np.dtype(array.dtype).itemsize
-        return 2**10 + count * item * 17 // 16  # zstd adds less than a hundredth to what it cannot pack
+        return 2**10 + count * item * 17 // 16  # zstd adds less than 1 % to incompressible data
 
     @property
     def paths(self) -> frozenset[str]:
@@ -60,7 +60,7 @@ class ShardForm:
 
 
 def form_of(run: Run) -> ShardForm:
-    """The form of this run's shards."""
+    """The required form of this run's shards."""
     schema, layout = run.schema, run.layout
     metadata = group_metadata(schema, layout, run.manifest.spec_hash)
     chunks: dict[str, tuple[str, ...]] = {}
@@ -78,21 +78,21 @@ def form_of(run: Run) -> ShardForm:
 def check_shard(
     run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, StoredFile]
 ) -> Iterator[Finding]:
-    """Every file of a committed shard against its entry, and the rows against the schema.
+    """Check every file of a committed shard against its entry, and the rows against the schema.
 
-    `listed` are the files below the shard's folder; drafts that a killed writer left (.part) are for `gc`.
-    Holds one shard's arrays at most.
+    `listed` are the files below the shard's folder; drafts of killed writers (.part) are left to `gc`. Holds
+    at most one shard's arrays in memory.
     """
     folder = shard_folder(commit.shard, commit.attempt)
     entries = {entry.path: entry for entry in commit.files}
     if odd := sorted(form.paths ^ entries.keys()):
-        problem = f"files: lacks or adds {len(odd)} files, first {odd[0]}"
+        problem = f"files: {len(odd)} missing or extra, first {odd[0]}"
         yield Finding(commit_key(commit.shard), "rows", problem, _WRITTEN_SO, commit.shard)
     for key in listed:
         path = key.removeprefix(f"{folder}/")
         if path != key and path not in entries and path != "commit.json" and not path.endswith(".part"):
-            problem = "no record knows this file in a committed attempt's folder"
-            yield Finding(key, "foreign", problem, "Move it away: nothing reads it", commit.shard)
+            problem = "is in a committed attempt's folder, but in no record"
+            yield Finding(key, "foreign", problem, "Move it out of the run: nothing reads it", commit.shard)
     kept: dict[str, Array] = {}
     whole = True
     if "zarr.json" in entries:
@@ -127,17 +127,17 @@ def check_shard(
 def _bytes_of(
     run: Run, form: ShardForm, commit: Commit, entry: FileEntry, listed: Mapping[str, StoredFile]
 ) -> tuple[bytes | None, list[Finding]]:
-    """A file's bytes where they are those that were committed, or what is wrong."""
+    """A file's bytes where they are the committed ones, or the problem."""
     key = f"{shard_folder(commit.shard, commit.attempt)}/{entry.path}"
     there = listed.get(key)
     data, problem = None, ""
     if entry.size > form.most_bytes(entry.path):
-        problem = f"{entry.size} bytes by its commit, more than such a file can have"
+        problem = f"has {entry.size} bytes by its commit, more than such a file can have"
         return None, [Finding(key, "rows", problem, _WRITTEN_SO, commit.shard)]
     if there is None:
         problem = "missing"
     elif there.size != entry.size:
-        problem = f"{there.size} bytes, where the commit has {entry.size}"
+        problem = f"has {there.size} bytes, but {entry.size} were committed"
     else:
         try:
             data = run.storage.get(key, entry.size)
@@ -147,7 +147,7 @@ def _bytes_of(
             if data is None:
                 problem = "missing"
             elif sha256(data).hexdigest() != entry.sha256:
-                data, problem = None, "sha256: other bytes than were committed"
+                data, problem = None, "sha256: differs from the committed bytes"
     if not problem:
         return data, []
     return None, [curable(key, "file", problem, Regenerate(run, commit.shard, entry), commit.shard)]
@@ -158,12 +158,12 @@ def _check_metadata(
 ) -> Iterator[Finding]:
     if data is None or same_json(data, form.metadata.get(path, b"")):
         return
-    problem = "not the metadata that the schema asks for"
+    problem = "differs from the metadata of the schema"
     yield Finding(f"{folder}/{path}", "rows", problem, _WRITTEN_SO, shard)
 
 
 def same_json(data: bytes, wanted: bytes) -> bool:
-    """Whether two files are equal, or are so but for how a library lays out its JSON."""
+    """Whether two files are equal, up to the layout of JSON."""
     if data == wanted:
         return True
     try:
@@ -175,7 +175,7 @@ def same_json(data: bytes, wanted: bytes) -> bool:
 def _decode(
     run: Run, form: ShardForm, table: Table, field: Field, chunks: list[bytes]
 ) -> tuple[Array | None, str]:
-    """An array of the shard, checked by its field's dtype, shape and range; or what is wrong."""
+    """An array of the shard, checked for dtype, shape and range; or the problem."""
     rows = rows_per_shard(run.layout, table)
     alone = RecordSchema(form.schema.name, form.schema.version, (field,), (field,), form.schema.sizes)
     try:
@@ -188,7 +188,7 @@ def _decode(
 
 
 def _row_problems(run: Run, commit: Commit, kept: Mapping[str, Array]) -> Iterator[tuple[str, str]]:
-    """(array, problem) where rows are not those that this shard must have, or unlike its commit."""
+    """Yield (array, problem) where rows are not those of this shard, or differ from its commit."""
     layout = run.layout
     first, scenes, each = commit.shard * layout.scenes_per_shard, commit.scenes, layout.candidates_per_scene
     indices = np.arange(first, first + scenes)
@@ -203,13 +203,13 @@ def _row_problems(run: Run, commit: Commit, kept: Mapping[str, Array]) -> Iterat
     for name, values in wanted.items():
         if not np.array_equal(kept[name], values):
             row = int(np.flatnonzero((kept[name] != values).reshape(len(values), -1).any(axis=1))[0])
-            yield name, f"row {row} is not that of its place in the run"
+            yield name, f"row {row} does not belong at its position in the run"
     positives = int(np.count_nonzero(kept["label"]))
     if positives != commit.positives:
-        yield "label", f"{positives} positives, where the commit has {commit.positives}"
+        yield "label", f"has {positives} positives, but the commit has {commit.positives}"
     sums = dict(zip(REDRAW_CAUSES, kept["redraws"].sum(axis=0).tolist(), strict=False))
     redraws = {cause: count for cause, count in sums.items() if count}
-    # Scenes that are labelled again keep the counts of those that drew them, at no cost to this run.
+    # Scenes of --scenes-from keep the counts of the run that made them.
     known = [redraws] if run.manifest.spec.scenes_from is None else [redraws, {}]
     if {cause: count for cause, count in commit.redraws.items() if count} not in known:
-        yield "redraws", f"add up to {redraws}, where the commit has {commit.redraws}"
+        yield "redraws", f"sum to {redraws}, but the commit has {commit.redraws}"

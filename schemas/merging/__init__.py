@@ -1,4 +1,4 @@
-"""Merging: runs made apart become one run, or one place of several, by links wherever layouts allow."""
+"""Merge separate runs into one run, or into merged runs of several parts, with links where possible."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from datagen.schemas.sealing import SEALED, seal, sealed_metadata
 from datagen.schemas.sealing.contents import read_contents
 from datagen.schemas.storage import Storage, open_storage
 
-_ELSEWHERE = "Choose a new --out, and name this one among the runs that are merged"
+_ELSEWHERE = "Choose a new --out, and name this run among those to merge"
 
 
 @dataclass(frozen=True, eq=False)
 class MergePlan:
-    """Runs that can be merged, and what they give: one union a specification, by ascending hash."""
+    """Runs that can be merged: one union per specification, by ascending hash."""
 
     out: str
-    existing: tuple[Run, ...]  # what stands at the place already
+    existing: tuple[Run, ...]  # runs at the place already
     unions: tuple[Union, ...]
-    hashes: tuple[str, ...]  # of all specifications of the place
+    hashes: tuple[str, ...]  # of all specifications in the result
 
     @property
     def is_ordinary(self) -> bool:
-        """Whether the result is one run; else it is a place of several."""
+        """Whether the result is one run; else it has several parts."""
         return len(self.hashes) == 1
 
     @property
     def records(self) -> int:
-        """Shards and attempts to write, at most: what is in several sources is counted in each."""
+        """Upper bound of the shards and attempts to write: duplicates count in each source."""
         return sum(len(union.kept) + sum(map(len, union.attempts)) for union in self.unions)
 
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """A merge that was done; `sealed` is the store's address, "" where nothing is committed."""
+    """The result of a merge; `sealed` is the store's address, "" where nothing is committed."""
 
     place: Storage
     written: tuple[WrittenUnion, ...]
@@ -53,13 +53,13 @@ class MergeResult:
 
 
 def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> MergePlan:
-    """Look at everything and write nothing; `tick` is called for every commit that was read.
+    """Plan a merge without writing; `tick` is called for every commit that was read.
 
-    A run that stands at `out` counts as one of the sources. InputError when there is nothing to merge, when
-    runs are not of one kind, hold other rows of one scene, or cannot be added to what is at `out`.
+    A run at `out` is one of the sources. InputError when there is nothing to merge, when runs are of
+    different kinds, have different rows for a scene, or cannot be added to the run at `out`.
     """
     if not places:
-        raise InputError("datagen merge", "RUN", "no run is named", "Name the runs to merge")
+        raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
     place = _place(out)
     existing = open_runs(place) if place is not None and _holds_runs(place) else []
     sources = _distinct([run for place in places for run in open_runs(place)])
@@ -76,7 +76,7 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     hashes = tuple(sorted(groups))
     _refuse_other_place(existing, hashes, layout)
     if place is not None and not existing:
-        # A merge that was cut short may have left parts that nothing names yet, and a draft of what would.
+        # An interrupted merge may have left parts that no record names yet, and a draft of the record.
         refuse_foreign(place, *(("parts/", MERGED) if len(hashes) > 1 else ()))
     here = {run.manifest.spec_hash for run in existing}
     unions = tuple(
@@ -90,14 +90,14 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
 def merge_runs(merge: MergePlan, tick: Callable[[], None] = lambda: None) -> MergeResult:
     """Write a planned merge and seal it; `tick` is called for every shard and every attempt.
 
-    Doing it again finishes what was cut short, and changes nothing where it is done.
+    Called again, it completes an interrupted merge, and changes nothing in a complete one.
     """
     place = open_storage(merge.out)
     runs: list[Run] = []
     for union in merge.unions:
         spec_hash = union.manifest.spec_hash
         runs.append(begin_union(union, place if merge.is_ordinary else place.below(part_folder(spec_hash))))
-    # From here on the place counts as what it will be; what is not there yet is missing, as in any run.
+    # From here on the result counts as merged runs; shards that are not written yet are missing.
     if not merge.is_ordinary:
         replace_record(place, MERGED, encode_record(Merged(parts=merge.hashes)))
     written = [write_union(union, run, tick) for union, run in zip(merge.unions, runs, strict=True)]
@@ -105,7 +105,7 @@ def merge_runs(merge: MergePlan, tick: Callable[[], None] = lambda: None) -> Mer
 
 
 def _seal(place: Storage) -> str:
-    """Seal the place unless it is sealed as it stands."""
+    """Seal the result unless its store is up to date."""
     if not label_counts(open_runs(place)).labels:
         return ""
     root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
@@ -115,7 +115,7 @@ def _seal(place: Storage) -> str:
 
 
 def _place(out: str) -> Storage | None:
-    """The place of the result as it is now; None where the folder is still to be made."""
+    """The storage of the result; None where the folder does not exist yet."""
     try:
         return open_storage(out, probe=False, create=False)
     except InputError as e:
@@ -143,17 +143,17 @@ def _address(place: str) -> str:
 
 
 def _refuse_nested(places: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
-    """Sources are never written to: the result cannot lie in one, nor one in the result."""
+    """Raise InputError where the result is inside a source or a source inside the result."""
     here, roots = _address(out), {_address(place) for place in places}
     known = {here, *(_identity(run.storage) for run in existing)}
     for other in sorted({*roots, *(_identity(run.storage) for run in sources)} - known):
         if here.startswith(f"{other}/") or other.startswith(f"{here}/"):
-            problem = f"lies in {other}" if here.startswith(other) else f"{other} lies in it"
-            raise InputError(out, "--out", problem, "Choose a place of its own for the result")
+            problem = f"is inside {other}" if here.startswith(other) else f"contains {other}"
+            raise InputError(out, "--out", problem, "Choose another folder for the result")
 
 
 def _refuse_other_place(existing: Sequence[Run], hashes: Sequence[str], layout: Layout) -> None:
-    """Refuse what cannot be added to what stands at the place: its shards and its kind of place stay."""
+    """Raise InputError for runs that cannot be added to the run at `out`, whose shards are kept."""
     if not existing:
         return
     first = existing[0]
@@ -161,7 +161,7 @@ def _refuse_other_place(existing: Sequence[Run], hashes: Sequence[str], layout: 
         raise InputError(
             first.storage.url,
             "layout.scenes_per_shard",
-            f"{first.layout.scenes_per_shard}, where these runs together need {layout.scenes_per_shard}",
+            f"is {first.layout.scenes_per_shard}, but these runs need {layout.scenes_per_shard}",
             _ELSEWHERE,
         )
     if len(existing) == 1 and len(hashes) > 1:
@@ -169,6 +169,6 @@ def _refuse_other_place(existing: Sequence[Run], hashes: Sequence[str], layout: 
         raise InputError(
             first.storage.url,
             "spec_hash",
-            f"one run stands there, and runs of another specification ({other[:16]}) are to join it",
+            f"is one run, and cannot hold runs of another specification ({other[:16]})",
             _ELSEWHERE,
         )

@@ -1,6 +1,6 @@
-"""Two runs that hold the same scenes: their rows must be equal, whatever bytes their files have.
+"""Check that runs with the same scenes have equal rows.
 
-Files may differ where rows do not: another version of the compressor, another cut into shards.
+Files may differ where rows do not: by the version of the compressor or the size of shards.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from datagen.schemas.scene_rows import read_scenes
 
 
 def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int) -> None:
-    """Raise InputError where two committed shards have other rows of a scene that both hold.
+    """Raise InputError where two committed shards have different rows for a common scene.
 
-    It names both runs, the shard, the first file that differs and the first sample. InputError also for a
-    file that is damaged.
+    It names both runs, the shard, the first differing file and the first differing sample. InputError also
+    for a damaged file.
     """
     first = max(
         run.layout.scenes_per_shard * shard for run, shard in ((one, shard_one), (other, shard_other))
@@ -40,13 +40,13 @@ def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int
         raise InputError(
             one.storage.url,
             f"shard {shard_one}",
-            f"{other.storage.url} has other rows of it: {file} differs, first in sample {sample}, in {field}",
-            "Run `datagen verify` on both, and merge without the one that is wrong",
+            f"{other.storage.url} has other rows: {file} differs, first in sample {sample}, in {field}",
+            "Run `datagen verify` on both, and merge without the wrong one",
         )
 
 
 def _first_difference(schema: RecordSchema, ours: SceneRows, theirs: SceneRows) -> tuple[str, int] | None:
-    """The first field and sample row in which one scene differs; row 0 where the scene itself does."""
+    """The first field and sample row that differ in a scene; row 0 where the scene's record differs."""
     for field in schema.scene_fields:
         if not _equal(np.asarray(ours.record[field.name]), np.asarray(theirs.record[field.name])):
             return field.name, 0
@@ -60,14 +60,14 @@ def _first_difference(schema: RecordSchema, ours: SceneRows, theirs: SceneRows) 
 
 
 def _equal(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> bool:
-    """Bit for bit."""
+    """Whether two arrays are equal bit for bit."""
     if a.dtype.kind == "O":
         return bool(np.array_equal(a, b))
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
 def _first_file(one: Run, shard_one: int, other: Run, shard_other: int, field: str) -> str:
-    """The first committed file that differs; the array's folder where the shards are cut otherwise."""
+    """The first committed file that differs; the array's folder where the shards have other sizes."""
     commit, theirs = one.commit_of(shard_one), other.commit_of(shard_other)
     folder = shard_folder(shard_one, commit.attempt)
     if one.layout != other.layout:

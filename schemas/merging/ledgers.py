@@ -1,7 +1,7 @@
-"""The ledgers of merged runs as one: every attempt once, and what was paid for it.
+"""Merge ledgers: every attempt once, with its cost.
 
-An attempt whose shard was kept from another one is superseded. Attempts at shards that are cut are cut with
-them, each piece with its share of the cost; those that made nothing stay whole, at their first piece.
+Where a shard is kept from another attempt, an attempt is superseded. Attempts of resharded shards are split
+with them, each piece with its share of the cost; unsuccessful ones are kept whole, with their first piece.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from datagen.schemas.record_files import MAX_RECORD_BYTES, Record, decode_record
 from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
 from datagen.schemas.storage import Storage
 
-SPARE_CAUSE = "merged: this shard is held from another attempt"
-GUESS_CAUSE = f"merged: {LOST_CAUSE}"  # of a guess made here, which gives way to one that was noted
-_AT_ONCE = 256  # attempts whose records are held
+SPARE_CAUSE = "merged: this shard is kept from another attempt"
+GUESS_CAUSE = f"merged: {LOST_CAUSE}"  # of a guess made here, which a recorded one replaces
+_AT_ONCE = 256  # attempts whose records are in memory
 
 
 @dataclass(frozen=True)
 class UnitedAttempt:
-    """All that the union says of one attempt; `end` is None while it has not ended."""
+    """The records of one attempt in the union; `end` is None while it has not ended."""
 
     name: str
     start: AttemptStart | None
@@ -33,7 +33,7 @@ class UnitedAttempt:
 
 @dataclass(frozen=True)
 class _NamedAttempt:
-    """Where a source speaks of an attempt: its name there, and the piece of it that is meant."""
+    """An attempt in a source: its name there, and the piece of it."""
 
     source: int
     attempt: str
@@ -41,9 +41,9 @@ class _NamedAttempt:
 
 
 def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[UnitedAttempt]:
-    """Every attempt of the union in order of names; records are read some hundreds at a time.
+    """Yield every attempt of the union in order of names; records are read some hundreds at a time.
 
-    One that left no end is lost, at a cost that nobody knows, where its shard is kept or `given_up`.
+    An attempt without an end is lost, with unknown cost, where its shard is kept or in `given_up`.
     """
     spare = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
     kept = {holding.name: holding for holding in union.kept.values()}
@@ -85,7 +85,7 @@ def _places(union: Union) -> dict[str, list[_NamedAttempt]]:
 
 
 class _Records:
-    """What the sources say of some attempts, and the commits of what these made."""
+    """Records of some attempts in the sources, and their commits."""
 
     def __init__(
         self, union: Union, places: Iterable[_NamedAttempt], holdings: Iterable[Holding | None]
@@ -108,12 +108,12 @@ class _Records:
                     self._commits[source, shard] = run.decode_commit(shard, data)
 
     def commit_of(self, holding: Holding) -> Commit:
-        """The source's commit of a holding. InputError where it was withdrawn meanwhile."""
+        """The source's commit of a holding. InputError where it was removed meanwhile."""
         found = self._commits.get((holding.source, holding.of))
         return self._union.commit_of(holding) if found is None else found
 
     def starts(self, name: str, places: Iterable[_NamedAttempt]) -> list[AttemptStart]:
-        """What the sources have of an attempt's begin, as the union names and numbers it."""
+        """The start record of an attempt from the sources, with the union's name and shard number."""
         found: list[AttemptStart] = []
         for place in places:
             start = self._starts.get((place.source, place.attempt))
@@ -125,7 +125,7 @@ class _Records:
         return found
 
     def ends(self, name: str, places: Iterable[_NamedAttempt]) -> list[LedgerEntry]:
-        """What the sources have of an attempt's end, as the union names and numbers it."""
+        """The end record of an attempt from the sources, with the union's name and shard number."""
         found: list[LedgerEntry] = []
         for place in places:
             end = self._ends.get((place.source, place.attempt))
@@ -157,14 +157,14 @@ def _end_of_held(
     ends: list[LedgerEntry],
     is_kept: bool,
 ) -> LedgerEntry:
-    """How an attempt that made a shard ended, at its commit's cost, also where no ledger says so."""
+    """The end record of an attempt that made a shard, with its commit's cost, also without a ledger entry."""
     truth = {
         "outcome": "committed" if is_kept else "superseded",
         "cause": "" if is_kept else SPARE_CAUSE,
         "stack": "",
         "cost": union.cost_of(holding, commit),
     }
-    # What was worked out from the commit comes last: merging again must not prefer it to what was noted.
+    # Records derived from the commit come last: merging again must prefer recorded ones.
     named = {"attempt": holding.name, "shard": holding.shard}
     derived = end_from_commit(commit, start.started if start else "").model_copy(update={**named, **truth})
     noted = [end.model_copy(update={**truth, "host": end.host or commit.host}) for end in ends]
@@ -172,5 +172,5 @@ def _end_of_held(
 
 
 def _account_first(end: LedgerEntry) -> tuple[bool, bool, bytes]:
-    """Which of several ends of one attempt says most: one with its cost, and a guess only where all are."""
+    """The most informative of several ends of one attempt: with cost, and a guess only where all are."""
     return end.cost is None, end.cause == GUESS_CAUSE, encode_record(end)

@@ -1,6 +1,6 @@
-"""What a union of runs of one specification holds: which source gives each shard, and which are spare.
+"""Plan the union of runs of one specification: the source of each shard, and the duplicates.
 
-Nothing is written here, and no data is read but to compare shards that two sources hold with other bytes.
+No file is written, and data is read only to compare shards that two sources have with different bytes.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from datagen.schemas.record_files import different_fields, encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Cost, Layout, Manifest, Plan
 
-# What may differ between runs that merge: they are other samples of the same kind.
+# Fields that may differ between merged runs: they give other samples of the same kind.
 FREE_FIELDS = ("seed", "split", "houses", "objects", "scenes_from")
 _SHOWN = 5
 
 
 def refuse_incompatible(runs: Sequence[Run]) -> None:
-    """Raise InputError where two runs are not of one kind, naming what differs, both values and both runs."""
+    """Raise InputError where two runs are of different kinds, with the differing fields of both."""
     first = runs[0]
     for run in runs[1:]:
         rows = different_fields(_kind(first), _kind(run))
@@ -34,8 +34,8 @@ def refuse_incompatible(runs: Sequence[Run]) -> None:
             raise InputError(
                 f"{first.storage.url} and {run.storage.url}",
                 rows[0][0],
-                f"not of one kind ({told}{more})",
-                f"Merge runs that differ in {', '.join(FREE_FIELDS[:-1])} or {FREE_FIELDS[-1]} alone",
+                f"differs in kind ({told}{more})",
+                f"Merge runs that differ only in {', '.join(FREE_FIELDS[:-1])} or {FREE_FIELDS[-1]}",
             )
 
 
@@ -51,9 +51,9 @@ def _kind(run: Run) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """A committed shard of a source, or a piece of it, that can be a shard of the union."""
+    """A committed shard of a source, or a piece of it, as a shard of the union."""
 
-    source: int  # place in the union's runs
+    source: int  # index in the union's runs
     of: int  # shard in the source
     attempt: str  # its name there
     name: str  # its name in the union
@@ -64,11 +64,11 @@ class Holding:
 
 @dataclass(frozen=True, eq=False)
 class Union:
-    """Runs of one specification as one.
+    """The union of runs of one specification.
 
-    `out` is the place in `runs` of the run that stands where the union goes, None where none does yet.
-    `kept` has the holding of every shard that some source has; `spare` the others, which hold equal rows.
-    `attempts` are the attempts in each source's ledger, listed before its commits were.
+    `out` is the index in `runs` of an existing run at the output, else None. `kept` has the chosen holding of
+    every shard; `spare` the duplicates, which have equal rows. `attempts` are those in each source's ledger,
+    listed before its commits.
     """
 
     runs: tuple[Run, ...]
@@ -81,34 +81,34 @@ class Union:
 
     @property
     def layout(self) -> Layout:
-        """How the union is cut into shards."""
+        """The layout of the union."""
         return self.manifest.layout
 
     def cut(self, source: int) -> Cut:
-        """How a source's shards fall into the union's."""
+        """How a source's shards are split into the union's."""
         return Cut(self.runs[source].layout.scenes_per_shard, self.layout.scenes_per_shard)
 
     def commit_of(self, holding: Holding) -> Commit:
-        """The source's commit of a holding, as the source has it."""
+        """The source's commit of a holding."""
         return self.runs[holding.source].commit_of(holding.of)
 
     def cost_of(self, holding: Holding, commit: Commit) -> Cost:
-        """A holding's cost, where its source's commit is this one."""
+        """A holding's cost, from its source's commit."""
         return self.cut(holding.source).cost(commit.cost, holding.shard)
 
 
 def plan_union(
     runs: Sequence[Run], out: int | None, layout: Layout, tick: Callable[[], None] = lambda: None
 ) -> Union:
-    """What runs of one specification hold together, cut by `layout`, which divides theirs.
+    """Plan the union of runs of one specification, with `layout`, which divides theirs.
 
-    What is committed now counts; a source may grow meanwhile. `tick` is called for every commit that was
-    read. InputError when two sources hold other rows of one scene: it names both and the first difference.
+    Shards committed now count; a source may grow meanwhile. `tick` is called for every commit that was read.
+    InputError when two sources have different rows for a scene: it names both and the first difference.
     """
     attempts: list[frozenset[str]] = []
     held: dict[int, list[Holding]] = {}
     for source, run in enumerate(runs):
-        # Before the commits: whatever the ledger calls committed then has its commit.
+        # Before the commits, so that every attempt that the ledger calls committed has its commit.
         attempts.append(frozenset(run.ledger.attempts()))
         cut = Cut(run.layout.scenes_per_shard, layout.scenes_per_shard)
         for holding in _holdings(run, source, cut):
@@ -146,7 +146,7 @@ def _holdings(run: Run, source: int, cut: Cut) -> Iterator[Holding]:
 
 
 def _preference(holding: Holding, out: int | None, runs: Sequence[Run], layout: Layout) -> tuple[object, ...]:
-    """What is committed at the place of the union stays; else names decide, so that order does not."""
+    """Sort key: shards at the output are kept; else names decide, not the order of the sources."""
     is_cut = runs[holding.source].layout != layout
     return (
         holding.source != out,
@@ -170,13 +170,13 @@ def _refuse_conflict(
 
 
 def _manifest(runs: Iterable[Run], layout: Layout) -> Manifest:
-    """One of the sources' manifests, the same whatever their order, with the union's layout."""
+    """One of the sources' manifests, independent of their order, with the union's layout."""
     return min((run.manifest.model_copy(update={"layout": layout}) for run in runs), key=encode_record)
 
 
 def _plan(runs: Sequence[Run]) -> Plan:
     plans = [plan for run in runs if (plan := run.plan()) is not None]
     if not plans:
-        problem = "no plan says how many samples are wanted"
-        raise InputError(runs[0].storage.url, "plans", problem, "Say it with `datagen extend`")
+        problem = "has no plan with the number of samples wanted"
+        raise InputError(runs[0].storage.url, "plans", problem, "Set it with `datagen extend`")
     return min(plans, key=lambda plan: (-plan.n, plan.created))

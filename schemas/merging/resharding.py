@@ -1,7 +1,6 @@
-"""Shards cut smaller: their common layout, and the names, costs and shard numbers of the pieces.
+"""Split shards: the common layout, and the names, costs and numbers of the pieces.
 
-Cutting in two steps gives what cutting at once gives, to the last byte: every rule below looks at scenes
-alone, never at how often something was cut before.
+Splitting in two steps gives the same bytes as in one: every rule depends only on scenes.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _NS = 10**9
 
 
 def common_layout(layouts: Iterable[Layout]) -> Layout:
-    """The largest shards that divide those of every layout; candidates per scene must agree."""
+    """The layout of the largest shards that divide those of every layout, for equal candidates per scene."""
     found = list(layouts)
     scenes = math.gcd(*(layout.scenes_per_shard for layout in found))
     return Layout(scenes_per_shard=scenes, candidates_per_scene=found[0].candidates_per_scene)
@@ -28,14 +27,14 @@ def common_layout(layouts: Iterable[Layout]) -> Layout:
 
 @dataclass(frozen=True)
 class Cut:
-    """How shards of `scenes` scenes fall into shards of `into` scenes, which divide them."""
+    """Split of shards of `scenes` scenes into shards of `into` scenes, a divisor."""
 
     scenes: int
     into: int
 
     @property
     def pieces(self) -> int:
-        """Pieces of one shard; 1 where nothing is cut."""
+        """Pieces per shard; 1 without a split."""
         return self.scenes // self.into
 
     def first(self, shard: int) -> int:
@@ -47,14 +46,13 @@ class Cut:
         return range(self.first(shard), self.first(shard + 1))
 
     def name(self, attempt: str, piece: int) -> str:
-        """Name of the attempt that made this piece: it says the piece's first scene."""
+        """Name of the attempt of this piece, with the piece's first scene."""
         return attempt if self.pieces == 1 else f"{_fitting(base_name(attempt))}.cut{piece * self.into}"
 
     def cost(self, cost: Cost, piece: int) -> Cost:
-        """What a piece cost: each scene the same, to the nanosecond and byte; the pieces add up to the whole.
+        """The cost of a piece: equal shares per scene, to the nanosecond and byte; pieces sum to the whole.
 
-        Where seconds or bytes do not divide, the first scenes carry one more. Peak memory is that of the
-        attempt.
+        Remainders of nanoseconds and bytes go to the first scenes. Peak memory is that of the attempt.
         """
         if self.pieces == 1:
             return cost
@@ -79,22 +77,22 @@ class Cut:
 
 
 def base_name(attempt: str) -> str:
-    """Name of the attempt of which this one is a piece; its own where it is whole."""
+    """Name of the attempt that a piece comes from; its own where it is not split."""
     found = _PIECE.fullmatch(attempt)
     return found[1] if found else attempt
 
 
 def rank(attempt: str) -> tuple[str, str]:
-    """Of equal attempts the first by this is kept: the order of the whole attempts' names."""
+    """Sort key of equal attempts: the names of the unsplit attempts; the first is kept."""
     return _fitting(base_name(attempt)), attempt
 
 
 def _share(total: int, scenes: int, first: int, count: int) -> int:
-    """What `count` scenes from `first` on carry of a total over all scenes."""
+    """The share of `count` scenes from `first` on in a total over all scenes."""
     each, rest = divmod(total, scenes)
     return each * count + min(max(rest - first, 0), count)
 
 
 def _fitting(name: str) -> str:
-    # Attempts are named in at most 100 characters, and a piece's name is longer.
+    # Names have at most 100 characters, and a piece's name is longer.
     return name if len(name) <= _MAX_NAME - 20 else sha256(name.encode()).hexdigest()[:32]

@@ -1,6 +1,6 @@
-"""A planned union written down: shards first, then the ledger, quarantine and lineage.
+"""Write a planned union: shards first, then the ledger, quarantine and lineage.
 
-Every step skips what is there, so that a merge that was killed is finished by doing it again.
+Every step skips existing files, so that a killed merge is completed by running it again.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ Tick = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class WrittenUnion:
-    """What became of a union. `there` are shards that its place had before."""
+    """The result of a union. `there` counts shards that existed before."""
 
     run: Run
     there: int
     linked: int
     cut: int
-    spare: int  # shards that more than one source holds
+    spare: int  # shards that several sources have
     attempts: int
 
 
 def begin_union(union: Union, storage: Storage) -> Run:
-    """The union's run with its manifest and plan, made where it does not exist yet.
+    """Open the union's run with its manifest and plan, or create it.
 
-    InputError when another run stands there.
+    InputError where there is another run.
     """
     if not storage.exists("manifest.json"):
         publish(storage, "manifest.json", encode_record(union.manifest))
@@ -52,7 +52,7 @@ def begin_union(union: Union, storage: Storage) -> Run:
         ("layout", run.layout, union.layout),
     ):
         if found != asked:
-            problem = f"{found}, where the merged run has {asked}"
+            problem = f"is {found}, but {asked} in the merged run"
             raise InputError(f"{storage.url}/manifest.json", field, problem, "Choose a new --out")
     run.grow(union.plan.n, union.plan.created)
     return run
@@ -61,7 +61,7 @@ def begin_union(union: Union, storage: Storage) -> Run:
 def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUnion:
     """Write the union into its run; `tick` is called for every shard and every attempt.
 
-    InputError where a source lacks a committed file, or one that must be cut is damaged.
+    InputError where a source lacks a committed file, or a file to split is damaged.
     """
     before = run.committed()
     wanted = [union.kept[shard] for shard in sorted(union.kept)]
@@ -86,7 +86,7 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUni
 
 
 def replace_record(storage: Storage, key: str, record: bytes) -> None:
-    """Write a record that may change, its copy first; nothing is touched where both are so already."""
+    """Write a record that may change, its copy first; unchanged ones are not written."""
     for name in (copy_key(key), key):
         if storage.get(name, MAX_RECORD_BYTES) != record:
             storage.put(name, record)
@@ -94,13 +94,13 @@ def replace_record(storage: Storage, key: str, record: bytes) -> None:
 
 
 def _link(union: Union, run: Run, holding: Holding) -> bool:
-    """Take a source's shard over as it is; whether it became the union's."""
+    """Link a source's shard; return whether it became the union's."""
     source, commit = union.runs[holding.source], union.commit_of(holding)
     source.check_files(commit)
     folder = shard_folder(holding.shard, holding.attempt)
     keys = [f"{folder}/{entry.path}" for entry in commit.files]
     largest = max((entry.size for entry in commit.files), default=0)
-    # Another merge may be at this very attempt, and have committed it.
+    # Another merge may have committed this attempt.
     with run.nothing_left_behind(holding.shard, holding.attempt):
         run.storage.adopt_many(source.storage, zip(keys, keys, strict=True), largest)
         run.storage.sync(keys)
@@ -108,7 +108,7 @@ def _link(union: Union, run: Run, holding: Holding) -> bool:
 
 
 def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
-    """Write pieces of one shard of a source as shards of their own; whether each became the union's."""
+    """Write pieces of a source's shard as shards; return for each whether it became the union's."""
     source = union.runs[holdings[0].source]
     whole = union.commit_of(holdings[0])
     arrays = read_shard(source, holdings[0].of)
@@ -140,12 +140,12 @@ def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
 
 
 def _is_lost(run: Run, holding: Holding) -> bool:
-    """Whether the place has this shard from another attempt than was planned."""
+    """Whether the output has this shard from another attempt than planned."""
     return run.commit_of(holding.shard).attempt != holding.name
 
 
 def _without(union: Union, lost: Iterable[Holding]) -> Union:
-    """The union after others were faster in committing some of its shards."""
+    """The union after other processes committed some of its shards."""
     kept, spare = dict(union.kept), dict(union.spare)
     for holding in lost:
         spare[holding.shard] = (*spare.get(holding.shard, ()), kept.pop(holding.shard))
@@ -170,13 +170,13 @@ def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) 
 def _put(storage: Storage, key: str, record: bytes, is_there: bool) -> None:
     if not is_there:
         storage.put_new(key, record)
-    elif storage.get(key, MAX_RECORD_BYTES) != record:  # what was known of an attempt was less
+    elif storage.get(key, MAX_RECORD_BYTES) != record:  # the existing record has less information
         storage.put(key, record)
         storage.sync([key])
 
 
 def _given_up(union: Union) -> dict[int, QuarantineRecord]:
-    """Records of the shards that some source gave up and none has, by shard."""
+    """Records of the shards that are quarantined in a source and committed in none, by shard."""
     found: dict[int, QuarantineRecord] = {}
     scenes = union.layout.scenes_per_shard
     for source, run in enumerate(union.runs):
@@ -189,7 +189,7 @@ def _given_up(union: Union) -> dict[int, QuarantineRecord]:
 
 
 def _lineage(union: Union) -> dict[ShardOrigin, list[int]]:
-    """The shards of each origin. Where several sources have a shard from one attempt, the first by order."""
+    """The shards of each origin; of several sources with a shard from one attempt, the first."""
     origins = [Origins(run) for run in union.runs]
     shards: dict[ShardOrigin, list[int]] = {}
     for source, known in enumerate(origins):
@@ -201,7 +201,7 @@ def _lineage(union: Union) -> dict[ShardOrigin, list[int]]:
     for shard, holding in union.kept.items():
         same = [h for h in (holding, *union.spare.get(shard, ())) if h.name == holding.name]
         claims = {origins[h.source].of(h.of) for h in same}
-        # A merge that was killed had no time to say where the shards at its place come from.
+        # A killed merge may not have written the origins of its shards.
         others = claims - {own} if len(claims) > 1 else claims
         shards.setdefault(min(others), []).append(shard)
     return shards

@@ -1,8 +1,7 @@
-"""Seal: one flat Zarr v3 store over the committed shards, which stock readers open.
+"""Seal runs: one flat Zarr v3 store over the committed shards, which any Zarr reader opens.
 
-Chunks are the shards' files (hard links, or copies by an object store's server), so sealing encodes
-nothing; metadata is new. Shards are packed in order, and rows beyond the end are cut by the arrays'
-shape alone.
+Chunks are the shards' files (hard links, or copies by the object store's server), so no data is encoded;
+metadata is new. Shards are packed in order, and rows beyond the end are cut by the arrays' shape.
 """
 
 from __future__ import annotations
@@ -16,18 +15,18 @@ __all__ = ["SEALED", "SealedPart", "SealedRoot", "seal", "sealed_metadata", "sea
 
 
 def seal(place: Storage) -> str:
-    """Lay data.zarr over the committed shards of the run, or of the merged runs, at `place`; its address.
+    """Make data.zarr over the committed shards of the run, or merged runs, at `place`; return its address.
 
-    Shards in quarantine or undone are left out. An older store is replaced whole, or stays whole; linked
-    files become read-only. InputError when nothing is committed, a committed file is missing or of another
-    size, merged runs have other arrays, or the disk or the server refuses.
+    Quarantined and missing shards are omitted. An older store is replaced atomically; linked files become
+    read-only. InputError when no shard is committed, a committed file is missing or of another size, merged
+    runs have different arrays, or the disk or the server fails.
     """
     contents = read_contents(place)
     metadata = sealed_metadata(contents)
     if place.folder is not None:
         seal_folder(contents, place.folder, metadata)
     else:
-        # Loaded here: who works on a disk does not wait for the client of object stores.
+        # Imported here: local runs need no client of object stores.
         from datagen.schemas.sealing.remote import seal_prefix
 
         seal_prefix(contents, metadata)
@@ -35,7 +34,7 @@ def seal(place: Storage) -> str:
 
 
 def unseal(place: Storage) -> None:
-    """Remove data.zarr at `place`, where there is one. The shards' files stay. InputError as `seal`."""
+    """Remove data.zarr at `place`, if any. The shards' files are kept. InputError as `seal`."""
     if place.folder is not None:
         unseal_folder(place.folder)
     else:

@@ -1,4 +1,4 @@
-"""What a sealed store holds: which shards, in which order, and where their files lie."""
+"""The content of a sealed store: shards in order, and their files."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from datagen.schemas.shard_files import TABLES, chunk_key, chunk_rows, group_met
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
-# Far above any run that can be made; what asks for more was made up.
+# Far above any real run.
 MOST_SHARDS = 10_000_000
-# The root's metadata names them one by one, and is read as a record is.
+# The root's metadata lists them one by one, and is as limited as a record.
 _MOST_MISSING = 500_000
 
 
 @dataclass(frozen=True)
 class SealedShard:
-    """One committed shard and the rows that the store has of it."""
+    """One committed shard and its rows in the store."""
 
-    folder: str  # of its files, below the place
+    folder: str  # of its files, relative to the sealed path
     scenes: int
     samples: int
 
 
 @dataclass(frozen=True)
 class SealedRun:
-    """What one run gives to the store. `n` is read once: the run may grow meanwhile."""
+    """The shards of one run in the store. `n` is read once: the run may grow meanwhile."""
 
     run: Run
     n: int
@@ -42,7 +42,7 @@ class SealedRun:
 
 
 class RowsDigest:
-    """The digest of a store's rows: whose shards they are, and which files hold them, in their order."""
+    """Digest of a store's rows: over its shards and their files, in order."""
 
     def __init__(self) -> None:
         self._digest = sha256()
@@ -54,7 +54,7 @@ class RowsDigest:
             self._digest.update(f"{entry.path} {entry.sha256}\n".encode())
 
     def hexdigest(self) -> str:
-        """The digest of what was added so far."""
+        """The digest so far."""
         return self._digest.hexdigest()
 
 
@@ -71,7 +71,7 @@ class Contents:
 
     @property
     def is_merged(self) -> bool:
-        """Whether the rows are those of several runs."""
+        """Whether the store has several runs."""
         return len(self.runs) > 1
 
     def rows(self, table: Table) -> int:
@@ -79,10 +79,7 @@ class Contents:
         return sum(shard.scenes if table == "scene" else shard.samples for shard in self.shards)
 
     def chunks(self, field: Field) -> Iterator[tuple[int, str, str]]:
-        """Every chunk of an array: (its shard's place in the store, its key in the place, its file's name).
-
-        The name is that in the array's folder of the store.
-        """
+        """Yield every chunk of an array: (position of its shard, key of its file, file name in the store)."""
         table: Table = "scene" if field in self.schema.scene_fields else "sample"
         rows = rows_per_shard(self.layout, table)
         step = chunk_rows(self.schema, field, rows)
@@ -94,13 +91,13 @@ class Contents:
 
 
 def read_contents(place: Storage, check: bool = True) -> Contents:
-    """What a store over the run or the merged runs at `place` holds now.
+    """Return the current content of a store over the run, or the merged runs, at `place`.
 
-    Rows of a run are those of its committed shards among the planned ones, in order; runs follow each
-    other. Only where the store ends are rows beyond n cut: all shards before are whole.
+    Rows are those of the committed planned shards in order, run after run. Rows beyond n are cut only at the
+    end of the store.
 
-    With `check`, InputError when a committed file is missing or of another size. Always when nothing is
-    committed, when a commit names other files than a shard has, or when merged runs cannot share arrays.
+    With `check`, InputError when a committed file is missing or of another size. Always when no shard is
+    committed, when a commit names other files than a shard has, or when merged runs have different arrays.
     """
     runs = open_runs(place)
     first = runs[0]
@@ -125,8 +122,8 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
             digests.append(digest.hexdigest())
         absent = ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(done))
         if len(absent) > _MOST_MISSING:
-            problem = f"{len(absent)} planned shards are missing, and a store names at most {_MOST_MISSING}"
-            mend = "Make more of them with `datagen resume`, or a smaller run"
+            problem = f"{len(absent)} planned shards are missing, but a store lists at most {_MOST_MISSING}"
+            mend = "Make more of them with `datagen resume`, or make a smaller run"
             raise InputError(run.storage.url, "plans", problem, mend)
         sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
     if not shards:
@@ -138,7 +135,7 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
 
 
 def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
-    """The commits, once their files are found to be there; several at a time on an object store."""
+    """The commits, after a check that their files exist; several at a time on an object store."""
 
     def check(commit: Commit) -> Commit:
         run.check_files(commit)
@@ -160,8 +157,8 @@ def _refuse_other_arrays(first: Run, run: Run) -> None:
             raise InputError(
                 f"{run.storage.url}/manifest.json",
                 field,
-                f"{other}, where {first.storage.url} has {one}: one store cannot hold both",
-                "Read them as two runs",
+                f"is {other}, but {one} in {first.storage.url}: one store cannot hold both",
+                "Read them as separate runs",
             )
 
 
@@ -181,6 +178,6 @@ def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> Non
         raise InputError(
             f"{run.storage.url}/{shard_folder(commit.shard, commit.attempt)}",
             "files",
-            f"the commit lacks or adds {len(odd)} files, first {odd[0]}",
-            "Mend it with `datagen repair`",
+            f"{len(odd)} files are missing or extra, first {odd[0]}",
+            "Repair it with `datagen repair`",
         )

@@ -1,4 +1,4 @@
-"""A sealed store on a local disk: hard links to the shards' files, put in place by one rename."""
+"""A sealed store on a local disk: hard links to the shards' files, published by one rename."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from datagen.schemas.storage import storage_error
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
-# What a kernel or a file system answers that cannot exchange two names.
+# Error codes of kernels and file systems that cannot exchange two names.
 _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes]) -> None:
-    """Make `folder`/data.zarr from the chunks of the contents and the metadata, at once and whole.
+    """Make `folder`/data.zarr from the chunks of the contents and the metadata, atomically.
 
-    The store is completed and made durable beside it, as data.zarr.<hex>.partial, and then takes the
-    name. Where one stands, the two exchange their names in one step (Linux: renameat2), so that every
-    moment has a whole store under the name; only where that is not to be had, the old one steps aside
-    first, and a kill between the two renames leaves none. InputError when the disk refuses.
+    The store is written durably as data.zarr.<hex>.partial and then renamed. An existing store is exchanged
+    with it in one step (Linux: renameat2), so that there is always a complete store; where that is not
+    supported, the old one is renamed first, and a kill between the two renames leaves none. InputError when
+    the disk fails.
     """
     draft = draft_of(folder)
     try:
@@ -51,7 +51,7 @@ def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes])
 
 
 def unseal_folder(folder: Path) -> None:
-    """Remove `folder`/data.zarr: first its name, then what it was. InputError when the disk refuses."""
+    """Remove `folder`/data.zarr: rename it, then delete it. InputError when the disk fails."""
     draft = draft_of(folder)
     try:
         (folder / SEALED).rename(draft)
@@ -65,12 +65,12 @@ def unseal_folder(folder: Path) -> None:
 
 
 def draft_of(folder: Path) -> Path:
-    """A new name for a store that is not complete or not wanted any more; `gc` knows such names."""
+    """A new name for an incomplete or replaced store; `gc` removes such names."""
     return folder / f"{SEALED}.{secrets.token_hex(8)}.partial"
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder, a file or a link as far as the disk lets."""
+    """Remove a folder, a file or a link as far as possible."""
     if path.is_symlink() or path.is_file():
         path.unlink(missing_ok=True)
     else:
@@ -94,7 +94,7 @@ def _link(contents: Contents, field: Field, draft: Path) -> None:
         mode = target.lstat().st_mode
         if not stat.S_ISREG(mode):
             place = f"{contents.place.url}/{source}"
-            raise InputError(place, "", "not a plain file", "Restore the file from a copy")
+            raise InputError(place, "", "is not a regular file", "Restore the file from a copy")
         if mode & 0o777 != 0o444:
             target.chmod(0o444)
 
@@ -113,9 +113,9 @@ def _sync_folder(path: Path) -> None:
 
 
 def _take_the_name(draft: Path, sealed: Path) -> Path:
-    """Give the finished store its name; what an older one is called by then.
+    """Rename the finished store; return the new name of an older one.
 
-    Whoever unseals, or seals for another job of the run, may be between any two lines here.
+    Another process may seal or unseal the run at any moment.
     """
     while True:
         try:
@@ -140,7 +140,7 @@ def _take_the_name(draft: Path, sealed: Path) -> Path:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Let two existing files or folders exchange their names in one step; False where that is unknown."""
+    """Exchange the names of two files or folders atomically; False where that is not supported."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False

@@ -1,4 +1,4 @@
-"""The zarr.json files of a sealed store, and what its root says of the runs below it."""
+"""The zarr.json files of a sealed store, and the runs listed in its root."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROOT = "zarr.json"
 
 
 class SealedPart(BaseModel):
-    """One run in a sealed store: what it wanted, and the shards among them that were not there."""
+    """One run in a sealed store: the samples wanted, and the missing shards."""
 
     spec_hash: str
     n: int
@@ -29,25 +29,25 @@ class SealedPart(BaseModel):
 
 
 class SealedRoot(BaseModel):
-    """What the root zarr.json of a sealed store says; one part for an ordinary run."""
+    """The content of the root zarr.json of a sealed store; one part for a single run."""
 
     parts: list[SealedPart]
-    # sha256 over the digests of all files that its shards have, in order; "" where it is not told.
+    # sha256 over the digests of all files of its shards, in order; "" where unknown.
     rows_sha256: str = ""
 
     def part(self, spec_hash: str) -> SealedPart | None:
-        """What it says of one run; None where it has nothing of it."""
+        """The entry of one run; None where there is none."""
         return next((part for part in self.parts if part.spec_hash == spec_hash), None)
 
 
 def sealed_root(place: Storage) -> SealedRoot | None:
-    """What data.zarr at `place` says of itself, or None where it does not exist or is not ours."""
+    """Read the root of data.zarr at `place`; None where it does not exist or has another form."""
     data = place.get(f"{SEALED}/{ROOT}", MAX_RECORD_BYTES)
     if data is None:
         return None
     try:
         attributes = json.loads(data)["attributes"]
-        if "parts" not in attributes:  # an ordinary run's
+        if "parts" not in attributes:  # a single run
             attributes = {"parts": [attributes], "rows_sha256": attributes.get("rows_sha256", "")}
         return SealedRoot.model_validate(attributes)
     except (ValueError, KeyError, TypeError, RecursionError, ValidationError):
@@ -55,7 +55,7 @@ def sealed_root(place: Storage) -> SealedRoot | None:
 
 
 def sealed_metadata(contents: Contents) -> dict[str, bytes]:
-    """zarr.json files of the store by path, the root's with consolidated metadata."""
+    """zarr.json files of the store by path; the root's has consolidated metadata."""
     first = contents.runs[0]
     attributes = root_attributes(contents.schema, contents.layout, first.run.manifest.spec_hash)
     if contents.is_merged:
@@ -69,7 +69,7 @@ def sealed_metadata(contents: Contents) -> dict[str, bytes]:
     make = default_buffer_prototype().buffer.from_bytes
     store = {path: make(data) for path, data in files.items()}
     with warnings.catch_warnings():
-        # Consolidated metadata is not yet in the Zarr v3 text; every reader we name knows it.
+        # Consolidated metadata is not in the Zarr v3 specification yet; common readers support it.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(MemoryStore(store), zarr_format=3)
     return {path: buffer.to_bytes() for path, buffer in store.items()}

@@ -1,7 +1,7 @@
-"""A sealed store in an object store: server-side copies of the chunks, published by its root's zarr.json.
+"""A sealed store in an object store: server-side copies of the chunks, published by the root zarr.json.
 
-Nothing can be renamed there. So the root is what makes a store: without it `zarr.open` finds none, and
-its consolidated metadata alone says how long the arrays are.
+Objects cannot be renamed, so the root publishes the store: without it `zarr.open` finds none, and only its
+consolidated metadata has the lengths of the arrays.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from datagen.schemas.storage import Storage
 
 
 def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
-    """Make data.zarr below the place from the chunks of the contents and the metadata, root last.
+    """Make data.zarr from the chunks of the contents and the metadata, root last.
 
-    A store whose shards are the first of the new one's stays open meanwhile: chunks are added to it, and
-    the root switches over. Any other is removed first, from its root on. A kill leaves the old store, the
-    new one, or none; what lies there without a root counts as nothing.
+    A store whose shards are the first of the new one stays readable: chunks are added, and the root is
+    replaced. Any other store is removed first, root first. A kill leaves the old store, the new one, or none;
+    objects without a root do not count.
     """
     place = contents.place
     old = sealed_root(place)
@@ -30,23 +30,23 @@ def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
     _copy_chunks(contents, kept, tidy=True)
     place.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
     place.put(f"{SEALED}/{ROOT}", metadata[ROOT])
-    # Whoever seals or unseals at the same time may have removed chunks of these shards before the root
-    # stood. What he published since is his own to look after.
+    # Another process that seals or unseals may have removed chunks before the root was written. It repairs
+    # what it publishes itself.
     _copy_chunks(contents, len(contents.shards), tidy=False)
 
 
 def unseal_prefix(place: Storage) -> None:
-    """Remove data.zarr below the place: its root, then the arrays' metadata, so that nothing opens while
-    chunks go."""
+    """Remove data.zarr: its root, then the arrays' metadata, then the chunks, so that it is never readable
+    in part."""
     place.delete([f"{SEALED}/{ROOT}"])
     place.delete([f.key for f in place.list(SEALED) if f.key.endswith(f"/{ROOT}")])
     place.delete(f.key for f in place.list(SEALED))
 
 
 def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
-    """Copy all chunks but those that the first `kept` shards left there; `tidy` removes what is no chunk.
+    """Copy all chunks except those of the first `kept` shards; `tidy` removes objects that are no chunks.
 
-    What a killed seal left beyond them may be of other shards, and is copied anew.
+    Chunks of a killed seal beyond those may belong to other shards, and are copied again.
     """
     for table in TABLES:
         for field in contents.schema.table(table):
@@ -56,7 +56,7 @@ def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
 
 
 def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
-    """Copy an array's chunks; keys of what is none of them."""
+    """Copy an array's chunks; return the keys of other objects."""
     place, folder = contents.place, f"{SEALED}/{field.name}"
     there = {f.key.removeprefix(f"{folder}/") for f in place.list(folder)} - {ROOT}
 

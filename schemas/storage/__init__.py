@@ -1,7 +1,7 @@
-"""Where a run lives: a folder or an object-store prefix behind one small set of verbs.
+"""Storage of a run: a local folder or an object-store prefix, behind one small interface.
 
-A local run and a run on S3 follow one protocol: write, make durable, and publish by a create-only put.
-Nothing relies on renaming what others can see.
+Local and S3 runs follow one protocol: write, make durable, and publish by a create-only put. No visible
+file is renamed.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Storage", "StoredFile", "open_storage", "storage_error"]
 
-# Names without end parts: no way up, no way to the root, nothing that a terminal would act on.
+# Relative names without `..`, empty parts or control characters.
 _KEY = re.compile(r"(?!\.{0,2}(?:/|\Z))(?:[^/\x00-\x1f\x7f\\]+(?:/(?!\.{0,2}(?:/|\Z))|\Z))+")
 
-_AT_ONCE = 16  # requests under way in this process
+_AT_ONCE = 16  # concurrent requests of this process
 
 Result = TypeVar("Result")
 Item = TypeVar("Item")
@@ -38,9 +38,9 @@ Item = TypeVar("Item")
 class Storage:
     """Files under one root, named by keys with forward slashes.
 
-    Every failure is an `InputError` that names the root, the key and the mend; so is a key that is
-    absolute, has empty parts or leads up. `folder` is the root on this machine, or None when the storage
-    is remote. On a disk no symbolic link below the root is followed, and pipes and devices are refused.
+    Every failure is an `InputError` with the root, the key and the fix, also for keys that are absolute, have
+    empty parts or lead up. `folder` is the root on this machine, None for remote storage. On a disk, symbolic
+    links below the root are not followed, and pipes and devices are refused.
     """
 
     def __init__(self, files: LocalFiles | RemoteObjects) -> None:
@@ -50,7 +50,7 @@ class Storage:
         self.url = str(files.folder) if local else files.url
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        # Workers reopen it by address: connections do not cross process borders.
+        # Workers reopen it by address: connections cannot be pickled.
         if isinstance(self._files, LocalFiles):
             return (_local, (self._files.root, self._files.prefix))
         return (open_storage, (self.url, False))
@@ -59,24 +59,24 @@ class Storage:
         return f"Storage({self.url!r})"
 
     def below(self, key: str) -> Storage:
-        """The storage whose root is a folder of this one, which need not exist."""
+        """The storage of a subfolder, which need not exist."""
         return Storage(self._files.below(_checked(self.url, key)))
 
     def put(self, key: str, data: bytes) -> None:
-        """Write a file whole; one of that name is replaced. Not durable before `sync`."""
+        """Write a file, or replace it. Not durable before `sync`."""
         self._try(key, lambda: self._files.put(key, data))
 
     def put_many(self, files: Mapping[str, bytes]) -> None:
-        """Write many files whole, as `put` does each; remote storage takes several at once."""
+        """Write many files as `put` does; several at once on remote storage."""
         for key in files:
             _checked(self.url, key)
         _exhaust(self.concurrent_map(lambda item: self.put(*item), files.items()))
 
     def put_new(self, key: str, data: bytes) -> bool:
-        """Write a file durably unless the key exists; False when it does with other bytes.
+        """Write a file durably unless the key exists; False where it exists with other bytes.
 
-        One racer wins. A store may write and yet answer with an error, and the repeated request then
-        finds the key taken: by these very bytes, which is a success.
+        One of several racing writers wins. Where a store wrote the file but responded with an error, the
+        repeated request finds the key with these bytes, which counts as a success.
         """
         if self._try(key, lambda: self._files.create(key, data)):
             return True
@@ -85,25 +85,25 @@ class Storage:
         except FileTooLarge:
             return False
         if same:
-            self.sync([key])  # whoever wrote it may not have come so far
+            self.sync([key])  # its writer may have stopped before
         return same
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        """The file's bytes, or None when there is no such file. Refuses one above the limit."""
+        """The file's bytes, or None where it does not exist. InputError above the limit."""
         return self._try(key, lambda: self._files.get(key, limit_bytes))
 
     def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
-        """(key, bytes) of many files, as `get` gives each, in the order of the keys.
+        """Yield (key, bytes) of many files as `get` does, in the order of the keys.
 
-        Remote storage reads several at once; at most some tens of files are held.
+        Remote storage reads several at once; at most some tens of files are in memory.
         """
         return self.concurrent_map(lambda key: (key, self.get(key, limit_bytes)), keys)
 
     def concurrent_map(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """What `do`, which asks this storage, gives for each item, in their order; the first failure ends it.
+        """Yield `do(item)`, which uses this storage, for each item in order; the first exception ends it.
 
-        Remote storage is asked several things at once, so that `do` must use none of the verbs for many.
-        None of them is under way any more when the iterator has ended.
+        Calls are concurrent for remote storage, so `do` must not use the methods for many files. None is
+        running after the iterator has ended.
         """
         if isinstance(self._files, LocalFiles):
             return map(do, items)
@@ -123,7 +123,7 @@ class Storage:
             raise storage_error(f"{self.url}/{prefix}" if prefix else self.url, e) from e
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove files; those that do not exist are passed over."""
+        """Remove files; missing ones are ignored."""
         if isinstance(self._files, LocalFiles):
             for key in keys:
                 self._try(key, lambda key=key: self._files.delete([key]))
@@ -131,21 +131,20 @@ class Storage:
             self._files.delete(_checked(self.url, key) for key in keys)
 
     def remove_empty(self, folder: str) -> None:
-        """Remove a folder in which no file is left; object stores have none."""
+        """Remove a folder without files; object stores have no folders."""
         files = self._files
         if isinstance(files, LocalFiles):
             self._try(folder, lambda: files.remove_empty(folder))
 
     def link_or_copy(self, source: str, target: str) -> None:
-        """A second name for the same bytes; one of that name is replaced. See `adopt`."""
+        """Link or copy a file to a second key, which is replaced. See `adopt`."""
         self.adopt(self, source, target)
 
     def adopt(self, source: Storage, source_key: str, key: str, limit_bytes: int = 2**31) -> None:
-        """Take over a file of another storage; one of that name is replaced. Not durable before `sync`.
+        """Link or copy a file of another storage, replacing an existing one. Not durable before `sync`.
 
-        No byte is moved where it can be helped: a hard link on one file system, else a copy; a copy by
-        the server within one bucket. Else the file is read and written here. InputError when there is no
-        such file, or when bytes that must be read are more than the limit.
+        It is a hard link on one file system, a copy by the server within one bucket, else the file is read
+        and written here. InputError where it does not exist, or where a file to be read is above the limit.
         """
         _checked(source.url, source_key)
         ours, theirs = self._files, source._files
@@ -166,18 +165,18 @@ class Storage:
             raise InputError(f"{source.url}/{source_key}", "", "no such file", mend) from e
 
     def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
-        """Take over many files of another storage, given as (its key, key here), as `adopt` does each.
+        """Link or copy many files of another storage, given as (its key, key here), as `adopt` does.
 
-        Where one of the two is remote, several are under way at once.
+        Several at once where one of the two is remote.
         """
         asked = source if isinstance(self._files, LocalFiles) else self
         _exhaust(asked.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files and the folders that name them survive a power cut.
+        """Make files and their folders durable.
 
-        Locally this calls fsync on each file and on each folder up to the root; an object store
-        has already done it when a put returns.
+        On a disk this calls fsync on each file and on each folder up to the root; an object store is durable
+        when a put returns.
         """
         files = self._files
         if isinstance(files, LocalFiles):
@@ -194,30 +193,30 @@ class Storage:
 
 
 def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> Storage:
-    """Storage at a folder or a URL (`s3://bucket/prefix`).
+    """Open the storage at a folder or a URL (`s3://bucket/prefix`).
 
-    With `probe`, it is refused unless a create-only put gives exactly one winner: commits rest on
-    that. With `create`, a missing folder is made; without, it is an error.
+    With `probe`, InputError unless create-only puts work, which commits depend on. With `create`, a missing
+    folder is created; without, it is an error.
     """
     text = str(place)
     if "\0" in text or not text.strip():
-        raise InputError(repr(text), "", "not the name of a folder", "Name a folder or an s3:// address")
-    if text.startswith("s3:") and not text.startswith("s3://"):  # a slip that would become a folder here
+        raise InputError(repr(text), "", "is not the name of a folder", "Name a folder or an s3:// address")
+    if text.startswith("s3:") and not text.startswith("s3://"):  # a typing error that would become a folder
         raise InputError(text[:200], "", "does not name a bucket", "Give s3://bucket/prefix")
     scheme, colon, rest = text.partition("://")
     if colon and scheme == "s3":
-        # Loaded here: who works on a disk does not wait for the client.
+        # Imported here: local runs need no client.
         from datagen.schemas.storage.remote_objects import RemoteObjects
 
         storage = Storage(RemoteObjects(text))
     elif colon and scheme != "file":
-        problem = "neither a folder nor an s3:// address"
+        problem = "is neither a folder nor an s3:// address"
         raise InputError(
             f"{scheme}://...", "", problem, "Name a folder or an s3:// address that you can write"
         )
     else:
         folder = Path(rest if colon else text).expanduser().absolute()
-        refuse_not_utf8(str(folder))  # records name it
+        refuse_not_utf8(str(folder))  # records contain it
         storage = _open_folder(folder, create)
     if probe:
         _probe(storage)
@@ -233,7 +232,7 @@ def _open_folder(folder: Path, create: bool) -> Storage:
             raise InputError(folder, "", problem, "Name the folder of a run")
         return _local(folder, ())
     except FileExistsError as e:
-        raise InputError(folder, "", "a file stands there", "Name a folder that is new or holds a run") from e
+        raise InputError(folder, "", "is a file", "Name a new folder, or the folder of a run") from e
     except OSError as e:
         raise storage_error(folder, e) from e
 
@@ -249,7 +248,7 @@ def _probe(storage: Storage) -> None:
             raise InputError(
                 storage.url,
                 "",
-                "create-only writes are not honoured here, so two jobs could overwrite each other",
+                "does not support create-only writes, so two jobs could overwrite each other",
                 "Use a local disk or an object store with conditional writes",
             )
     finally:
@@ -258,8 +257,8 @@ def _probe(storage: Storage) -> None:
 
 def _checked(url: str, key: str) -> str:
     if not _KEY.fullmatch(key):
-        problem = "not the name of a file below the root"
-        raise InputError(f"{url}/{key!r}"[:300], "", problem, "Remove what names it")
+        problem = "is not the name of a file below the root"
+        raise InputError(f"{url}/{key!r}"[:300], "", problem, "Remove the record that names it")
     return key
 
 

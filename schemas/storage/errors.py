@@ -1,4 +1,4 @@
-"""What is told when files cannot be read or written: one line that names the place and the mend."""
+"""One-line errors with a fix for files and objects that cannot be read or written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 
-# What any write may meet, whatever is written: the machine is at fault, and no shard or program.
+# Errors of the machine that any write can cause, whatever the shard.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 MACHINE = (*FULL, *FORBIDDEN, errno.EMFILE, errno.ENAMETOOLONG)
@@ -23,56 +23,56 @@ _MENDS = {
     errno.EACCES: "Give yourself read and write permission there, or choose another folder",
     errno.EPERM: "Choose a folder on a file system that allows this (hard links, permissions)",
     errno.EROFS: "Choose a folder that can be written",
-    errno.ENOTDIR: "A file stands where a folder is needed: remove it or choose another folder",
-    errno.EISDIR: "A folder stands where a file is needed: remove it or choose another folder",
+    errno.ENOTDIR: "A file is where a folder is needed: remove it or choose another folder",
+    errno.EISDIR: "A folder is where a file is needed: remove it or choose another folder",
     errno.ENAMETOOLONG: "Choose a shorter path",
     errno.EMFILE: "Raise the limit of open files (ulimit -n)",
     errno.EIO: "Check the disk",
 }
-_OTHER_MEND = "Check that the place exists, is reachable and can be written"
+_OTHER_MEND = "Check that the path exists, is reachable and can be written"
 
-_RESUME = "then go on with `datagen resume`"
+_RESUME = "then continue with `datagen resume`"
 _KEYS_MEND = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
 _ENDPOINT_MEND = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
 
 
 class StoreUnavailable(InputError):
-    """An object store that refuses or does not answer, after all that was worth repeating.
+    """An object store that refuses or does not respond, after all retries.
 
-    It concerns whoever uses the store, not one shard: a job that meets it cannot go on.
+    It concerns the whole job, not one shard: the job stops.
     """
 
 
 class NotARegularFile(InputError):
-    """A link, a pipe, a socket or a device, or folders within folders without end."""
+    """A link, a pipe, a socket or a device, or folders that are nested too deeply."""
 
 
 class FileTooLarge(InputError):
-    """A file that is not read because of its size."""
+    """A file that is too large to read."""
 
 
 @dataclass(frozen=True)
 class RequestFailure:
-    """What went wrong in one request to an object store. `passing`: another try may succeed."""
+    """The failure of one request to an object store. `passing`: a retry may succeed."""
 
     problem: str
     mend: str
     passing: bool
 
     def at(self, place: str) -> StoreUnavailable:
-        """The error to raise."""
+        """The error for this failure."""
         return StoreUnavailable(place, "", self.problem, self.mend)
 
 
 def storage_error(place: str | Path, error: OSError) -> InputError:
-    """The one-line error for a failed file operation, with the mend that its errno asks for."""
+    """The one-line error for a failed file operation, with the fix for its errno."""
     problem = os.strerror(error.errno) if error.errno is not None else str(error)
     return InputError(place, "", problem, _MENDS.get(error.errno or 0, _OTHER_MEND))
 
 
 def machine_error(error: BaseException | None, codes: Sequence[int] = MACHINE) -> InputError | None:
-    """The one-line error where one of `codes` is behind an exception; None where none is."""
+    """The one-line error where an exception has one of `codes`; else None."""
     known = error if isinstance(error, InputError) else None
     while error is not None:
         if isinstance(error, OSError) and error.errno in codes:
@@ -86,25 +86,25 @@ def too_large(place: str, size: int, limit_bytes: int) -> FileTooLarge:
     return FileTooLarge(
         place,
         "",
-        f"{size} bytes, more than the {limit_bytes} that such a file can have",
-        "It was not written by this program: restore the run from a copy, or remove the file",
+        f"has {size} bytes, more than the {limit_bytes} that such a file can have",
+        "It was not written by datagen: restore the run from a copy, or remove the file",
     )
 
 
 def store_trouble(error: Exception) -> RequestFailure:
-    """What an exception of the object store's client means.
+    """Translate an exception of the object store's client.
 
-    Of its text only the status, the server's error code and the kind of failure are told on: addresses
-    and headers in it may hold credentials.
+    Only the status, the server's error code and the kind of failure are reported: addresses and headers in
+    the text may contain credentials.
     """
     text = str(error)
     status = _found(r"non-2xx status code: ([0-9]{3})", text) or _found(r"status: ([0-9]{3})", text)
     code = _found(rf"<Code>({_TRUSTED})</Code>", text)
-    if "//169.254." in text:  # where a machine of a cloud asks for its role
+    if "//169.254." in text:  # address at which a cloud machine requests its role
         asked_too_often = status.startswith("5") or status == "429"
         return RequestFailure("no credentials are set", _KEYS_MEND, passing=asked_too_often)
     if code == "NoSuchBucket":
-        mend = "Make the bucket first, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
+        mend = "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
         return RequestFailure("no such bucket", mend, passing=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
         mend = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
@@ -115,27 +115,27 @@ def store_trouble(error: Exception) -> RequestFailure:
         shown = f"{status} {code}" if code else status
         if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
             mend = f"Wait until the store has recovered, {_RESUME}"
-            return RequestFailure(f"the store answers {shown}", mend, passing=True)
-        mend = "Check that AWS_ENDPOINT_URL is an S3 store and knows this request"
+            return RequestFailure(f"the store responds {shown}", mend, passing=True)
+        mend = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"
         return RequestFailure(f"the store refuses ({shown})", mend, passing=False)
-    if code:  # a copy that fails late answers 200 with an error in its body
+    if code:  # a copy that fails late responds 200 with an error in its body
         mend = f"Wait until the store has recovered, {_RESUME}"
-        return RequestFailure(f"the store answers {code}", mend, passing=True)
+        return RequestFailure(f"the store responds {code}", mend, passing=True)
     return _trouble_on_the_way(text)
 
 
 def _trouble_on_the_way(text: str) -> RequestFailure:
     kind = _found(r"HttpError \{\s*kind: ([A-Za-z]+)", text)
     if kind == "Connect":
-        why = "its name is not known" if "dns error" in text else "the connection fails"
+        why = "unknown host name" if "dns error" in text else "the connection fails"
         return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_MEND, passing=True)
     if kind == "Timeout":
-        mend = f"Check the network, or allow more with DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
-        return RequestFailure("the store does not answer in time", mend, passing=True)
+        mend = f"Check the network, or raise DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
+        return RequestFailure("the store does not respond in time", mend, passing=True)
     if kind in ("Request", "Interrupted", "Decode"):
-        return RequestFailure("the store breaks off its answers", _ENDPOINT_MEND, passing=True)
+        return RequestFailure("the store's response is cut off", _ENDPOINT_MEND, passing=True)
     mend = "Check that AWS_ENDPOINT_URL is an S3 store"
-    return RequestFailure("the store's answer is not that of an S3 store", mend, passing=False)
+    return RequestFailure("the response is not that of an S3 store", mend, passing=False)
 
 
 def _found(pattern: str, text: str) -> str:

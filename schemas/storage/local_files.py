@@ -1,8 +1,8 @@
-"""Files below one folder of this machine, reached without following a symbolic link.
+"""Files below one folder of this machine, opened without following symbolic links.
 
-A run may come from elsewhere and hold links to anything. So every verb walks down from the root by open
-folders, refuses what is neither a folder nor a plain file, and is not led out by a link that is put in
-its way meanwhile. Failures are OSErrors; what is refused is an InputError that names it.
+A run may come from another user and contain links to anything. Every method therefore walks down from the
+root through open folder descriptors, which also prevents races, and refuses all but folders and regular
+files. Failures are OSErrors; refusals are InputErrors.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from datagen.schemas.storage.errors import NotARegularFile, storage_error, too_l
 from datagen.schemas.storage.stored_file import StoredFile
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-# Enough to go through a folder, without permission to read it.
+# Enough to traverse a folder, without permission to read it.
 _STEP = getattr(os, "O_PATH", os.O_RDONLY) | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-# Without O_NONBLOCK the opening of a pipe waits for somebody at its other end.
+# Without O_NONBLOCK, opening a pipe waits for a writer.
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _DRAFT = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
@@ -37,7 +37,7 @@ _KINDS = {
 
 
 class LocalFiles:
-    """The files below `root`/`prefix`. The root itself may be a link: whoever named it meant it."""
+    """The files below `root`/`prefix`. The root itself, given by the user, may be a link."""
 
     def __init__(self, root: Path, prefix: tuple[str, ...] = ()) -> None:
         self.root, self.prefix = root, prefix
@@ -45,7 +45,7 @@ class LocalFiles:
 
     @staticmethod
     def make_root(folder: Path) -> None:
-        """Make a folder that survives a power cut with what is made in it."""
+        """Create a folder durably."""
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         for path in missing:
@@ -56,11 +56,11 @@ class LocalFiles:
                 os.close(fd)
 
     def below(self, key: str) -> LocalFiles:
-        """The files of a folder below, which need not exist; reached from the same root."""
+        """The files of a subfolder, which need not exist, from the same root."""
         return LocalFiles(self.root, (*self.prefix, *key.split("/")))
 
     def put(self, key: str, data: bytes) -> None:
-        """Write a file whole; one of that name is replaced."""
+        """Write a file, or replace it."""
         folders, name = _split(key)
         here = self._walk(folders, make=True)
         try:
@@ -71,9 +71,9 @@ class LocalFiles:
             os.close(here)
 
     def create(self, key: str, data: bytes) -> bool:
-        """Write a file durably unless the name is taken; False when it is.
+        """Write a file durably unless the name exists; False where it does.
 
-        The bytes are on disk before the name is, or a power cut could leave an empty file that counts.
+        The bytes are on disk before the name, so that a power cut cannot leave an empty file.
         """
         folders, name = _split(key)
         here = self._walk(folders, make=True)
@@ -90,7 +90,7 @@ class LocalFiles:
         return True
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        """The file's bytes, or None when there is no such file. InputError for one above the limit."""
+        """The file's bytes, or None where it does not exist. InputError above the limit."""
         try:
             fd = self._open_file(key)
         except FileNotFoundError:
@@ -132,7 +132,7 @@ class LocalFiles:
             os.close(here)
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove files; those that do not exist are passed over. A link is removed, not what it names."""
+        """Remove files; missing ones are ignored. Of a link, the link is removed."""
         for key in keys:
             folders, name = _split(key)
             with suppress(FileNotFoundError):
@@ -143,7 +143,7 @@ class LocalFiles:
                     os.close(here)
 
     def remove_empty(self, folder: str) -> None:
-        """Remove a folder with the folders in it, as far as they hold no file."""
+        """Remove a folder and its subfolders, where they hold no file."""
         folders, name = _split(folder)
         with suppress(FileNotFoundError):
             here = self._walk(folders)
@@ -156,7 +156,7 @@ class LocalFiles:
                 os.close(here)
 
     def take(self, source: LocalFiles, source_key: str, key: str) -> None:
-        """A second name for a file of `source`, or a copy where no link can be; replaces an older file."""
+        """Hard-link a file of `source`, or copy it where that is impossible; replaces an existing file."""
         from_folders, from_name = _split(source_key)
         folders, name = _split(key)
         there = source._walk(from_folders)
@@ -184,7 +184,7 @@ class LocalFiles:
     def sync(self, keys: Iterable[str]) -> None:
         """Call fsync on each file, and on each folder from there up to the root, leaves first.
 
-        InputError names the file or folder for which the disk refuses.
+        InputError names the file or folder where it fails.
         """
         folders: set[tuple[str, ...]] = set()
         for key in keys:
@@ -207,7 +207,7 @@ class LocalFiles:
             raise storage_error(self.folder / key, e) from e
 
     def _walk(self, folders: Sequence[str], make: bool = False, flags: int = _STEP) -> int:
-        """An open folder, whose descriptor the caller closes; with `make` missing ones are made."""
+        """Open a folder; the caller closes the descriptor. With `make`, missing ones are created."""
         here = os.open(self.root, flags & ~os.O_NOFOLLOW)
         for name in (*self.prefix, *folders):
             try:
@@ -237,8 +237,8 @@ class LocalFiles:
 
     def _list(self, folder: int, prefix: str, depth: int) -> Iterator[StoredFile]:
         if depth > _MAX_DEPTH:
-            mend = "It was not written by this program: remove it"
-            raise NotARegularFile(f"{self.folder}/{prefix}", "", "folders within folders without end", mend)
+            mend = "It was not written by datagen: remove it"
+            raise NotARegularFile(f"{self.folder}/{prefix}", "", "folders are nested too deeply", mend)
         with os.scandir(folder) as entries:
             for entry in entries:
                 key = prefix + entry.name
@@ -247,7 +247,7 @@ class LocalFiles:
                     is_folder = stat.S_ISDIR(seen.st_mode)
                     below = os.open(entry.name, _FOLDER, dir_fd=folder) if is_folder else -1
                 except FileNotFoundError:
-                    continue  # removed since the folder was read
+                    continue  # removed since the listing
                 if is_folder:
                     try:
                         yield from self._list(below, f"{key}/", depth + 1)
@@ -259,12 +259,12 @@ class LocalFiles:
                     yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
 
     def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
-        """Raise NotARegularFile for what is neither a file nor a folder."""
+        """Raise NotARegularFile for anything but a file or a folder."""
         kind = _KINDS.get(stat.S_IFMT(mode))
         if kind is not None:
             place = f"{self.folder}/{key}"
-            mend = "Remove it; where it stands for a file that you trust, put a copy of that file there"
-            raise NotARegularFile(place, "", f"{where or 'is '}{kind}, and a run has none", mend)
+            mend = "Remove it, or replace it by a copy of the file"
+            raise NotARegularFile(place, "", f"{where or 'is '}{kind}, which a run never has", mend)
 
     def _copy(self, key: str, draft: str, into: int) -> None:
         fd = self._open_file(key)
@@ -281,7 +281,7 @@ class LocalFiles:
 
 @contextmanager
 def _drafted(name: str, folder: int) -> Generator[str]:
-    """The name of a draft beside a file, which is gone when the block ends."""
+    """Give the name of a draft in a file's folder; it is removed when the block ends."""
     draft = f"{name}.{secrets.token_hex(8)}.part"
     try:
         yield draft
@@ -320,7 +320,7 @@ def _step(name: str, here: int, make: bool, flags: int) -> int:
 
 
 def _read(fd: int, size: int) -> bytes:
-    """The first `size` bytes, or what there is of them."""
+    """Read the first `size` bytes, or fewer."""
     data = os.read(fd, size)
     if len(data) == size:
         return data

@@ -1,7 +1,7 @@
-"""Objects below a prefix of an S3 bucket, through obstore: repeated while that helps, within a bound.
+"""Objects below a prefix of an S3 bucket, through obstore, with bounded retries.
 
-The client repeats nothing by itself, so that one rule holds for every request: what may pass is tried
-again with growing pauses until `PATIENCE` requests' time is used up, what cannot pass is told at once.
+The client's own retries are off, so that one rule holds for every request: transient failures are retried
+with growing pauses until `PATIENCE` timeouts have passed, others are raised at once.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from datagen.schemas.storage.errors import RequestFailure, store_trouble, too_la
 from datagen.schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
 from datagen.schemas.storage.stored_file import StoredFile
 
-PATIENCE = 1.5  # timeouts for which a request is repeated, at least once
+PATIENCE = 1.5  # timeouts for which a request is retried, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
-_DELETED_AT_ONCE = 1000  # what S3 takes in one request
+_DELETED_AT_ONCE = 1000  # limit of S3 per request
 _FAILURES = (BaseError, OSError, ValueError)
 
 Result = TypeVar("Result")
 
 
 class RemoteObjects:
-    """The objects below `s3://bucket/prefix`. A failure is an `InputError` of the object and the mend."""
+    """The objects below `s3://bucket/prefix`. A failure is an `InputError` with the object and the fix."""
 
     def __init__(self, url: str) -> None:
         self.bucket, self.prefix = bucket_and_prefix(url)
@@ -45,30 +45,29 @@ class RemoteObjects:
         return RemoteObjects(f"{self.url}/{key}")
 
     def put(self, key: str, data: bytes) -> None:
-        """Write an object whole; one of that name is replaced."""
+        """Write an object, or replace it."""
         self._try(key, lambda: obstore.put(self._store, key, data, use_multipart=False))
 
     def create(self, key: str, data: bytes) -> bool:
-        """Write an object unless the name is taken; False when it is, by whomever.
+        """Write an object unless the name exists; False where it does.
 
-        A request that was carried out and yet answered with an error finds its own object when it is
-        repeated: False, too.
+        Also False where a first request wrote the object but responded with an error, and was retried.
         """
 
         def put() -> bool:
             try:
                 obstore.put(self._store, key, data, mode="create", use_multipart=False)
             except AlreadyExistsError as e:
-                # Also said while another request is at this name, which may come to nothing.
+                # Also sent while another request for this name is running, which may fail.
                 if "409 Conflict" in str(e) and not self.exists(key):
-                    raise _TransientTrouble("the store answers 409") from e
+                    raise _TransientTrouble("the store responds 409") from e
                 return False
             return True
 
         return self._try(key, put)
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        """The object's bytes, or None when there is none. InputError for one above the limit."""
+        """The object's bytes, or None where it does not exist. InputError above the limit."""
 
         def get() -> bytes:
             found = obstore.get(self._store, key)
@@ -77,7 +76,7 @@ class RemoteObjects:
                 raise too_large(f"{self.url}/{key}", size, limit_bytes)
             data = bytes(found.bytes())
             if len(data) != size:
-                raise _TransientTrouble("the store breaks off its answers")
+                raise _TransientTrouble("the store's response is cut off")
             return data
 
         try:
@@ -105,7 +104,7 @@ class RemoteObjects:
                     pages = iter(obstore.list(self._store, prefix, offset=last))
                 return next(pages, None)
             except _FAILURES:
-                pages = None  # a stream that failed is over: begin again after what was seen
+                pages = None  # a failed stream cannot continue: list again after the last key
                 raise
 
         while (entries := self._try(prefix, page)) is not None:
@@ -115,7 +114,7 @@ class RemoteObjects:
                 yield StoredFile(last, int(entry["size"]), str(stamp), entry["last_modified"].timestamp())
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove objects; those that do not exist are passed over."""
+        """Remove objects; missing ones are ignored."""
         left = iter(keys)
         while some := list(islice(left, _DELETED_AT_ONCE)):
             try:
@@ -154,7 +153,7 @@ class RemoteObjects:
             raise InputError(self.url, "", problem, "Check their spelling and values") from e
 
     def _try(self, key: str, request: Callable[[], Result]) -> Result:
-        """What a request gives, repeated while that helps; FileNotFoundError for an absent object."""
+        """Run a request with retries; FileNotFoundError for a missing object."""
         end_s = time.monotonic() + PATIENCE * self._timeout_s
         pause_s, tries = _FIRST_PAUSE_S, 0
         while True:
@@ -174,7 +173,7 @@ class RemoteObjects:
 
 
 class _TransientTrouble(OSError):
-    """Trouble that the client does not take for any."""
+    """A failure that the client does not report as one."""
 
     def __init__(self, problem: str) -> None:
         self.trouble = RequestFailure(problem, "Submit again when the store has recovered", passing=True)

@@ -1,4 +1,4 @@
-"""What an s3:// address and the environment say of an object store, checked before its client sees it."""
+"""Settings of an object store from its s3:// address and the environment, checked before use."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from urllib.parse import urlsplit
 
 from datagen.schemas.errors import InputError
 
-TIMEOUT_S = 20.0  # silence of the store after which a request is given up
+TIMEOUT_S = 20.0  # seconds without a response after which a request fails
 _TRUE = ("true", "1", "yes", "on")
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-# What the environment may say of connections; the client forgets it once it is given settings of its own.
+# Connection settings in the environment, which the client ignores once it has explicit ones.
 _CONNECTION = ("allow_http", "allow_invalid_certificates", "proxy_url", "proxy_excludes")
 
 
 def connection_settings() -> dict[str, object]:
-    """What AWS_ALLOW_HTTP and its like say, by the client's names."""
+    """Connection settings such as AWS_ALLOW_HTTP, by the client's names."""
     given = {name: os.environ.get(f"AWS_{name.upper()}", "") for name in _CONNECTION}
     return {
         name: value if name.startswith("proxy") else value.lower() in _TRUE
@@ -27,38 +27,38 @@ def connection_settings() -> dict[str, object]:
 
 
 def timeout_s() -> float:
-    """Seconds of silence after which a request is given up: DATAGEN_STORE_TIMEOUT_S, or 20."""
+    """Timeout of a request in seconds: DATAGEN_STORE_TIMEOUT_S, or 20."""
     given = os.environ.get("DATAGEN_STORE_TIMEOUT_S", "")
     try:
         seconds = float(given or TIMEOUT_S)
     except ValueError:
         seconds = 0.0
     if not 0.1 <= seconds <= 3600:
-        mend = "Give the seconds to wait for an answer of the object store, 0.1 to 3600"
-        raise InputError("DATAGEN_STORE_TIMEOUT_S", given[:40], "is not such a number", mend)
+        mend = "Give the timeout of the object store in seconds, 0.1 to 3600"
+        raise InputError("DATAGEN_STORE_TIMEOUT_S", given[:40], "is not a valid timeout", mend)
     return seconds
 
 
 def bucket_and_prefix(url: str) -> tuple[str, str]:
-    """(bucket, prefix) of an s3:// address; InputError where it is none, or the endpoint is none."""
+    """(bucket, prefix) of an s3:// address; InputError for a bad address or endpoint."""
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
     prefix = prefix.rstrip("/")
     mend = "Give s3://bucket/prefix"
     if "@" in bucket or "?" in url or "#" in url:
-        # Not shown: it may hold a key.
-        problem = "holds more than a bucket and a prefix"
-        raise InputError("the s3:// address", "", problem, f"{mend}, and keys by AWS_* variables")
+        # Not shown: it may contain a key.
+        problem = "has more than a bucket and a prefix"
+        raise InputError("the s3:// address", "", problem, f"{mend}, and keys in AWS_* variables")
     if not _BUCKET.fullmatch(bucket):
         mend = f"{mend}, with 3 to 63 small letters, digits, dots and hyphens for the bucket"
         raise InputError(url[:200], "", "does not name a bucket", mend)
     if prefix and any(part in ("", ".", "..") for part in prefix.split("/")):
-        raise InputError(url[:200], "", "has an empty part, or one of dots", mend)
+        raise InputError(url[:200], "", "has an empty part, or a part of dots", mend)
     _refuse_endpoint()
     return bucket, prefix
 
 
 def _refuse_endpoint() -> None:
-    """The client panics on an address that is none."""
+    """Raise InputError for a bad endpoint, on which the client would panic."""
     for name in _ENDPOINTS:
         given = os.environ.get(name, "")
         if not given:
@@ -73,4 +73,4 @@ def _refuse_endpoint() -> None:
             mend = "Give http(s)://HOST:PORT of the store, without keys"
             raise InputError(name, "", "is not the address of a store", mend)
         if given.lower().startswith("http:") and not connection_settings().get("allow_http"):
-            raise InputError(name, "", "is not encrypted (http)", "Set AWS_ALLOW_HTTP=true if you mean it")
+            raise InputError(name, "", "is not encrypted (http)", "Set AWS_ALLOW_HTTP=true to allow it")

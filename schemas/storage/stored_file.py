@@ -1,4 +1,4 @@
-"""What a listing tells of a file."""
+"""An entry of a listing."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from dataclasses import dataclass
 class StoredFile:
     """One listed file: its key below the storage's root, its size in bytes, and its change stamp.
 
-    Equal stamps of one key mean equal bytes: the store's entity tag, or what the file system notes of
-    the file (inode, time of change and size). `modified_s` is when it was last written, in seconds since
-    1970 UTC.
+    Equal stamps of one key mean equal bytes: the store's entity tag, or inode, time of change and size of a
+    file. `modified_s` is the time of the last write, in seconds since 1970 UTC.
     """
 
     key: str

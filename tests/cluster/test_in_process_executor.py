@@ -137,5 +137,5 @@ def test_notes_are_not_written_where_another_user_could_have_planted_links(tmp_p
         os.chown(notes, NOBODY, NOBODY)
     task = ScriptedTask(7, "a", 60, str(notes))
     report = guarded(lambda *_: pytest.fail("was run"), task, deadline=False)
-    assert report.ends_job and "another user's folder" in report.cause
+    assert report.ends_job and "belongs to another user" in report.cause
     assert not list(target.iterdir()) and not list(notes.iterdir())

@@ -68,7 +68,7 @@ def test_another_folder_of_the_same_name_is_not_the_run(run: Run, tmp_path: Path
         (tmp_path / key).write_bytes(data)
     assert Run.open(tmp_path).manifest == run.manifest
     copy = task_of(run, run=open_storage(tmp_path).url)
-    with pytest.raises(InputError, match="another folder has this name there"):
+    with pytest.raises(InputError, match="is another folder there"):
         refuse_unfit_machines(one_machine(copy), run, task_of(run))
 
 
@@ -77,5 +77,5 @@ def test_a_machine_with_other_versions_is_named(run: Run) -> None:
     here = versions_of(names)
     assert here["numpy"] and here["scenes"] == ""
     other = MachineReport("", {**here, "numpy": "1.0"})
-    with pytest.raises(InputError, match=r"numpy: it has 1\.0, and this machine .* Install"):
+    with pytest.raises(InputError, match=r"numpy: is 1\.0 there, but .* Install"):
         refuse_unfit_machines(one_machine(finding=other), run, task_of(run))

@@ -44,7 +44,7 @@ def test_lines_of_text_say_the_same() -> None:
     assert thirty_seconds(as_json=False)[2:] == [
         "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h",
         "shard 5 crashed: Fatal Python error: Segmentation fault (retry)",
-        "asked to stop: waiting for what is in flight; Ctrl-C again ends it at once",
+        "asked to stop: waiting for running attempts; Ctrl-C again stops at once",
         "shards 80/150  60 labels/s  0:01:10 left  0 retries  0.00 core-h  stopping",
     ]
 

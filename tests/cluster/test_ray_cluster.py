@@ -52,7 +52,7 @@ def test_a_local_cluster_listens_on_loopback_alone_and_asks_for_its_token(
         }
         assert listening and listening <= LOOPBACK
         address = ray.get_runtime_context().gcs_address
-        with pytest.raises(InputError, match=r"asks for a token, and none is set\. Set RAY_AUTH_TOKEN"):
+        with pytest.raises(InputError, match=r"requires a token, but none is set\. Set RAY_AUTH_TOKEN"):
             refuse_unusable(address)
         monkeypatch.setenv("RAY_AUTH_TOKEN", new_token())
         with pytest.raises(InputError, match="refuses the token in RAY_AUTH_TOKEN"):

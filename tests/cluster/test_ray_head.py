@@ -38,7 +38,7 @@ def test_a_head_that_ray_gives_up_is_started_again(
     try:
         head = ensure_head(1)
         assert running_head() == head and [f.exists() for f in folders] == [False, True]
-        assert "Ray did not start and is started again: " in capsys.readouterr().err
+        assert "Ray did not start; trying again: " in capsys.readouterr().err
         assert cli.run(["cancel", "--head"]) == 0
         assert running_head() is None
         assert not [p for p in psutil.process_iter() if group_of(p) == head.group]

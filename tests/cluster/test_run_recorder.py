@@ -59,7 +59,7 @@ def test_what_is_closed_says_all_that_is_known(tmp_path: Path) -> None:
         host=commit.host,
     )
     lost = found["lost"]
-    assert lost.cause == "it left no end, and its shard was decided without it"
+    assert lost.cause == "it left no end record, and its shard was decided without it"
     assert (lost.cost, lost.host, lost.started) == (None, None, starts["lost"].started)
     assert lost.ended >= lost.started > ""
 

@@ -27,8 +27,8 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--seed -1", ["seed", "-1", "0"]),
     ("--seed 9223372036854775808", ["seed", "9223372036854775808"]),
     ("--split dev", ["--split", "dev", "train"]),
-    ("--settler bullet", ["settle.engine", "bullet", "pybullet, sapien"]),
-    ("--renderer raster", ["observation.renderer", "raster", "embree"]),
+    ("--settler bullet", ["--settler: settle.engine", "bullet", "pybullet, sapien"]),
+    ("--renderer raster", ["--renderer: observation.renderer", "raster", "embree"]),
     ("--candidates-per-scene 0", ["--candidates-per-scene", "0", "625"]),
     ("--candidates-per-scene 626", ["--candidates-per-scene", "626", "625"]),
     ("--candidates-per-scene all", ["--candidates-per-scene", "all", "grid"]),
@@ -58,7 +58,7 @@ OPTIONS: list[tuple[str, list[str]]] = [
     ("--objects ycb:{missing}", ["{missing}"]),
     ("--objects ycb:{empty}", ["{empty}", "objects.json"]),
     ("--objects ycb:{file}", ["{file}"]),
-    ("--out {file}", ["{file}", "a file stands there"]),
+    ("--out {file}", ["{file}", "is a file"]),
     ("--out {file}/below", ["{file}/below", "Not a directory"]),
     ("--out {foreign}", ["{foreign}", "thesis.tex", "--out"]),
     ("--out {missing}\0", ["not the name of a folder"]),
@@ -125,7 +125,7 @@ def test_an_unknown_label_source(source: str, tmp_path: Path, capsys: pytest.Cap
 
 
 CONFIGS: list[tuple[str, list[str]]] = [
-    ("n_clutter = 3", ["n_clutter", "Take the key out"]),
+    ("n_clutter = 3", ["n_clutter", "Remove or correct the key"]),
     ("[scene]\nclutter = 3", ["scene.clutter", "docs/reference/specification.md"]),
     ("[scene]\nn_clutter = -1", ["scene.n_clutter", "-1"]),
     ("[scene]\nn_clutter = 31", ["scene.n_clutter", "30"]),

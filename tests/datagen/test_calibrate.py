@@ -140,7 +140,7 @@ def test_runs_are_calibrated_to_together_and_odd_splits_are_said(
 def test_a_file_that_is_there_stays(trials: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rule.toml"
     out.write_text("mine")
-    refused(["calibrate", str(trials), "--out", str(out)], capsys, str(out), "there already")
+    refused(["calibrate", str(trials), "--out", str(out)], capsys, str(out), "already exists")
     assert out.read_text() == "mine"
 
 
@@ -158,7 +158,9 @@ def test_what_cannot_be_fitted_to_is_refused(
     planned = small_spec(1, label_source="plan")
     refused(["calibrate", str(trials), made("plan", planned), *out], capsys, "plan", "sim")
     ruled = trial_spec(2, heuristic=HeuristicParams(mu=0.6))
-    refused(["calibrate", str(trials), made("ruled", ruled), *out], capsys, "heuristic", "another rule")
+    refused(
+        ["calibrate", str(trials), made("ruled", ruled), *out], capsys, "heuristic", "differs from that of"
+    )
     near = trial_spec(3, candidates=CandidateParams(within="in-range", per_scene=5))
     refused(["calibrate", made("near", near), *out], capsys, "in-range", "clear")
     refused(["calibrate", made("one", trial_spec(4), 1), *out, "--candidates", "grid"], capsys, "label")

@@ -68,7 +68,7 @@ def test_a_job_is_seen_stopped_and_told_of_from_elsewhere(
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [e["event"] for e in events] == ["job_began", "stop_asked", "job_ended"]
     assert cli.run(["cancel", str(run)]) == 0
-    assert "none is at work" in capsys.readouterr().out
+    assert "none is running" in capsys.readouterr().out
 
 
 def test_at_once_ends_a_shard_in_the_middle_of_it_or_after(tmp_path: Path) -> None:
@@ -97,11 +97,11 @@ def test_a_job_that_was_killed_is_dead_and_nobody_waits_for_it(
     (shown,) = json_of(capsys, ["status", str(run)])["jobs"]
     assert shown["health"] == "dead"
     assert cli.run(["status", str(run)]) == 0
-    assert "dead: its process is gone" in capsys.readouterr().out
+    assert "dead: its process has ended" in capsys.readouterr().out
     assert cli.run(["cancel", str(run)]) == 0
-    assert "none is at work" in capsys.readouterr().out
+    assert "none is running" in capsys.readouterr().out
     assert cli.run(["logs", str(run)]) == 0
-    assert "is dead: last heard of then" in capsys.readouterr().out
+    assert "is dead: its process has ended" in capsys.readouterr().out
 
 
 def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
@@ -121,7 +121,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         told = capsys.readouterr()
         (line,) = [line for line in told.err.splitlines() if "has not ended" in line]
         assert job.id in line and "heard 5 min" in line and f"kill -9 {work.process.pid} on" in line
-        assert f"datagen resume {run}" in line and "go on with" not in told.out
+        assert f"datagen resume {run}" in line and "Resume with" not in told.out
     finally:
         work.process.send_signal(signal.SIGCONT)
     assert work.process.wait(800) == 130  # the request stands

@@ -125,7 +125,7 @@ def test_a_set_is_told_over_the_runs_that_hold_it(
         "grid": ([1], len(clear), SCENES),
     }
     assert cli.run(["evaluate", file, str(near), *QUICK, "--candidates", "clear"]) == 2
-    assert "no run was made of clear candidates, but of in-range" in capsys.readouterr().err
+    assert "no run covers clear candidates, only in-range" in capsys.readouterr().err
 
 
 def _check_page(text: str, n_sets: int) -> None:
@@ -214,7 +214,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     assert report["methods"][0]["threshold"] is None and report["methods"][2]["note"]
     assert report["parts"][0]["sets"]["grid"]["comparisons"] == []  # without models there is nothing to ask
     assert cli.run([*words, "--fit", str(grids)]) == 2
-    assert "is trained on too" in capsys.readouterr().err
+    assert "is also in the training data" in capsys.readouterr().err
     rule = tmp_path / "rule.toml"
     rule.write_text("[heuristic]\nmu = 0.5\ntau = 0.4\n")
     chosen = ["--baselines", "distance", "--baselines", "analytic", "--heuristic", str(rule)]
@@ -223,7 +223,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     distance, analytic = report["methods"]
     rule.write_text(f"# run {report['runs'][0]['parts'][0]['spec_hash']}: sim\n[heuristic]\nmu = 0.5\n")
     assert cli.run([*words, "--baselines", "analytic", "--heuristic", str(rule)]) == 2
-    assert "its rule was fitted to the labels of" in capsys.readouterr().err
+    assert "was fitted on the labels of" in capsys.readouterr().err
     assert distance["state"] and analytic["state"]["params"]["mu"] == 0.5 and analytic["threshold"] < 0.45
 
 
@@ -241,16 +241,16 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     odd.write_text('[heuristic]\nmu = "far"\n')
     heuristic = make_run(tmp_path / "heuristic").storage.url
     cases: list[tuple[list[str], list[str]]] = [
-        ([file], ["RUN", "only checkpoints are named"]),
-        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint's file nor a run's folder"]),
+        ([file], ["PATH", "no run is given"]),
+        ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
         ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "no checkpoint"]),
         ([file, heuristic], ["label_source", "heuristic labels", "datagen submit sim"]),
-        ([run, "--baselines", "none"], ["CKPT", "there is nobody to evaluate"]),
+        ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["the same checkpoint as"]),
-        ([file, run, run], ["sample_id", "comes twice"]),
+        ([file, run, run], ["sample_id", "occurs twice"]),
         ([file, run, "--bootstrap", "0"], ["--bootstrap"]),
         ([file, run, "--seed", "-1"], ["--seed"]),
-        ([file, run, "--baselines", "luck"], ["--baselines: luck: no such baseline"]),
+        ([file, run, "--baselines", "luck"], ["--baselines: luck: is not a baseline"]),
         ([file, run, "--baselines", "scalars"], ["--baselines: scalars", "--fit"]),
         ([file, run, "--fit", heuristic, "--baselines", "distance"], ["heuristic labels"]),
         ([file, run, "--heuristic", str(tmp_path / "thesis.tex"), *QUICK], ["thesis.tex", "is not TOML"]),

@@ -62,7 +62,7 @@ def test_a_run_over_stored_scenes_is_not_extended_beyond_them(
     run = tmp_path / "run"
     again = ["submit", "heuristic", "--scenes-from", str(source), "--out", str(run), *HERE]
     assert cli.run([*again, "--n", str(PER_SCENE)]) == 0
-    refused(["extend", str(run), "--n", str(LONG_N), *HERE], capsys, "--n", "committed candidates")
+    refused(["extend", str(run), "--n", str(LONG_N), *HERE], capsys, "--n", "is more than the")
     assert json_of(capsys, ["status", str(run)])["n"] == PER_SCENE
     assert cli.run(["extend", str(run), "--n", str(N), *HERE]) == 0
     np.testing.assert_array_equal(arrays_of(run)["label"], arrays_of(source)["label"])
@@ -81,7 +81,7 @@ def test_merged_runs_share_what_is_to_come(tmp_path: Path, capsys: pytest.Captur
     assert report["complete"] and report["sealed"] and report["labels"] == report["n"] == total
     assert [part["n"] for part in report["parts"]] == [run.n for run in parts]
     assert cli.run(["status", str(place)]) == 0
-    assert "of each part its own" in capsys.readouterr().out
+    assert "one per part" in capsys.readouterr().out
     labels, last = arrays_of(place)["label"], parts[-1]
     assert len(labels) == total
     alone = make_small_run(tmp_path / "alone", last.n, "--seed", str(last.manifest.spec.seed))

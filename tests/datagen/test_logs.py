@@ -127,7 +127,7 @@ def test_silence_is_told_from_a_run_of_which_nothing_is_to_be_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run(tmp_path / "run", n=20, shards=[0])
-    for more, words in (((), "no attempt has failed"), (("--shard", "1"), "nobody has begun it")):
+    for more, words in (((), "no attempt has failed"), (("--shard", "1"), "the shard has not begun")):
         assert cli.run(["logs", run.storage.url, *more]) == 0
         told = capsys.readouterr()
         assert told.out == "" and words in told.err and len(told.err.splitlines()) == 1
@@ -143,5 +143,5 @@ def test_a_lifted_quarantine_stays_in_the_logs(tmp_path: Path, capsys: pytest.Ca
     )  # fmt: skip
     assert lift_quarantine(run) == [1]
     (event,) = lines_of(capsys, run.storage.url)
-    assert event["event"] == "quarantined" and "taken out of it later" in event["text"]
+    assert event["event"] == "quarantined" and "tried again later" in event["text"]
     refused(["logs", run.storage.url, "--driver"], capsys, "detached")

@@ -91,7 +91,7 @@ def test_every_reading_verb_takes_it(merged: Path, tmp_path: Path, capsys: pytes
     picture = tmp_path / "scene.png"
     assert cli.run(["show", str(merged), "--scene", str(second), "--out", str(picture)]) == 0
     assert picture.stat().st_size > 10_000
-    refused(["show", str(merged), "--scene", "9", "--out", str(picture)], capsys, "Choose one from 0 to 8")
+    refused(["show", str(merged), "--scene", "9", "--out", str(picture)], capsys, "Give one from 0 to 8")
 
 
 def test_scenes_are_taken_from_one_of_its_parts(
@@ -106,11 +106,11 @@ def test_scenes_are_taken_from_one_of_its_parts(
 def test_refusals_are_one_line(apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = str(tmp_path / "out")
     make_run(tmp_path / "foreign", 10, shards=[0])
-    refused(["merge", "--out", out], capsys, "--runs requires an argument")
+    refused(["merge", "--out", out], capsys, "RUN... is missing")
     refused(["merge", str(tmp_path / "nowhere"), "--out", out], capsys, "no such folder")
     refused(["merge", str(tmp_path), "--out", out], capsys, "not a run")
     kinds = ["merge", str(apart / "whole"), str(tmp_path / "foreign"), "--out", out]
-    refused(kinds, capsys, "not of one kind", "engines", str(apart / "whole"), str(tmp_path / "foreign"))
+    refused(kinds, capsys, "differs in kind", "engines", str(apart / "whole"), str(tmp_path / "foreign"))
     joins = ["merge", str(apart / "other"), "--out", str(apart / "whole")]
     refused(joins, capsys, "another specification", "Choose a new --out")
     assert not Path(out).exists()
@@ -126,7 +126,7 @@ def test_it_says_what_came_from_where_and_what_is_missing(tmp_path: Path, capsys
     words = (f"merged: {out}", "labels 30 of 40; missing shards: 1", f"datagen resume {out}", "3 linked")
     for word in (
         *words,
-        "1 held more than once",
+        "1 duplicates",
         f"{tmp_path}/a: 2 shards, made on test",
         f"{tmp_path}/b: 1",
     ):
@@ -156,7 +156,7 @@ def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
         [sys.executable, "-c", program, *command], capture_output=True, text=True, check=False
     )
     assert run.returncode == 130, run.stderr
-    said = "interrupted early; what is committed stays. Go on with:"
+    said = "interrupted; committed shards are kept. Resume with:"
     assert run.stderr == f"{said}\n  datagen {' '.join(command)}\ninterrupted\n"
     assert len(Run.open(out).committed()) == 1
     assert cli.run(command) == 0

@@ -208,7 +208,7 @@ def bad_files(folder: Path) -> None:
 
 # The option that is changed, its value, and words of the refusal. `-` leaves the option out.
 REFUSED: list[tuple[str, str, str]] = [
-    ("--mask", "{bad}/black.png", "selects nothing"),
+    ("--mask", "{bad}/black.png", "selects no pixel"),
     ("--mask", "{bad}/small.png", "160x120"),
     ("--rgb", "{bad}/small.png", "160x120"),
     ("--depth", "{bad}/black.png", "16-bit"),
@@ -242,18 +242,18 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--camera-pose", "{bad}/pose_mirror.json", "rotation"),
     ("--camera-pose", "{bad}/pose_wide.json", "rotation"),
     ("--camera-pose", "{bad}/pose_rows.json", "four"),
-    ("--click", "10,10", "mask already"),
+    ("--click", "10,10", "is given with a mask"),
     ("--frame", "{bad}/missing", "--frame"),
     ("--frame", "{bad}/none.ply", "no vertices"),
     ("--frame", "{bad}/many.ply", "1,000,000,000,000"),
     ("--frame", "{bad}/short.ply", "in the file"),
     ("--frame", "{bad}/flat.ply", "no property z"),
     ("--frame", "{bad}/words.ply", "numbers"),
-    ("--frame", "{bad}/lists.ply", "not understood"),
+    ("--frame", "{bad}/lists.ply", "is not valid"),
     ("--frame", "{bad}/minus.ply", "-2"),
     ("--frame", "{bad}/noply.ply", "not a PLY"),
     ("--frame", "{bad}/objects.npz", "object"),
-    ("--frame", "{bad}/other.npz", "holds none"),
+    ("--frame", "{bad}/other.npz", "has none of"),
     ("--frame", "{bad}/norgb.npz", "rgb"),
     ("--frame", "{bad}/claim.npz", "promises"),
     ("--frame", "{bad}/bomb.npz", "unpacks"),
@@ -342,7 +342,9 @@ def test_a_floor_out_of_sight_is_asked_for(
 
 
 @pytest.mark.parametrize("json_too", [False, True])
-@pytest.mark.parametrize(("value", "words"), [(np.nan, "NaN or infinite"), (3e38, "no finite score")])
+@pytest.mark.parametrize(
+    ("value", "words"), [(np.nan, "NaN or infinite"), (3e38, "is not finite for sample")]
+)
 def test_a_model_without_finite_scores_gives_no_answer(
     made: Path, tmp_path: Path, value: float, words: str, json_too: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -111,7 +111,7 @@ def test_the_cost_of_the_labels_it_came_from_is_carried_on(
     assert told["useful"]["wall_s"] == pytest.approx(own_s)
     assert told["wall_s_per_label"] == pytest.approx((own_s + before["wall_s"]) / N)
     assert cli.run(["audit", str(again)]) == 0
-    assert "labels it came from" in capsys.readouterr().out
+    assert "relabelled files" in capsys.readouterr().out
     (part,) = open_parts([again], ())
     assert part.cost == pytest.approx({k: v + told["useful"][k] for k, v in before.items()})
 
@@ -195,11 +195,11 @@ def test_merged_runs_are_relabelled_part_by_part(
         np.testing.assert_array_equal(values, np.concatenate([arrays[name] for arrays in each]), err_msg=name)
     assert json_of(capsys, ["relabel", str(merged), "--out", str(out), *RULE])["labels"] == 0
     assert cli.run(["verify", str(out)]) == 0
-    # Where something else is, no part is begun.
+    # Where other files is, no part is begun.
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "todo.txt").write_text("mine")
     for there, words in (
-        (merged, "other runs were merged here"),
+        (merged, "has other merged runs"),
         (tmp_path / "alone", "holds one run"),
         (tmp_path / "notes", "todo.txt"),
     ):
@@ -220,8 +220,8 @@ def test_scenes_that_were_merged_twice_are_labelled_once(source: Path, tmp_path:
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ((), ("heuristic", "nothing would change", "--mu")),
-        (("--mu", "0.53", "--tau", "0.4546"), ("nothing would change",)),
+        ((), ("heuristic", "has these parameters already", "--tau")),
+        (("--mu", "0.53", "--tau", "0.4546"), ("has these parameters already",)),
         (("--mu", "nan"), ("heuristic.mu", "finite")),
         (("--sigma-l", "0"), ("heuristic.sigma_l", "greater than 0")),
         (("--d-min", "0.95"), ("heuristic", "d_max 0.92 must be above d_min 0.95")),
@@ -244,7 +244,7 @@ def test_what_cannot_be_done_is_refused_before_anything_is_written(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[visibility]\nwindow_px = 32\n", ("visibility", "those that the run stores", "--scenes-from")),
+        ("[visibility]\nwindow_px = 32\n", ("visibility", "visibilities, which are stored", "--scenes-from")),
         ("[scene]\nn_clutter = 3\n", ("scene",)),
         ("[arm]\nrobot = 'panda'\n", ("arm", "heuristic has no arm")),
         ("[heuristic]\nnu = 1\n", ("heuristic.nu",)),
@@ -266,7 +266,7 @@ def test_it_is_not_written_over_something_else(
     refused(["relabel", str(source), "--out", str(relabelled), "--mu", "0.8"], capsys, "heuristic.mu", "0.7")
     refused(["relabel", str(source), "--out", str(source), "--mu", "0.8"], capsys, "another specification")
     (tmp_path / "thesis.tex").write_text("text")
-    refused(["relabel", str(source), "--out", str(tmp_path), "--mu", "0.8"], capsys, "something else")
+    refused(["relabel", str(source), "--out", str(tmp_path), "--mu", "0.8"], capsys, "other files")
     assert files_of(relabelled) == held
 
 
@@ -340,7 +340,13 @@ def test_labels_of_trials_do_not_follow_from_the_rule(
     more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
     assert cli.run(["submit", "plan", "--n", "8", "--out", str(plan), *more]) == 0
     arguments = ["relabel", str(plan), "--out", str(tmp_path / "run"), *RULE]
-    refused(arguments, capsys, "label_source", "plan labels do not follow", "submit heuristic --scenes-from")
+    refused(
+        arguments,
+        capsys,
+        "label_source",
+        "cannot be computed from distance",
+        "submit heuristic --scenes-from",
+    )
 
 
 def test_runs_on_s3_are_relabelled_and_replayed_there(

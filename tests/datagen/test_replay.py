@@ -85,7 +85,7 @@ def test_a_prefix_that_is_unique_is_enough(source: Path) -> None:
 def test_ids_that_name_nothing_or_more_are_refused(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused(["replay", str(source), "0" * 32], capsys, "is no sample of")
+    refused(["replay", str(source), "0" * 32], capsys, "is not a sample of")
     refused(["replay", str(source), "12345"], capsys, "6 to 32 hexadecimal digits")
     refused(["replay", str(source), "../../etc"], capsys, "hexadecimal digits")
     beyond = Run.open(source)
@@ -93,7 +93,7 @@ def test_ids_that_name_nothing_or_more_are_refused(
     with pytest.raises(InputError, match="no sample"):
         find_sample([beyond], last)
     monkeypatch.setattr("datagen.commands.replay._PREFIX_AT_LEAST", 1)
-    with pytest.raises(InputError, match=r"begins more than one id .*Give more digits"):
+    with pytest.raises(InputError, match=r"matches several samples .*Give more digits"):
         find_sample([beyond], id_of(source, 0)[:1])
 
 
@@ -156,14 +156,14 @@ def test_scenes_of_another_run_are_drawn_by_it_or_recalled(
     assert told["equal"] and not told["drawn_again"] and told["stages"] == []
     capsys.readouterr()
     assert cli.run(["replay", str(out), "--scene", "2", "--out", str(tmp_path / "scene.png")]) == 0
-    assert "not drawn again" in capsys.readouterr().out
+    assert "not sampled again" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ((), ("name one thing to replay",)),
-        (("abcdef", "--scene", "0"), ("name one thing to replay",)),
+        ((), ("one of three ways",)),
+        (("abcdef", "--scene", "0"), ("one of three ways",)),
         (("--scene", "4"), ("--scene", "4 is not in this run")),
         (("--shard", "9"), ("--shard", "9 is not in this run", "0 to 3")),
         (("--scene", "0", "--out", "missing/scene.png"), ("--out", "folder does not exist")),
@@ -212,11 +212,11 @@ def test_a_shard_that_runs_here_says_how_to_lift_its_quarantine(
     assert cli.run(["replay", str(given_up), "--shard", "1"]) == 0
     told = capsys.readouterr().out
     for words in (
-        "the last cause", "Traceback of the worker", f"{PER_SCENE} labels", "nothing was written",
-        "--quarantined", "in quarantine since 2026-01-01",
+        "the last cause", "Traceback of the worker", f"{PER_SCENE} labels", "no file was written",
+        "--quarantined", "quarantined at 2026-01-01",
     ):  # fmt: skip
         assert words in told, told
-    assert told.index("the last cause") < told.index("nothing was written")
+    assert told.index("the last cause") < told.index("no file was written")
     assert files_of(given_up) == held
     report = json_of(capsys, ["replay", str(given_up), "--shard", "1"])
     assert report["mend"] == f"datagen resume {given_up} --quarantined" and not report["committed"]

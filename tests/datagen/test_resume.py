@@ -87,7 +87,7 @@ def test_other_sources_are_refused(
     lose(copied, 2)
     before = files_of(copied)
     refused(["resume", str(copied), option, other, *HERE], capsys, other.partition(":")[2])
-    refused(["resume", str(copied), "--scenes-from", str(copied), *HERE], capsys, "draws its own scenes")
+    refused(["resume", str(copied), "--scenes-from", str(copied), *HERE], capsys, "has its own scenes")
     assert files_of(copied) == before
 
 
@@ -99,7 +99,7 @@ def test_another_engine_than_the_run_was_made_with_is_refused(
     spec = manifest.spec.model_copy(update={"engines": manifest.spec.engines | {"numpy": "1.0"}})
     odd = manifest.model_copy(update={"spec": spec, "spec_hash": spec.hash()})
     (copied / "manifest.json").write_bytes(encode_record(Manifest.model_validate(odd.model_dump())))
-    refused(["resume", str(copied), *HERE], capsys, "engines", "numpy: it has 1.0, here is")
+    refused(["resume", str(copied), *HERE], capsys, "engines", "numpy: the run has 1.0, this machine")
 
 
 def test_shards_that_were_given_up_are_tried_again_only_when_asked(

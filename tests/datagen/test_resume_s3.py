@@ -56,7 +56,7 @@ def test_a_run_on_s3_is_resumed_extended_and_told_of(
     ends = [job["state"]["end"] for job in report["jobs"]]
     assert ends == ["interrupted", "complete", "complete", "complete"]
     assert cli.run(["logs", run]) == 0
-    assert "taken out of it later" in capsys.readouterr().out
+    assert "tried again later" in capsys.readouterr().out
     here = make_small_run(tmp_path / "run", N + PER_SCENE)
     assert digests_of(Run.open(run)) == digests_of(Run.open(here))
 

@@ -60,7 +60,7 @@ def test_a_run_on_s3_is_the_run_on_a_disk(
     submit(again, 8, "--scenes-from", out)
     assert sealed_arrays(Run.open(again))["scene_index"].tolist() == [0]
     arguments = ["submit", "heuristic", "--n", "32", "--out", f"{bucket}/more", "--scenes-from", out]
-    refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"{out} has 16 committed candidates for it")
+    refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"{out}is more than the 16 candidates of ")
 
     other, merged = f"{bucket}/runs/b", f"{bucket}/merged"
     submit(other, 8, "--seed", "7", *config)
@@ -98,9 +98,9 @@ def test_places_on_s3_that_cannot_be_used(
     words = ["submit", "heuristic", "--n", "8", "--workers", "0", "--out"]
     refused([*words, "s3://no-such-bucket/run"], capsys, "s3://no-such-bucket/run", "no such bucket")
     refused(["status", f"{bucket}/none"], capsys, f"{bucket}/none", "not a run")
-    refused([*words, "s3://k:secret@bucket/run"], capsys, "holds more than a bucket and a prefix")
+    refused([*words, "s3://k:secret@bucket/run"], capsys, "has more than a bucket and a prefix")
     open_storage(bucket).put("mine/thesis.txt", b"x")
-    refused([*words, f"{bucket}/mine"], capsys, "holds files of something else")
+    refused([*words, f"{bucket}/mine"], capsys, "holds other files")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")

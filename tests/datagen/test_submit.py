@@ -100,7 +100,7 @@ def test_a_run_with_shards_given_up_says_so_again(copied: Path, capsys: pytest.C
     capsys.readouterr()
     assert cli.run(submit_arguments(copied, N)) == 1
     told = capsys.readouterr()
-    assert "given up" in told.out and "2 shards (2, 5)" in told.out and "no luck" in told.err
+    assert "committed or quarantined" in told.out and "2 shards (2, 5)" in told.out and "no luck" in told.err
     assert arrays_of(copied)["label"].shape == (N - 2 * PER_SCENE,)
     shutil.rmtree(copied / "quarantine")  # as the message says
     assert cli.run(submit_arguments(copied, N)) == 0
@@ -120,7 +120,7 @@ def test_a_larger_n_extends_and_shard_size_changes_no_array(copied: Path, finish
 @pytest.mark.parametrize(
     ("more", "fields"),
     [
-        (["--seed", "5"], ["seed: it has 0, asked 5"]),
+        (["--seed", "5"], ["seed: 0, but 5 was given"]),
         (["--settler", "pybullet"], ["settle.engine", "sapien", "pybullet"]),
         (["--split", "val", "--robots-per-scene", "2"], ["split", "'all'", "'val'", "robots_per_scene"]),
         (["--candidates-per-scene", "9"], ["candidates_per_scene", "8", "9"]),
@@ -154,7 +154,7 @@ def test_status_tells_an_older_seal(copied: Path, capsys: pytest.CaptureFixture[
     report = json_of(capsys, ["status", str(copied)])
     assert not report["sealed"] and report["sealed_labels"] == N
     assert cli.run(["status", str(copied)]) == 0
-    assert "data.zarr is older" in capsys.readouterr().out
+    assert "data.zarr is out of date" in capsys.readouterr().out
     # Sealed unfinished, it holds no more labels than before.
     assert cli.run(["seal", str(copied)]) == 0
     Run.open(copied).grow(3 * N)
@@ -268,7 +268,8 @@ def test_a_count_of_built_in_houses_and_a_relative_folder_reach_the_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = make_small_run(tmp_path / "run", PER_SCENE, "--houses", "builtin:30")
-    assert Run.open(run).manifest.sources == {"houses": "builtin:30", "objects": "builtin"}
+    sources = Run.open(run).manifest.sources
+    assert sources == {"houses": "builtin:30", "objects": "builtin", "n_houses": "30", "n_objects": "58"}
     folder = tmp_path / "objects"
     folder.mkdir()
     monkeypatch.chdir(tmp_path)

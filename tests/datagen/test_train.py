@@ -87,7 +87,7 @@ def test_runs_that_do_not_fit_the_stage_are_refused(
     first: Path, heuristic_run: Path, sim_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "c.ckpt"
-    learns = "learns from those of"
+    learns = "trains on"
     refused(
         words("stage1", sim_run, out), capsys, str(sim_run), "sim labels", learns, "Train stage2 or sim-only"
     )
@@ -102,8 +102,8 @@ def test_what_cannot_be_trained_is_refused(
 ):
     out, run = tmp_path / "c.ckpt", heuristic_run
     cases: list[tuple[list[str], tuple[str, ...]]] = [
-        (words("stage2", run, out), ("--init", "no checkpoint is named")),
-        (words("stage1", run, out, "--init", str(first)), ("--init", "fresh weights")),
+        (words("stage2", run, out), ("--init", "starts from a checkpoint of stage 1")),
+        (words("stage1", run, out, "--init", str(first)), ("--init", "random weights")),
         (words("stage2", run, out, "--init", tiny), (tiny, "checkpoint")),
         (words("stage1", tmp_path / "none", out), ("none",)),
         (words("stage1", run, out, "--val", str(run)), ("house",)),
@@ -146,7 +146,7 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
     process.send_signal(signal.SIGINT)
     told = process.communicate()[1]
     if process.returncode == 130:  # unless it had come to its end just then
-        assert f"Go on with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
+        assert f"Resume with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
         assert not read_checkpoint(tmp_path / "c.ckpt").head.finished
     else:
         assert process.returncode == 0
@@ -159,7 +159,7 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_gpu_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="torch finds no GPU here"):
+    with pytest.raises(InputError, match="torch finds no GPU"):
         choose_device("cuda", None)
     assert choose_device("auto", None) == ("cpu", 1)
     assert choose_device("auto", 3) == ("cpu", 3)

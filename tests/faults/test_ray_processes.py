@@ -106,7 +106,7 @@ def test_only_those_who_know_the_token_are_let_in(
     monkeypatch.setenv("HOME", str(tmp_path))
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(InputError, match=r"asks for a token, and none is set\. Set RAY_AUTH_TOKEN"):
+    with pytest.raises(InputError, match=r"requires a token, but none is set\. Set RAY_AUTH_TOKEN"):
         refuse_unusable(cluster.address)
     (tmp_path / ".ray").mkdir()
     (tmp_path / ".ray" / "auth_token").write_text("another")

@@ -78,7 +78,7 @@ def test_a_sealed_place_is_not_sealed_over_plans_that_were_exchanged(
     assert cli.run(["repair", str(tmp_path / "merged")]) == (0 if is_decided else 1)
     assert files_of(tmp_path / "merged") == (whole if is_decided else before)
     told = capsys.readouterr().out
-    assert is_decided or "plans/1.json" in told or "samples, and 20 are committed and wanted" in told
+    assert is_decided or "plans/1.json" in told or "samples, but 20 are committed and wanted" in told
 
 
 def test_a_manifest_of_another_part_is_not_read(clean: Path, tmp_path: Path) -> None:

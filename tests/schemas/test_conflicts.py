@@ -69,7 +69,7 @@ def test_the_first_sample_that_differs_is_named_and_the_first_file(tmp_path: Pat
 
     one, other = made(tmp_path / "a", 0), made(tmp_path / "b", 0, change)
     told = refusal(one, 0, other, 0)
-    assert told.startswith(f"{one.storage.url}: shard 0: {other.storage.url} has other rows of it: ")
+    assert told.startswith(f"{one.storage.url}: shard 0: {other.storage.url} has other rows: ")
     file = "shards/000000/a/distance_m/c.0"
     assert f"{file} differs, first in sample {sample(one, 0, 6)}, in label" in told
 

@@ -69,7 +69,7 @@ def test_a_newer_program_writes_its_fields_and_an_older_one_refuses_that_run(
         assert Run.open(run).manifest.schema_version == NEWER
         opened = Run.open(run)
         assert list(deep_findings(opened, 3, open_sources(opened), np.random.default_rng(0))) == []
-    words = ("schema_version", f"{NEWER}, and this program knows", f"to {SCHEMA_VERSION}. Use the version")
+    words = ("schema_version", f"is {NEWER}, but this program reads", f"to {SCHEMA_VERSION}. Use the version")
     refused(["show", str(run), "--out", str(tmp_path / "scene.png")], capsys, *words)
     again = ["submit", "heuristic", "--n", str(2 * N), "--out", str(run), "--workers", "0"]
     refused([*again, "--config", str(tmp_path / "run.toml"), "--candidates-per-scene", "8"], capsys, *words)

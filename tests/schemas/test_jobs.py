@@ -82,7 +82,7 @@ def test_a_torn_state_is_as_if_it_were_absent_and_a_damaged_record_is_named(tmp_
     (tmp_path / f"jobs/{record.id}.stop.json").write_text('{"now": true}')
     (job,) = jobs.all()
     assert job.state is None and job.order is None and job.record == record
-    with pytest.raises(InputError, match="already begun"):
+    with pytest.raises(InputError, match="exists already"):
         jobs.begin(record.model_copy(update={"pid": 3}))
     file = tmp_path / f"jobs/{record.id}.json"
     file.write_bytes(file.read_bytes().replace(b"datagen", b"datagex"))

@@ -60,7 +60,7 @@ def test_an_end_that_is_not_its_commits_follows_from_the_commit(run: Run, field:
     assert start is not None
     finding = only(run)
     assert (finding.kind, finding.key, finding.shard) == ("account", "ledger/a-1.json", 1)
-    assert finding.problem.startswith(f"{field}: is not that of the attempt's commit")
+    assert finding.problem.startswith(f"{field}: differs from the attempt's commit")
     assert restored(finding, LedgerEntry) == end_from_commit(run.commit_of(1), start.started)
 
 
@@ -69,7 +69,7 @@ def test_the_only_record_of_another_attempt_is_not_overwritten(run: Run, ending:
     edit(folder_of(run) / f"ledger/a-1{ending}", attempt="x")
     finding = only(run)
     assert (finding.key, finding.cure) == (f"ledger/a-1{ending}", None)
-    assert f"belongs at ledger/x{ending}" in finding.mend
+    assert f"Move it to ledger/x{ending}" in finding.mend
     shutil.copy(folder_of(run) / f"ledger/a-1{ending}", folder_of(run) / f"ledger/x{ending}")
     findings, _ = check(folder_of(run))
     assert isinstance(next(f for f in findings if f.key == finding.key).cure, Restore)
@@ -78,7 +78,7 @@ def test_the_only_record_of_another_attempt_is_not_overwritten(run: Run, ending:
 def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run) -> None:
     edit(folder_of(run) / "ledger/a-1.start.json", shard=0)
     finding = only(run)
-    assert (finding.key, finding.problem) == ("ledger/a-1.start.json", "is not that of this attempt")
+    assert (finding.key, finding.problem) == ("ledger/a-1.start.json", "belongs to another attempt")
     assert restored(finding, AttemptStart) == AttemptStart(attempt="a-1", shard=1, started="then", host="h")
 
 
@@ -86,8 +86,8 @@ def test_a_start_that_is_not_its_commits_follows_from_the_end(run: Run) -> None:
     ("cost", "problem"),
     [
         ({"stage_wall_s": {"draw": 1.0005}}, ""),  # clocks are read one after the other
-        ({"stage_wall_s": {"draw": 0.6, "settle": 0.6}}, "stage_wall_s: the stages have 1.2 s"),
-        ({"stage_cpu_s": {"draw": 1.5}}, "stage_cpu_s: the stages have 1.5 s"),
+        ({"stage_wall_s": {"draw": 0.6, "settle": 0.6}}, "stage_wall_s: the stages sum to 1.2 s"),
+        ({"stage_cpu_s": {"draw": 1.5}}, "stage_cpu_s: the stages sum to 1.5 s"),
     ],
 )
 def test_stages_of_a_commit_that_take_longer_than_it(run: Run, cost: dict[str, Any], problem: str) -> None:

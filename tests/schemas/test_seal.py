@@ -127,7 +127,7 @@ def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):
     run = make_run(tmp_path, n=20, shards=[0])
     commit = write(run, 1, "b")
     assert run.commit(commit.model_copy(update={"files": commit.files[:-1]}))
-    with pytest.raises(InputError, match="lacks or adds 1 files"):
+    with pytest.raises(InputError, match="1 files are missing or extra"):
         seal(run.storage)
 
 

@@ -124,8 +124,8 @@ def test_places_that_cannot_hold_a_run(tmp_path: Path):
     for place, problem in [
         ("", "not the name of a folder"),
         ("a\0b", "not the name of a folder"),
-        (tmp_path / "file", "a file stands there"),
-        (tmp_path / "file" / "below", "A file stands where a folder is needed"),
+        (tmp_path / "file", "is a file"),
+        (tmp_path / "file" / "below", "A file is where a folder is needed"),
         (tmp_path / ("x" * 300), "shorter path"),
         ("gopher://there/run", "Name a folder or an s3://"),
     ]:

@@ -62,7 +62,7 @@ def test_what_is_no_plain_file_is_refused_by_name(kind: str, place: Storage):
     secrets = place.folder.parent / "secrets"
     odd(kind, place.folder / "a" / "odd", secrets)
     for name, verb in VERBS.items():
-        with pytest.raises(InputError, match=r"a run has none\. Remove it") as e:
+        with pytest.raises(InputError, match=r"which a run never has\. Remove it") as e:
             verb(place, "a/odd")
         assert f"{place.url}/a/odd" in str(e.value), name
         assert "\n" not in str(e.value)
@@ -87,7 +87,9 @@ def test_no_verb_goes_through_a_link_in_a_path(place: Storage):
         lambda: place.below("shards").put("key", b"overwritten"),
         lambda: list(place.below("shards").list("")),
     ):
-        with pytest.raises(InputError, match="'shards' in this path is a symbolic link, and a run has none"):
+        with pytest.raises(
+            InputError, match="'shards' in this path is a symbolic link, which a run never has"
+        ):
             verb()
     place.delete(["shards"])  # the link itself
     assert files_of(secrets) == {"key": b"secret"}
@@ -102,7 +104,7 @@ def test_a_device_is_refused(place: Storage):
         os.mknod(place.folder / "zero", 0o600 | 0o020000, os.makedev(1, 5))
     except PermissionError:
         pytest.skip("devices cannot be made here")
-    with pytest.raises(InputError, match="is a device, and a run has none"):
+    with pytest.raises(InputError, match="is a device, which a run never has"):
         place.get("zero", 10)
 
 
@@ -117,14 +119,14 @@ def test_the_root_may_be_a_link(tmp_path: Path):
 def test_a_folder_of_something_else_is_not_told_to_remove_its_links(place: Storage):
     assert place.folder is not None
     (place.folder / "link").symlink_to(place.folder.parent / "secrets")
-    with pytest.raises(InputError, match=r"link: the folder holds files of something else\. Choose a new"):
+    with pytest.raises(InputError, match=r"link: holds other files than those of a run\. Choose a new"):
         refuse_foreign(place)
 
 
 def test_folders_without_end_are_refused(place: Storage):
     assert place.folder is not None
     (place.folder / "/".join(["d"] * 40)).mkdir(parents=True)
-    with pytest.raises(InputError, match="folders within folders without end"):
+    with pytest.raises(InputError, match="folders are nested too deeply"):
         list(place.list(""))
 
 
@@ -132,9 +134,9 @@ def test_a_folder_is_no_file(place: Storage):
     place.put("a/b", b"x")
     assert not place.exists("a")
     for verb in (lambda: place.get("a", 9), lambda: place.put("a", b""), lambda: place.delete(["a"])):
-        with pytest.raises(InputError, match="A folder stands where a file is needed"):
+        with pytest.raises(InputError, match="A folder is where a file is needed"):
             verb()
-    with pytest.raises(InputError, match="A file stands where a folder is needed"):
+    with pytest.raises(InputError, match="A file is where a folder is needed"):
         place.get("a/b/c", 9)
 
 

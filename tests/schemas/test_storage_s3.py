@@ -171,7 +171,7 @@ def test_answers_that_break_off_are_asked_for_again(behind: Behind):
 
 def test_a_store_that_ignores_create_only_is_refused(behind: Behind, bucket: str):
     with behind(Faults(forgets_create_only=True)):
-        with pytest.raises(InputError, match="create-only writes are not honoured here") as e:
+        with pytest.raises(InputError, match="does not support create-only writes") as e:
             open_storage(f"{bucket}/runs/a")
         assert bucket in str(e.value) and "\n" not in str(e.value)
         assert list(open_storage(bucket, probe=False).list("")) == []
@@ -191,7 +191,7 @@ def test_a_store_that_is_down_is_told_within_the_bound(behind: Behind, monkeypat
         ):
             before = faults.seen["requests"]
             with pytest.raises(
-                StoreUnavailable, match=r"the store answers 50[03] .*Wait until the store"
+                StoreUnavailable, match=r"the store responds 50[03] .*Wait until the store"
             ) as e:
                 verb()
             assert faults.seen["requests"] - before >= 2
@@ -232,13 +232,13 @@ def answer(status: str, code: str) -> bytes:
         (answer("403 Forbidden", "AccessDenied"), "access denied (AccessDenied). Check AWS_ACCESS_KEY_ID"),
         (answer("403 Forbidden", "SignatureDoesNotMatch"), "access denied (SignatureDoesNotMatch)"),
         (answer("400 Bad Request", "ExpiredToken"), "access denied (ExpiredToken)"),
-        (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Make the bucket first"),
+        (answer("404 Not Found", "NoSuchBucket"), "no such bucket. Create the bucket"),
         (answer("301 Moved", "PermanentRedirect"), "the bucket is in another region. Set AWS_REGION"),
         (answer("501 Not Implemented", "NotImplemented"), "the store refuses (501 NotImplemented)"),
-        (answer("503 Slow Down", "SlowDown"), "the store answers 503 SlowDown. Wait until"),
+        (answer("503 Slow Down", "SlowDown"), "the store responds 503 SlowDown. Wait until"),
         (b"SSH-2.0-OpenSSH\r\n\r\n", "is not that of an S3 store. Check that AWS_ENDPOINT_URL"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "is not that of an S3 store"),
-        (None, "the store does not answer in time. Check the network, or allow more with"),
+        (None, "the store does not respond in time. Check the network, or raise"),
     ],
 )
 def test_every_trouble_is_one_line_with_its_mend(
@@ -271,7 +271,7 @@ def told_of(port: int, problem: str, monkeypatch: pytest.MonkeyPatch, timeout_s:
 def test_what_is_told_of_an_answer_does_not_hang_on_names():
     told = "Error performing GET http://host/redirect/dns error/k - Server returned non-2xx status code: "
     trouble = store_trouble(GenericError(told + "503 Service Unavailable: <Error><Code>SlowDown</Code>"))
-    assert (trouble.problem, trouble.passing) == ("the store answers 503 SlowDown", True)
+    assert (trouble.problem, trouble.passing) == ("the store responds 503 SlowDown", True)
     asked = "Error performing PUT http://169.254.169.254/latest/api/token - "
     trouble = store_trouble(GenericError(asked + "HTTP error: error sending request"))
     assert (trouble.problem, trouble.passing) == ("no credentials are set", False)
@@ -284,10 +284,10 @@ def test_addresses_and_settings_that_cannot_be_used(bucket: str, monkeypatch: py
         ("s3://", "does not name a bucket"),
         ("s3:///x", "does not name a bucket"),
         ("s3://B_/x", "does not name a bucket"),
-        ("s3://key:secret@bucket/x", "holds more than a bucket and a prefix"),
-        ("s3://bucket/x?secret=1", "holds more than a bucket and a prefix"),
-        ("s3://bucket/../x", "has an empty part, or one of dots"),
-        ("s3://bucket/a//b", "has an empty part, or one of dots"),
+        ("s3://key:secret@bucket/x", "has more than a bucket and a prefix"),
+        ("s3://bucket/x?secret=1", "has more than a bucket and a prefix"),
+        ("s3://bucket/../x", "has an empty part, or a part of dots"),
+        ("s3://bucket/a//b", "has an empty part, or a part of dots"),
         ("gs://bucket/x", "neither a folder nor an s3:// address"),
         ("s3:/bucket/x", "does not name a bucket. Give s3://bucket/prefix"),
     ]:
@@ -295,7 +295,7 @@ def test_addresses_and_settings_that_cannot_be_used(bucket: str, monkeypatch: py
             open_storage(place)
         assert "secret" not in str(e.value)
     for name, value, problem in [
-        ("DATAGEN_STORE_TIMEOUT_S", "soon", "is not such a number"),
+        ("DATAGEN_STORE_TIMEOUT_S", "soon", "is not a valid timeout"),
         ("AWS_ALLOW_HTTP", "", r"is not encrypted \(http\). Set AWS_ALLOW_HTTP=true"),
         ("AWS_ENDPOINT_URL", "not an address", "is not the address of a store"),
         ("AWS_ENDPOINT_URL", "http://key:secret@host", "is not the address of a store"),

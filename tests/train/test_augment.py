@@ -243,5 +243,5 @@ def test_labels_and_names_are_those_of_the_plain_stream(tmp_path_factory: pytest
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(make, field: str):
-    with pytest.raises(InputError, match=f"augmentation: {field}: .* lies outside"):
+    with pytest.raises(InputError, match=f"augmentation: {field}: .* is not between"):
         make()

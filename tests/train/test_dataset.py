@@ -245,7 +245,7 @@ def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tm
     )
     assert alone.origin() == [said[0] | {"cost": None}]
     assert said[0]["spec_hashes"] == [run.manifest.spec_hash]
-    with pytest.raises(InputError, match="samples would come twice"):
+    with pytest.raises(InputError, match="samples would occur twice"):
         SampleStream([place, tmp_path / "merged"])
 
 
@@ -258,8 +258,8 @@ def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tm
         ({"seed": -1}, "seed: -1 is below 0"),
         ({"rank": 2, "world": 2}, "rank: 2 of 2"),
         ({"world": 20}, "19 scenes for 20 ranks"),
-        ({"extra": ("beauty",)}, "beauty: the run stores no such field"),
-        ({"houses": lambda house: False}, "house_id: no scene of a house that counts"),
+        ({"extra": ("beauty",)}, "beauty: is not a field of the run"),
+        ({"houses": lambda house: False}, "house_id: has no scene in the selected houses"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(place: str, changes: dict[str, Any], problem: str):
@@ -274,9 +274,9 @@ def test_rows_that_make_no_sense_are_refused_with_their_shard(tmp_path: Path):
     with pytest.raises(InputError, match=r"shards/000000/a-0: label: a label of 2"):
         SampleStream([tmp_path / "label"])
     for name, changes, problem in (
-        ("robots", {"robot_index": 0}, r"\w+_m: samples of one robot differ"),
-        ("points", {"n_points": 65}, r"n_points: not a number of points that a cloud can hold"),
-        ("scenes", {"sample_scene_index": 7}, r"sample_scene_index: a sample names a scene"),
+        ("robots", {"robot_index": 0}, r"\w+_m: differs between samples of one robot"),
+        ("points", {"n_points": 65}, r"n_points: is not between 0 and the size"),
+        ("scenes", {"sample_scene_index": 7}, r"sample_scene_index: has a sample of a scene"),
     ):
         make_stream_run(tmp_path / name, 18, **changes)
         with pytest.raises(InputError, match=rf"{name}/shards/000000/a-0: {problem}"):

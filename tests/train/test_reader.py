@@ -99,7 +99,7 @@ def test_missing_and_cut_files_are_named(tmp_path: Path):
     data = victim.read_bytes()
     reader = SampleReader([tmp_path])
     victim.write_bytes(data[:-3])
-    with pytest.raises(InputError, match=r"label/c\.0: label: \d+ bytes whose sha256 is not that"):
+    with pytest.raises(InputError, match=r"label/c\.0: label: has \d+ bytes with another sha256"):
         next(reader.shards())
     victim.unlink()
     with pytest.raises(InputError, match=r"label/c\.0: label: no such file"):
@@ -114,13 +114,13 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path):
     make_run(tmp_path / "bare", n=20, shards=[])
     (tmp_path / "odd.zarr").mkdir()
     cases: list[tuple[list[Path], dict[str, Any], str]] = [
-        ([], {}, "no run is named"),
-        ([tmp_path / "bare"], {}, "20 of the 20 planned samples are not committed"),
+        ([], {}, "no run is given"),
+        ([tmp_path / "bare"], {}, "20 of the 20 planned samples are missing"),
         ([tmp_path / "bare"], {"allow_incomplete": True}, "no shard is committed"),
         ([tmp_path / "odd.zarr"], {}, "no such file"),
         ([tmp_path / "none"], {}, "no such folder"),
-        ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: the run stores no such field"),
-        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: not a field of samples"),
+        ([tmp_path / "run"], {"sample_fields": ("beauty",)}, "beauty: is not a field of the run"),
+        ([tmp_path / "run"], {"sample_fields": ("points_m",)}, "points_m: is not a field of samples"),
     ]
     for places, fields, problem in cases:
         with pytest.raises(InputError, match=problem):
@@ -213,7 +213,7 @@ def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
     assert {"distance_m", "visibility"} <= swapped
     for name in swapped & {*ALL, *SAMPLES}:
         scenes, samples = ((name,), ()) if name in ALL else ((), (name,))
-        with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*sha256 is not that of the commit"):
+        with pytest.raises(InputError, match=f"/{name}/c.*: {name}: .*another sha256 than the commit"):
             list(SampleReader([place], scenes, samples).shards())
     readers: list[Callable[[], object]] = [
         lambda: read_labelled(run),
@@ -221,7 +221,7 @@ def test_chunks_that_were_swapped_between_shards_are_refused_by_every_reader(
         lambda: list(SampleStream([place]).epoch(0)),
     ]
     for read in readers:
-        with pytest.raises(InputError, match="sha256 is not that of the commit"):
+        with pytest.raises(InputError, match="another sha256 than the commit"):
             read()
 
 
@@ -255,7 +255,7 @@ def test_a_file_is_held_against_its_commit_once_in_a_process(tmp_path: Path, mon
 def test_a_run_that_lacks_planned_samples_is_read_only_where_that_is_said(tmp_path: Path):
     make_run(tmp_path, n=30)
     (tmp_path / "commits/000001.json").unlink()
-    words = r"10 of the 30 planned samples are not committed\. .*resume.*--allow-incomplete"
+    words = r"10 of the 30 planned samples are missing\. .*resume.*--allow-incomplete"
     for opened in (lambda: SampleReader([tmp_path]), lambda: SampleStream([tmp_path])):
         with pytest.raises(InputError, match=words) as error:
             opened()

@@ -22,9 +22,11 @@ def test_a_shared_house_is_named_by_id_or_by_content(tmp_path: Path):
     make_stream_run(tmp_path / "content", 18, seed=3, house_id="other", house_digest="1" * 64)
     train = SampleStream([tmp_path / "a"])
     refuse_shared_houses(train, SampleStream([tmp_path / "b"]))
-    with pytest.raises(InputError, match="/id: house_id: house 'one' is trained on too, one of 1"):
+    with pytest.raises(InputError, match="/id: house_id: house 'one' is also in the training data, one of 1"):
         refuse_shared_houses(train, SampleStream([tmp_path / "id"]))
-    with pytest.raises(InputError, match=r"/content: .*house 'one' .*\(as 'other' there, of equal content\)"):
+    with pytest.raises(
+        InputError, match=r"/content: .*house 'one' .*\(as 'other' there, with equal content\)"
+    ):
         refuse_shared_houses(train, SampleStream([tmp_path / "b", tmp_path / "content"]))
 
 
@@ -67,7 +69,7 @@ def test_one_run_is_divided_by_house(tmp_path: Path):
     assert (train.shuffle, train.seed, validation.seed) == (True, 3, 3)
     # Twins by content under two names, one on each side.
     make_stream_run(tmp_path / "twin", 18, seed=6, house_digest="in", house_id=twin)
-    with pytest.raises(InputError, match="of equal content"):
+    with pytest.raises(InputError, match="with equal content"):
         split_by_house([tmp_path / "in", tmp_path / "twin"])
 
 

@@ -17,7 +17,7 @@ from datagen.train.baselines.scalars import Scalars
 from datagen.train.baselines.threshold import Threshold
 from datagen.train.inputs import Array, Batch
 
-# By the name on the command line. `threshold-detector` is the visibility stand-in until a detector is named.
+# By the name on the command line. `threshold-detector` uses estimated visibility without --detector.
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "proximity": Proximity,
     "threshold": Threshold,
@@ -34,14 +34,14 @@ def make_baselines(
     heuristic: HeuristicParams | None = None,
     seed: int = 0,
 ) -> list[Baseline]:
-    """The baselines of these names, before fitting.
+    """Return the baselines of these names, before fitting.
 
     `detector` is a folder for `threshold-detector`, `heuristic` the parameters of `analytic`, `seed` that
     of `scalars`. InputError names an unknown one.
     """
     for name in names:
         if name not in BASELINES:
-            raise InputError("--baselines", name, "no such baseline", choices(BASELINES))
+            raise InputError("--baselines", name, "is not a baseline", choices(BASELINES, name))
     made: list[Baseline] = []
     for name in names:
         if name == "threshold-detector" and detector is not None:
@@ -56,9 +56,9 @@ def make_baselines(
 
 
 def fit_baselines(baselines: Sequence[Baseline], batches: Iterable[Batch[Array]]) -> list[Baseline]:
-    """All of them fitted on the same batches, read with `FIELDS`; never on those they are judged on.
+    """Fit all of them on the same batches, read with `FIELDS`, from other scenes than the evaluation's.
 
-    The batches are held together: 15 MB for 100 scenes of 4,096 points.
+    The batches are kept in memory: 15 MB for 100 scenes of 4,096 points.
     """
     held = list(batches)
     return [baseline.fit(held) for baseline in baselines]

@@ -1,4 +1,4 @@
-"""The distance-visibility rule H >= tau with rho estimated from the observed cloud."""
+"""Baseline: the distance-visibility rule H >= tau with rho estimated from the observed cloud."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _PAPER = HeuristicParams()
 
 @dataclass(frozen=True)
 class Analytic(Unfitted):
-    """Score H (workers/labels/distance_visibility_score.py), good from tau on.
+    """Score H (workers/labels/distance_visibility_score.py), positive from tau on.
 
-    `params` are those of a specification, by default the paper's with ours where it states none;
-    `datagen calibrate` fits better ones. Where the base does not fit the score is H - 10.
-    With `only_clear` off every place is judged by H alone, as the label source `heuristic` does.
+    `params` are those of a specification, by default the paper's; `datagen calibrate` fits better ones. Where
+    the base is not clear the score is H - 10. Without `only_clear` every candidate has score H, as in the
+    label source `heuristic`.
     """
 
     params: HeuristicParams = _PAPER

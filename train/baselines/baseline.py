@@ -1,4 +1,4 @@
-"""What plain methods have in common: the interface, the numbers that they judge by, and fitting a cut."""
+"""Common parts of baselines: the interface, features, and fitting of a threshold."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from datagen.train.scorers import Scorer
 F64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-# Columns that a batch must bring along for baselines.
+# Further columns of a batch that baselines need.
 FIELDS = ("base_is_clear", "base_clearance_m", "object_name")
-# Above any distance and probability: a candidate that is ruled out is worse by it than any other.
+# Penalty of impossible candidates, larger than any distance or probability.
 RULED_OUT = 100.0
 
 
 class Baseline(Scorer, Protocol):
-    """A scorer without a network over clouds, perhaps with a few fitted numbers."""
+    """A scorer without a network over clouds, possibly with a few fitted numbers."""
 
     @property
     def needs_fit(self) -> bool:
-        """Whether it cannot score before `fit`."""
+        """Whether it needs `fit` before it can score."""
         ...
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Self:
-        """The same with its numbers fitted to the labels, for the best balanced accuracy or likelihood.
+        """Return a copy fitted to the labels, for the best balanced accuracy or likelihood.
 
-        What has no numbers returns itself. InputError where all labels are alike.
+        A baseline without parameters returns itself. InputError where all labels are equal.
         """
         ...
 
     def state(self) -> dict[str, Any]:
-        """Its numbers, as values that JSON can hold."""
+        """Its fitted numbers as JSON values."""
         ...
 
 
 class Unfitted:
-    """What a method has that has nothing to fit, and no numbers."""
+    """Defaults of a baseline without parameters."""
 
     needs_fit = False
 
@@ -56,22 +56,22 @@ class Unfitted:
 
 
 def planar_distance_m(batch: Batch[Array]) -> F64:
-    """Distance (N,) on the floor from each base to the target's centre."""
+    """Horizontal distance (N,) from each base to the target's centre (m)."""
     return np.linalg.norm(batch.candidates.base_xy_m.astype(np.float64), axis=1)
 
 
 def mount_m(batch: Batch[Array]) -> F64:
-    """Distance (N,) from each arm's mount to the target's centre."""
+    """Distance (N,) from each arm's mount to the target's centre (m)."""
     return mount_distance_m(batch.clouds, batch.robots, batch.candidates)
 
 
 def reach_m(batch: Batch[Array]) -> F64:
-    """Reach (N,) of each candidate's arm."""
+    """Reach (N,) of each candidate's arm (m)."""
     return batch.robots.arm_reach_m[batch.candidates.robot_row].astype(np.float64)
 
 
 def is_feasible(batch: Batch[Array]) -> Bools:
-    """Where (N,) the base fits and the target is within the arm's reach."""
+    """Mask (N,) of clear candidates within the arm's reach."""
     return is_clear(batch) & (mount_m(batch) <= reach_m(batch))
 
 
@@ -79,29 +79,29 @@ _KNOWN_RHO: WeakKeyDictionary[Batch[Array], F64] = WeakKeyDictionary()
 
 
 def observed_rho(batch: Batch[Array]) -> F64:
-    """Estimated rho (N,), worked out once for all baselines that ask of the same batch."""
+    """Estimated rho (N,), cached for all baselines of a batch."""
     if batch not in _KNOWN_RHO:
         _KNOWN_RHO[batch] = observed_visibility(batch.clouds, batch.robots, batch.candidates)
     return _KNOWN_RHO[batch]
 
 
 def labels(batches: Sequence[Batch[Array]], of: str) -> Bools:
-    """All labels (N,). InputError where they are all alike, since nothing can be fitted to them."""
+    """All labels (N,). InputError where they are all equal, so that nothing can be fitted."""
     found = np.concatenate([np.zeros(0, np.int64), *(b.label for b in batches)]) == 1
     if found.all() or not found.any():
-        problem = f"all {len(found):,} labels are alike, and nothing can be fitted to them"
+        problem = f"all {len(found):,} labels are equal, so nothing can be fitted"
         raise InputError(f"baseline {of}", "label", problem, "Fit on runs with labels of both kinds")
     return found
 
 
 def best_cut(score: F64, label: Bools) -> float:
-    """The threshold on scores (N,) with the best balanced accuracy; halfway between the scores it parts.
+    """The threshold on scores (N,) with the best balanced accuracy, midway between two scores.
 
-    Of equally good ones the lowest. Both classes must be there.
+    Of equally good ones the lowest. Both classes must occur.
     """
     order = np.argsort(score, kind="stable")
     s, y = score[order], label[order]
-    # Calling all from row k on good.
+    # All rows from k on are positive.
     true_good = y.sum() - np.concatenate([[0], np.cumsum(y)])
     true_bad = np.concatenate([[0], np.cumsum(~y)])
     balanced = 0.5 * (true_good / y.sum() + true_bad / (~y).sum())

@@ -1,4 +1,4 @@
-"""Among what geometry allows, the candidate from which the target is detected best (the paper's third)."""
+"""Baseline: among feasible candidates, the best detection of the target (the paper's third baseline)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _VIEWS_AT_ONCE = 8
 
 
 class Confidence(Protocol):
-    """How sure a detector would be of the target, from each candidate's camera."""
+    """Confidence of a detector in the target, from each candidate's camera."""
 
     @property
     def name(self) -> str: ...
 
     def of(self, batch: Batch[Array], asked: Array) -> F64:
-        """Confidences (N,) in [0, 1] of the asked candidates (N,) bool; 0 for others."""
+        """Confidences (N,) in [0, 1] of the selected candidates (N,) bool; 0 for others."""
         ...
 
 
 @dataclass(frozen=True)
 class VisibilityDetector:
-    """No detector at all: the estimated rho stands in for the confidence of one."""
+    """Estimated rho in place of a detector's confidence."""
 
     name: str = field(default="threshold-visibility (stand-in for a detector)", init=False)
 

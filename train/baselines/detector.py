@@ -1,4 +1,4 @@
-"""Object detectors that are told in words what to look for. The one file that imports transformers."""
+"""Zero-shot object detectors. Only this module imports transformers."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ U8 = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """K boxes of one picture."""
+    """K boxes of one image."""
 
     boxes_px: npt.NDArray[np.float64]  # (K, 4) left, top, right, bottom
     scores: npt.NDArray[np.float64]  # (K,) in [0, 1]
 
     def best_at_middle(self, shape: Sequence[int]) -> float:
-        """The highest score of the boxes that hold the middle of a picture (H, W), or 0."""
+        """The highest score of the boxes around the centre of an image (H, W), or 0."""
         y, x = shape[0] / 2, shape[1] / 2
         left, top, right, bottom = self.boxes_px.reshape(-1, 4).T
         holds = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
@@ -32,10 +32,10 @@ class Detections:
 
 
 class Detector(Protocol):
-    """Finds what a text names."""
+    """Detects objects named by a text."""
 
     def detect(self, frames: U8, label: str) -> list[Detections]:
-        """What is found in each of the frames (B, H, W, 3)."""
+        """Detections in each of the frames (B, H, W, 3)."""
         ...
 
 
@@ -49,7 +49,7 @@ class ZeroShotDetector:
         where = Path(folder)
         if not (where / "config.json").is_file():
             mend = "Name a folder that holds a detector's config.json, weights and processor"
-            raise InputError(where, "config.json", "not the folder of a detector", mend)
+            raise InputError(where, "config.json", "is not in the folder of a detector", mend)
         try:
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
         except ImportError as error:
@@ -62,7 +62,7 @@ class ZeroShotDetector:
             )
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             mend = "Save model and processor into it again with `save_pretrained`"
-            raise InputError(where, "", f"no zero-shot detector: {error}", mend) from None
+            raise InputError(where, "", f"is not a zero-shot detector: {error}", mend) from None
         self._model = model.to(device).eval()
         self._device = device
 

@@ -1,4 +1,4 @@
-"""A band of distances, and nothing else: what there is to know without looking."""
+"""Baseline: a band of distances, without the cloud."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _EDGES = 101
 
 @dataclass(frozen=True)
 class DistanceBand:
-    """Good where low <= d <= high, and the base fits; score: how far inside the band d is.
+    """Positive where low <= d <= high and the base is clear; score: distance from the band's edges.
 
-    d is the distance of a `kind` as the heuristic has them, in metres or shares of the reach. `fit`
-    chooses kind and band.
+    d is one of the heuristic's kinds of distance, in metres or shares of the reach. `fit` chooses kind and
+    band.
     """
 
     kind: Kind = "planar"
@@ -44,7 +44,7 @@ class DistanceBand:
         return bool(np.isnan(self.low))
 
     def score(self, batch: Batch[Array]) -> F64:
-        """min(d - low, high - d) (N,), less `RULED_OUT` where the base does not fit."""
+        """min(d - low, high - d) (N,), minus `RULED_OUT` where the base is not clear."""
         d = _distance(batch, self.kind)
         return np.minimum(d - self.low, self.high - d) - np.where(is_clear(batch), 0.0, RULED_OUT)
 

@@ -12,11 +12,11 @@ from datagen.train.inputs import Array, Batch, is_clear
 
 @dataclass(frozen=True)
 class Proximity(Unfitted):
-    """It only picks: the nearest clear one of a robot's candidates is good, and all others are bad."""
+    """Without threshold: the nearest clear one of a robot's candidates is positive, the others negative."""
 
     name: str = field(default="proximity", init=False)
     threshold: float = field(default=float("nan"), init=False)
 
     def score(self, batch: Batch[Array]) -> F64:
-        """Minus the distance (N,) in metres, less `RULED_OUT` where the base does not fit."""
+        """Minus the distance (N,) in metres, minus `RULED_OUT` where the base is not clear."""
         return -planar_distance_m(batch) - np.where(is_clear(batch), 0.0, RULED_OUT)

@@ -1,4 +1,4 @@
-"""A small network on a dozen numbers: what can be known of a candidate without looking at shapes."""
+"""Baseline: a small network on 11 numbers per candidate, without shapes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Layer = tuple[F64, F64]  # weights (out, in), bias (out,)
 
 @dataclass(frozen=True, eq=False)
 class Scalars:
-    """Probability of a good label by two hidden layers of 32; 0 where the base does not fit.
+    """Probability of a positive label by two hidden layers of 32; 0 where the base is not clear.
 
-    Fitted by cross-entropy on places where it does.
+    Fitted by cross-entropy on clear candidates.
     """
 
     seed: int = 0
@@ -42,7 +42,7 @@ class Scalars:
     def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,)."""
         if not self.layers:
-            raise InputError("baseline scalars", "", "not fitted", "Fit it on runs in validation houses")
+            raise InputError("baseline scalars", "", "is not fitted", "Fit it on runs in validation houses")
         hidden = features(batch)
         for weights, bias in self.layers[:-1]:
             hidden = np.maximum(hidden @ weights.T + bias, 0)
@@ -51,12 +51,12 @@ class Scalars:
         return np.where(is_clear(batch), chance, 0.0)
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Scalars:
-        """Fitted anew; the same for the same batches and seed, whatever torch drew before."""
+        """Fit; the result depends only on batches and seed."""
         label = labels(batches, self.name)
         clear = np.concatenate([is_clear(b) for b in batches])
         rows = np.concatenate([features(b) for b in batches])
         if not clear.any():
-            problem = "no base fits anywhere, and nothing can be fitted"
+            problem = "no candidate is clear, so nothing can be fitted"
             raise InputError(
                 "baseline scalars", "base_is_clear", problem, "Fit on runs with clear candidates"
             )
@@ -93,7 +93,7 @@ def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]
     from torch import nn
 
     mean = rows.mean(0)
-    # What hardly varies here must not count for much where it does.
+    # Features that hardly vary here must not be amplified.
     scale = np.maximum(rows.std(0), 1e-2)
     x = torch.from_numpy(((rows - mean) / scale).astype(np.float32))
     y = torch.from_numpy(label)
@@ -118,7 +118,7 @@ def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]
         schedule.step()
     linear = [m for m in net if isinstance(m, nn.Linear)]
     layers = [(m.weight.detach().double().numpy(), m.bias.detach().double().numpy()) for m in linear]
-    # Into the first layer goes what made the features comparable.
+    # The normalisation of features is folded into the first layer.
     weights = layers[0][0] / scale
     layers[0] = weights, layers[0][1] - weights @ mean
     return tuple(layers)

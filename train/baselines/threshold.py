@@ -1,4 +1,4 @@
-"""Geometry alone: within reach and clear (the paper's threshold baseline)."""
+"""Baseline: clear and within reach (the paper's threshold baseline)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from datagen.train.inputs import Array, Batch
 
 @dataclass(frozen=True)
 class Threshold(Unfitted):
-    """Score 1 where the base fits and the target is within the arm's reach, else 0."""
+    """Score 1 where the base is clear and the target within the arm's reach, else 0."""
 
     name: str = field(default="threshold", init=False)
     threshold: float = field(default=1.0, init=False)

@@ -1,4 +1,4 @@
-"""Coarse pictures of a coloured cloud from anywhere, for detectors that want to see one."""
+"""Coarse images of a coloured cloud from any viewpoint, for detectors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
 
 SIZE_PX = 256
-# Sees what lies within about half a metre of the target from a metre away.
+# Covers about half a metre around the target from a metre away.
 _HALF_ANGLE_RAD = 0.5
-# A point is painted as a square this wide: stored clouds have a point every 2 to 3 cm.
+# Width of the square drawn for a point: stored clouds have a point every 2 to 3 cm.
 _POINT_M = 0.025
 _LARGEST_PX = 24
 _NEAREST_M = 0.05
@@ -21,10 +21,10 @@ _BACKGROUND = 127
 
 
 def render_views(points_m: F32, rgb: U8, eyes_m: F32, size_px: int = SIZE_PX) -> U8:
-    """Pictures (N, size, size, 3) from eyes (N, 3) that look at the origin, upright.
+    """Images (N, size, size, 3) from viewpoints (N, 3) that look at the origin, upright.
 
-    Points (P, 3) with colours (P, 3) in the same frame are painted from far to near as squares that
-    shrink with distance; what no point covers is grey.
+    Points (P, 3) with colours (P, 3) in the same frame are drawn from far to near as squares that shrink with
+    distance; pixels without a point are grey.
     """
     return np.stack([_view(points_m, rgb, eye, size_px) for eye in eyes_m.astype(np.float64)])
 

@@ -1,7 +1,7 @@
-"""Intervals by resampling scenes: candidates of one scene stand or fall together, scenes do not.
+"""Intervals by resampling scenes, since candidates of one scene are correlated.
 
-Every statistic is a function of sums over scenes, so that a resample is a weight a scene and a thousand of
-them are one matrix product. All methods see the same resamples, which is what makes differences sharp.
+Every statistic is a function of sums over scenes, so a resample is a weight per scene, and a thousand of
+them are one matrix product. All methods share the resamples, which makes paired differences precise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Weights = npt.NDArray[np.uint16]
 
 
 def resample_weights(n_scenes: int, n_resamples: int, rng: np.random.Generator) -> Weights:
-    """How often (B, S) each of the scenes is drawn in each resample of as many scenes."""
+    """Counts (B, S) of each scene in each resample."""
     drawn = np.empty((n_resamples, n_scenes), np.uint16)
     for row in drawn:
         row[:] = np.bincount(rng.integers(0, n_scenes, n_scenes), minlength=n_scenes)
@@ -28,7 +28,7 @@ def resample_weights(n_scenes: int, n_resamples: int, rng: np.random.Generator) 
 
 
 def summed(weights: Weights, per_scene: F64) -> F64:
-    """Sums (B, ...) over the resampled scenes of what each of them holds (S, ...)."""
+    """Sums (B, ...) over the resampled scenes of values per scene (S, ...)."""
     return weights.astype(np.float64) @ per_scene
 
 
@@ -71,7 +71,7 @@ def _beaten(positives: F64, negatives: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A value with what the resamples (B,) say it might as well have been.
+    """A value with its resampled values (B,).
 
     `trials` is how many scenes a share is of, where it is one of scenes that each say yes or no.
     """
@@ -81,7 +81,7 @@ class Estimate:
     trials: int = 0
 
     def interval(self) -> tuple[float, float]:
-        """The percentile interval of `LEVEL`; nan where no resample says anything.
+        """The percentile interval of `LEVEL`; nan without defined resamples.
 
         Where all scenes of a share say yes, or all no, so does every resample, which is no certainty: then it
         is the exact interval of a share (Clopper and Pearson 1934).
@@ -109,6 +109,6 @@ def verdict(difference: Estimate) -> str:
 
 
 def are_disjoint(a: Estimate, b: Estimate) -> bool:
-    """Whether the two intervals have nothing in common: more than a difference that excludes 0."""
+    """Whether the two intervals are disjoint, a stronger condition than a significant difference."""
     (a_low, a_high), (b_low, b_high) = a.interval(), b.interval()
     return a_low > b_high or b_low > a_high

@@ -1,4 +1,4 @@
-"""Accuracy by kinds of candidates: object, distance, what is seen, cause, what was trained on."""
+"""Accuracy by groups of candidates: object, distance, visibility, outcome, training."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_ED
 
 RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
-# Heading of a breakdown -> the groups of its candidates, each with its name.
+# Heading of a breakdown -> its groups of candidates, by name.
 Groups = Mapping[str, list[tuple[str, Bools]]]
 
 
 def groups_of(columns: Columns, trained_objects: Collection[str]) -> Groups:
-    """The groups (N,) that hold any candidate, by heading, in the order in which they are told."""
+    """The non-empty groups (N,), by heading, in order of the report."""
     ratio = columns.mount_distance_m.astype(np.float64) / columns.reach_m
     seen = np.isin(columns.target_digest.astype(str), np.array(sorted(trained_objects), str))
     target = columns.target.astype(str)
@@ -36,7 +36,7 @@ def groups_of(columns: Columns, trained_objects: Collection[str]) -> Groups:
 
 
 def breakdown(groups: Groups, true: Bools, said: Mapping[str, F64]) -> list[dict[str, Any]]:
-    """One row a group: candidates, positives, and each method's accuracy and balanced accuracy."""
+    """One row per group: candidates, positives, and each method's accuracy and balanced accuracy."""
     return [
         {
             "by": heading,

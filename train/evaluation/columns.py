@@ -1,4 +1,4 @@
-"""What is kept of an evaluated run: a few numbers a candidate and a few words a scene, never its clouds."""
+"""The columns kept of an evaluated run, without its clouds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from datagen.workers.bases.candidate_sets import in_set
 
 F32 = npt.NDArray[np.float32]
 
-# Columns of the store that a batch has to bring along, beside those that scorers ask for.
+# Further columns of a batch that the evaluation needs.
 EXTRA = (
     *("base_is_clear", "distance_m", "mount_distance_m", "visibility", "outcome"),
     *("house_id", "object_name", "object_digest", "scene_index"),
@@ -52,7 +52,7 @@ class Columns:
 
     @property
     def n_scenes(self) -> int:
-        """S, whatever rows are left of them."""
+        """S, the number of scenes."""
         return len(self.house)
 
     @property
@@ -70,7 +70,7 @@ class Columns:
         )
 
     def of_scenes(self, kept: Bools) -> Columns:
-        """Some of the scenes (S,) with all their rows, numbered anew."""
+        """Some of the scenes (S,) with all their rows, renumbered."""
         rows = kept[self.scene]
         cut = {name: getattr(self, name)[rows] for name in _ROWS}
         cut["scene"] = (np.cumsum(kept) - 1)[cut["scene"]]
@@ -81,7 +81,7 @@ class Columns:
         )
 
     def is_in(self, candidates: str) -> Bools:
-        """Which (N,) belong to a set of `CANDIDATE_SETS`."""
+        """Mask (N,) of the candidates in a set of `CANDIDATE_SETS`."""
         return in_set(candidates, self.is_clear, self.mount_distance_m, self.reach_m)
 
 
@@ -91,7 +91,7 @@ _ROWS = tuple(f.name for f in fields(Columns) if f.name not in (*_SCENE_COLUMNS,
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene that will be drawn: its number, and P of its points with their colours."""
+    """An example scene: its number, and P of its points with their colours."""
 
     scene: int
     points_m: F32  # (P, 3), target frame
@@ -177,12 +177,12 @@ def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> N
     _, first = np.unique(scene_row, return_index=True)
     for name in (batch.sample_id[row].tobytes() for row in first):
         if name in known:
-            raise InputError("RUN", "sample_id", f"{name.hex()} comes twice", "Name every run once")
+            raise InputError("RUN", "sample_id", f"{name.hex()} occurs twice", "Name every run once")
         known.add(name)
 
 
 class _Reservoir:
-    """As many of the scenes offered as are wanted, each as likely as any other."""
+    """A uniform random sample of the given scenes."""
 
     def __init__(self, wanted: int, rng: np.random.Generator) -> None:
         self._wanted, self._rng, self._offered = wanted, rng, 0

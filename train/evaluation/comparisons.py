@@ -1,6 +1,6 @@
-"""Methods beside each other: differences over the same resampled scenes, as JSON has them.
+"""Paired differences of methods over the same resampled scenes, as JSON values.
 
-A difference is sharper than the intervals of its two methods: what a scene adds to both falls out of it.
+A paired difference is more precise than the intervals of its two methods: common effects of a scene cancel.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from datagen.train.evaluation.bootstrap import Estimate, are_disjoint, verdict
 
-# As they build on each other; what the paper asks is what each adds to the one before it.
+# In order of training: the paper compares each with the one before it.
 REGIMES = ("stage1", "sim-only", "two-stage")
 # By method and metric.
 Estimates = Mapping[str, Mapping[str, Estimate]]
@@ -44,10 +44,10 @@ def differences(estimates: Estimates, names: Sequence[str]) -> list[dict[str, An
 def comparisons(
     estimates: Estimates, origins: Mapping[str, TrainedBy], names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """The differences that are asked for first, by each metric.
+    """The main differences, by each metric.
 
-    `regimes`: each regime less the one before it, of the same model and share of the houses. `best`: the
-    best model less the best baseline, both chosen by these very scenes, which no interval allows for.
+    `regimes`: each regime minus the one before it, of the same model and share of the houses. `best`: the
+    best model minus the best baseline, both chosen on these scenes, which the interval does not account for.
     """
     return [
         {"kind": kind, **_difference(estimates, metric, first, second)}
@@ -95,5 +95,5 @@ def said_of(estimate: Estimate) -> dict[str, float | None]:
 
 
 def finite(value: float) -> float | None:
-    """None for what no number says."""
+    """None for nan."""
     return value if np.isfinite(value) else None

@@ -1,6 +1,6 @@
-"""Methods held against labels: every number of the tables with its interval, as plain values.
+"""Evaluate methods on labels: every number of the tables with its interval, as plain values.
 
-Values are None where nothing can be said, and intervals are those of `datagen.train.evaluation.bootstrap`.
+Values are None where undefined; intervals come from `datagen.train.evaluation.bootstrap`.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from datagen.train.evaluation.grids import picks, select
 from datagen.train.evaluation.metrics import F64, Bools
 
 _CURVE_POINTS = 200
-# In the order in which they are told; differences are told of each.
+# In order of the report, which has differences for each.
 METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick", "mean_average_precision")
 GRID_METRICS = ("good", "mean_average_precision")
 
 
 @dataclass(frozen=True)
 class Method:
-    """What is evaluated: its name among the scores, and what trained it, which no baseline has.
+    """A method: its name among the scores, and its training, which baselines lack.
 
-    Whether scores are probabilities of a good label has to be said: others lie in [0, 1] too.
+    Scores in [0, 1] may or may not be probabilities, so this is a field.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Method:
 
     @property
     def only_picks(self) -> bool:
-        """Whether it has no threshold, so that its pick among a robot's candidates is its decision."""
+        """Whether it has no threshold, so that its choice among a robot's candidates is its decision."""
         return bool(np.isnan(self.threshold))
 
     def says(self, score: F64, columns: Columns) -> F64:
@@ -70,7 +70,7 @@ def evaluate_set(
     weights: Weights,
     trained_objects: Collection[str] = (),
 ) -> dict[str, Any]:
-    """All that is told of one set of candidates; `weights` (B, S) draw the scenes of `columns`.
+    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
 
     InputError where the set is empty, or its labels are all alike.
     """
@@ -78,9 +78,9 @@ def evaluate_set(
     n, positives = len(columns), int(columns.label.sum())
     if not n:
         mend = "Choose another set, or evaluate more scenes"
-        raise InputError("--candidates", candidates, "no candidate of these runs is in it", mend)
+        raise InputError("--candidates", candidates, "has no candidate of these runs", mend)
     if positives in (0, n):
-        problem = f"all {n:,} candidates have the label {int(positives > 0)}, which any constant predicts"
+        problem = f"all {n:,} candidates have the label {int(positives > 0)}"
         raise InputError("--candidates", candidates, problem, "Evaluate a run with labels of both kinds")
     said = {m.name: m.says(columns.scores[m.name], columns) for m in methods}
     estimates = {m.name: _estimates(columns, m, said[m.name], weights) for m in methods}

@@ -1,4 +1,4 @@
-"""Choosing one of many: the best-scored candidate of each robot, how far off a wrong one is, the order."""
+"""Choice of the best-scored candidate of each robot: its label, its distance to a positive, the order."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from datagen.train.evaluation.metrics import F64, Bools, Ints, average_precision
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:
-    """Share (N,) of each group's pick: 1 for the best-scored allowed candidate, 0 for others.
+    """Share (N,) of each group's choice: 1 for the best-scored allowed candidate, 0 for others.
 
-    Of k best that no score tells apart each has 1/k: what drawing one of them gives on average. A group
-    without an allowed candidate picks none.
+    Of k candidates with the best score each has 1/k. A group without an allowed candidate has no choice.
     """
     share = np.zeros(len(score))
     rows = np.flatnonzero(allowed)

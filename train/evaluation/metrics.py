@@ -1,7 +1,6 @@
-"""How scores and decisions stand to labels. Arrays are (N,); nan where nothing can be said.
+"""Metrics of scores and decisions. Arrays are (N,); nan where undefined.
 
-A decision is the share of it that says good: 0 or 1, or 1/k for each of k candidates that a method which
-picks one cannot tell apart.
+A decision is 0 or 1, or 1/k for each of k candidates with the same best score.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ def confusion(said: F64, true: Bools, group: Ints, n_groups: int) -> F64:
 
 
 def accuracy(counts: F64) -> F64:
-    """Share (...) of right decisions, of confusions (..., 4)."""
+    """Accuracy (...) of confusions (..., 4)."""
     return _ratio(counts[..., 0] + counts[..., 3], counts.sum(axis=-1))
 
 
 def balanced_accuracy(counts: F64) -> F64:
-    """Mean (...) of the shares of positives and of negatives that are found, of confusions (..., 4).
+    """Balanced accuracy (...), the mean of sensitivity and specificity, of confusions (..., 4).
 
-    0.5 for a method that looks at nothing, however rare positives are.
+    0.5 for a constant method, however rare positives are.
     """
     found = _ratio(counts[..., 0], counts[..., 0] + counts[..., 2])
     refused = _ratio(counts[..., 3], counts[..., 3] + counts[..., 1])
@@ -71,7 +70,7 @@ def _steps(true: Bools, score: F64) -> tuple[F64, F64]:
 
 
 def roc(true: Bools, score: F64) -> Curve:
-    """Shares of negatives (x) and of positives (y) called good, from none to all. Needs both classes."""
+    """ROC curve: false (x) and true (y) positive rates. Needs both classes."""
     positives, negatives = _steps(true, score)
     return Curve(
         np.concatenate([[0.0], negatives / negatives[-1]]), np.concatenate([[0.0], positives / positives[-1]])
@@ -79,7 +78,7 @@ def roc(true: Bools, score: F64) -> Curve:
 
 
 def area_under_roc(true: Bools, score: F64) -> float:
-    """Chance that a good candidate scores above a bad one, ties counting half; nan with one class."""
+    """Area under the ROC curve, ties counting half; nan with one class."""
     if not len(true) or true.all() or not true.any():
         return float("nan")
     curve = roc(true, score)
@@ -87,7 +86,7 @@ def area_under_roc(true: Bools, score: F64) -> float:
 
 
 def precision_recall(true: Bools, score: F64) -> Curve:
-    """Share of positives found (x) and how many of those called good are (y). Needs a positive."""
+    """Precision (y) over recall (x). Needs a positive."""
     positives, negatives = _steps(true, score)
     return Curve(positives / positives[-1], positives / (positives + negatives))
 
@@ -102,7 +101,7 @@ def average_precision(true: Bools, score: F64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Candidates (K,) by bins of the probability that was said: how many, what was said, what was so."""
+    """Bins (K,) of predictions: count, mean prediction, observed rate."""
 
     count: npt.NDArray[np.int64]
     said: F64
@@ -110,12 +109,12 @@ class Reliability:
 
     @property
     def expected_error(self) -> float:
-        """Expected calibration error: mean distance of the said from the true share, by candidate."""
+        """Expected calibration error: count-weighted distance of mean prediction and observed rate."""
         return float(np.average(np.abs(self.said - self.true), weights=self.count))
 
 
 def reliability(true: Bools, probability: F64, bins: int = N_BINS) -> Reliability:
-    """Equally wide bins of [0, 1] that hold any; the last holds 1 as well."""
+    """Non-empty bins of [0, 1] of equal width; the last includes 1."""
     row = np.minimum((probability * bins).astype(np.int64), bins - 1)
     count = np.bincount(row, minlength=bins)
     held = count > 0
@@ -124,5 +123,5 @@ def reliability(true: Bools, probability: F64, bins: int = N_BINS) -> Reliabilit
 
 
 def brier(true: Bools, probability: F64) -> float:
-    """Mean squared difference of what was said and what was so."""
+    """Brier score: mean squared difference of prediction and label."""
     return float(np.mean((probability - true) ** 2))

@@ -1,8 +1,7 @@
-"""What the paper states, to stand beside what is measured here.
+"""The paper's numbers, for comparison.
 
 GBPP: Grasp-Aware Base Placement Prediction for Robots via Two-Stage Learning, arXiv:2509.11594, Tables
-I to III and the text beside them. Its candidates, houses and arms are its own: its numbers are a mark,
-and no measurement of the sets that are evaluated here.
+I to III and their text. They are for other candidates, houses and arms, and not directly comparable.
 """
 
 from __future__ import annotations

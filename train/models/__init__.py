@@ -14,13 +14,13 @@ MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, 
 
 
 def build_model(name: str, config: Mapping[str, Any]) -> Model:
-    """The model of that name with fresh parameters (torch's global generator draws them).
+    """Build the model of that name with new parameters from torch's global generator.
 
     `config` may leave out what has a default. InputError names an unknown model or field, or a
     value out of its bounds, so that a foreign checkpoint's configuration can be handed in.
     """
     if name not in MODELS:
-        raise InputError("model", name, "no such model", choices(MODELS))
+        raise InputError("model", name, "is unknown", choices(MODELS, name))
     return MODELS[name](config)
 
 

@@ -47,7 +47,7 @@ class Tokens:
 
 @dataclass(frozen=True, eq=False)
 class TokenSizes:
-    """How many numbers, vectors and tensors a token has with so many scales."""
+    """Numbers, vectors and tensors of a token, for a number of scales."""
 
     numbers: int
     vectors: int

@@ -1,4 +1,4 @@
-"""A base pose from a real frame: read it, find the floor and the target, score the places around it."""
+"""Predict a base pose from a real frame: floor, target, and scores of base poses around it."""
 
 from __future__ import annotations
 

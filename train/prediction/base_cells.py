@@ -1,4 +1,4 @@
-"""Where a base could stand around the target, and what was seen of those places."""
+"""Base positions around the target, and whether they are clear, blocked or unseen."""
 
 from __future__ import annotations
 

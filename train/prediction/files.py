@@ -1,4 +1,4 @@
-"""Pictures and small JSON documents of a frame, read as if a stranger had written them."""
+"""Read untrusted images and small JSON documents of a frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from datagen.workers.json_document import JsonNode, parse_json
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096
 MAX_FILE_BYTES = 256 * 2**20
-FILE_MEND = "Name a file that exists and is not larger"
+FILE_MEND = "Name an existing, smaller file"
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses travel as text of four or five digits.
 _POSE_ROUNDING = 1e-3
@@ -46,7 +46,7 @@ def read_depth(path: Path, depth_scale_m: float) -> F32:
     image = _opened(path, ("PNG",), None)
     if not image.mode.startswith("I;16"):
         mend = "Save depth as a 16-bit grey PNG, in steps of --depth-scale (0.001 m unless given)"
-        raise InputError(path, "", f"not a 16-bit depth picture (its mode is {image.mode})", mend)
+        raise InputError(path, "", f"is not a 16-bit depth image (its mode is {image.mode})", mend)
     return valid_depth(np.asarray(image).astype(np.float32) * np.float32(depth_scale_m))
 
 
@@ -90,11 +90,11 @@ def checked_pose(T: F64, place: str) -> F64:
     """The pose with its rotation made exact. InputError for NaN and for what is no rotation."""
     mend = "Give T_world_camera as 4x4: a rotation, a position in metres, and the row 0 0 0 1"
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(place, "T_world_camera", "not 4x4 finite numbers", mend)
+        raise InputError(place, "T_world_camera", "is not 4x4 finite numbers", mend)
     if not is_pose(T, _POSE_ROUNDING):
-        raise InputError(place, "T_world_camera", "its left upper 3x3 part is no rotation", mend)
+        raise InputError(place, "T_world_camera", "has an upper left 3x3 part that is not a rotation", mend)
     if np.abs(T[:3, 3]).max() > _EXTENT_M:
-        raise InputError(place, "T_world_camera", f"farther than {_EXTENT_M:g} m from the origin", mend)
+        raise InputError(place, "T_world_camera", f"is farther than {_EXTENT_M:g} m from the origin", mend)
     # The nearest rotation (Schoenemann 1966), so that rounded text does not stretch the cloud.
     u, _, vt = np.linalg.svd(T[:3, :3])
     exact = T.astype(np.float64)
@@ -129,11 +129,11 @@ def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Ima
     except InputError:
         raise
     except (OSError, ValueError, SyntaxError, EOFError) as error:
-        problem = f"not a readable {kinds} picture ({type(error).__name__})"
+        problem = f"is not a readable {kinds} image ({type(error).__name__})"
         raise InputError(path, "", problem, f"Save it again as {kinds}") from None
 
 
 def _refuse_size(path: Path, width: int, height: int) -> None:
     if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
         size = "too many" if width > MAX_SIDE_PX and width == height else f"{width}x{height}"
-        raise InputError(path, "", f"{size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")
+        raise InputError(path, "", f"has {size} pixels", f"Give a frame of at most {MAX_PIXELS:,} pixels")

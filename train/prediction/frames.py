@@ -1,4 +1,4 @@
-"""What a depth camera gave at one moment: points in the camera's frame, with the picture they come from."""
+"""Frames of a depth camera: points in the camera frame, with their image."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def read_frame(
     fx, fy, cx, cy, width, height = read_intrinsics(Path(intrinsics))
     chosen = None if mask is None else read_mask(Path(mask))
     if (height, width) != depth_m.shape:
-        problem = f"{width}x{height}, where the depth picture has {_size(depth_m)}"
+        problem = f"is {width}x{height}, but the depth image has {_size(depth_m)}"
         raise InputError(intrinsics, "width, height", problem, "Give the intrinsics of this stream")
     T = None if pose is None else read_pose(Path(pose))
     image = RgbdImage(colour, depth_m, Pinhole(fx, fy, cx, cy), chosen)
@@ -141,7 +141,7 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
             return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
         case _:
             mend = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
-            raise InputError(path, "--frame", "no frame", mend)
+            raise InputError(path, "--frame", "is not a frame", mend)
 
 
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, str]) -> SensorFrame:
@@ -153,15 +153,15 @@ def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, 
     where = {name: places.get(name, name) for name in ("rgb", "depth", "mask")}
     for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
         if picture is not None and picture.shape[:2] != image.depth_m.shape:
-            problem = f"{_size(picture)} pixels, where the depth has {_size(image.depth_m)}"
-            mend = "Align colour and depth, and give pictures of one size"
+            problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
+            mend = "Align colour and depth, and give images of equal size"
             raise InputError(where[name], "", problem, mend)
     pixels = np.flatnonzero(image.depth_m.ravel())
     if not len(pixels):
-        mend = "Look at the camera's depth stream, and at --depth-scale"
+        mend = "Check the camera's depth stream, and --depth-scale"
         raise InputError(where["depth"], "", "no pixel has depth", mend)
     if image.mask is not None and not image.mask.any():
-        raise InputError(where["mask"], "", "the mask selects nothing", "Paint the target white on black")
+        raise InputError(where["mask"], "", "selects no pixel", "Mark the target white on black")
     on_target = None if image.mask is None else image.mask.ravel()[pixels]
     colours = image.rgb.reshape(-1, 3)[pixels]
     return SensorFrame(where["depth"], image.points(pixels), colours, on_target, T_world_camera, image)
@@ -171,21 +171,21 @@ def _npz_frame(path: Path, depth_scale_m: float) -> SensorFrame:
     arrays = read_arrays(path)
     for name, shape in (("depth", "(H, W)"), ("rgb", "(H, W, 3)"), ("intrinsics", "(4,)")):
         if name not in arrays:
-            raise InputError(path, name, "missing", f"Put it in as an array {shape}")
+            raise InputError(path, name, "is missing", f"Add it as an array {shape}")
     depth, rgb, numbers = arrays["depth"], arrays["rgb"], arrays["intrinsics"]
     if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
-        raise InputError(path, "depth", f"an array of shape {depth.shape}", "Give depth as (H, W)")
+        raise InputError(path, "depth", f"has shape {depth.shape}", "Give depth as (H, W)")
     if depth.dtype.kind != "f" and depth.dtype != np.uint16:
         mend = "Give uint16 in steps of --depth-scale, or float in metres"
-        raise InputError(path, "depth", f"of type {depth.dtype}", mend)
+        raise InputError(path, "depth", f"has type {depth.dtype}", mend)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-        raise InputError(path, "rgb", f"{rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
+        raise InputError(path, "rgb", f"is {rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or (numbers[:2] < 1).any():
-        raise InputError(path, "intrinsics", "not fx, fy, cx, cy", "Give four numbers, in pixels")
+        raise InputError(path, "intrinsics", "are not fx, fy, cx, cy", "Give four numbers, in pixels")
     scale = 1.0 if depth.dtype.kind == "f" else depth_scale_m
     mask = arrays.get("mask")
     if mask is not None and mask.ndim != 2:
-        raise InputError(path, "mask", f"an array of shape {mask.shape}", "Give the mask as (H, W)")
+        raise InputError(path, "mask", f"has shape {mask.shape}", "Give the mask as (H, W)")
     pose = arrays.get("T_world_camera")
     with np.errstate(over="ignore", invalid="ignore"):
         metres = valid_depth((depth.astype(np.float64) * scale).astype(np.float32))

@@ -1,4 +1,4 @@
-"""Frames in one world cloud, and of that the cloud that a model is given."""
+"""Fuse frames into one world cloud, and make the model's input cloud of it."""
 
 from __future__ import annotations
 

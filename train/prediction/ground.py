@@ -1,4 +1,4 @@
-"""Where the floor is and which way is up: the camera's pose in a world whose floor is z = 0."""
+"""Find the floor: the camera's pose in a world with the floor at z = 0."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
 _LEAST_POINTS = 300  # of all, for a residual
 _SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
 _NEIGHBOURS, _TREE_POINTS = 20, 20_000  # of clouds without a picture, for normals
-_MEND = "Give --gravity x,y,z (camera frame: where things fall) or --camera-pose pose.json"
+_MEND = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-pose pose.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,20 +68,18 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
     if frame.T_world_camera is not None:
         T = frame.T_world_camera
         if camera_height_m is not None and abs(T[2, 3] - camera_height_m) > _tolerance_m(camera_height_m):
-            problem = (
-                f"the pose has the camera at {T[2, 3]:.2f} m, --camera-height says {camera_height_m:.2f} m"
-            )
-            mend = "Correct one; the pose's world has its floor at z = 0"
+            problem = f"is {T[2, 3]:.2f} m in the pose, but --camera-height is {camera_height_m:.2f} m"
+            mend = "Correct one of them; the floor of the pose's world is at z = 0"
             raise InputError(frame.place, "camera height", problem, mend)
         return _with_residual(frame, T, "the pose given with the frame")
     if camera_height_m is None:
         mend = "Give --camera-height in metres above the floor, or --camera-pose pose.json"
-        raise InputError(frame.place, "camera height", "missing", mend)
+        raise InputError(frame.place, "camera height", "is missing", mend)
     if gravity is not None:
         down = gravity / np.linalg.norm(gravity)
         if down[1] < 0 and abs(down[2]) < 0.95:
-            mend = "Turn its sign: it says where things fall, an accelerometer at rest shows the opposite"
-            raise InputError("--gravity", "", "points up in the picture", mend)
+            mend = "Change its sign: gravity points down, an accelerometer at rest measures the opposite"
+            raise InputError("--gravity", "", "points up in the image", mend)
         return _with_residual(frame, level_pose(-down, camera_height_m), "gravity and the camera's height")
     up, height_m, doubt = _floor_plane(frame, camera_height_m)
     how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({camera_height_m:.3f} m given)"
@@ -112,7 +110,7 @@ def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
 
 def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
     world = frame.points_m @ T[:3, :3].T + T[:3, 3]
-    # Twice as wide as what counts as floor, so that a floor that lies a little off is told of.
+    # Twice the tolerance of the floor, so that a floor with a small offset is reported.
     z = world[np.abs(world[:, 2]) < 0.1, 2]
     near = world[floor_points(world, T[:3, 3]), 2]
     if len(near) < _LEAST_POINTS:
@@ -132,7 +130,7 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     up = _way_up(normals, rng)
     levels = [] if up is None else _levels(points, normals, up)
     if up is None or not levels:
-        raise InputError(frame.place, "floor", "no level surface is seen in the depth picture", _MEND)
+        raise InputError(frame.place, "floor", "is not in the depth image: no level surface", _MEND)
     for _ in range(_REFITS):
         up = _common_up(points, levels, up)
         levels = _levels(points, normals, up) or levels
@@ -142,24 +140,24 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     if abs(below_m[k] - camera_height_m) > _tolerance_m(camera_height_m):
         lowest = max(below_m)
         problem = (
-            f"not seen in the depth picture: the lowest level surface is {lowest:.2f} m below the camera, "
+            f"is not in the depth image: the lowest level surface is {lowest:.2f} m below the camera, "
             f"{camera_height_m:.2f} m given"
         )
         x, y, z = np.round(-up, 3)
-        told = f"level surfaces tell {x:g},{y:g},{z:g}"
-        mend = f"Correct --camera-height, or, if that is no floor: {_MEND}; {told}"
+        told = f"level surfaces suggest {x:g},{y:g},{z:g}"
+        mend = f"Correct --camera-height, or, if that surface is not the floor: {_MEND}; {told}"
         raise InputError(frame.place, "floor", problem, mend)
     error_m = depth_error_m(points[levels[k], 2])
-    # The points' height is a mean of so many measurements, the height that was given is one more.
+    # The points' height is a mean of many measurements, the given height is one more.
     weights = 1 / np.array([(error_m.mean() ** 2) / 25 + 0.004**2, _GIVEN_ERROR_M**2])
     height_m = float(np.average([below_m[k], camera_height_m], weights=weights))
     below = float((points @ up + height_m < -0.03 - 4 * depth_error_m(points[:, 2])).mean())
     if below > _MOST_BELOW:
-        problem = f"{below:.0%} of all points lie below the plane {height_m:.2f} m under the camera"
+        problem = f"{below:.0%} of all points are below the plane {height_m:.2f} m under the camera"
         raise InputError(frame.place, "floor", problem, f"Correct --camera-height, or: {_MEND}")
-    doubts = [f"it is only {share:.1%} of what was seen"] if share < _SURE_SHARE else []
+    doubts = [f"it has only {share:.1%} of the points"] if share < _SURE_SHARE else []
     if abs(below_m[k] - camera_height_m) > _SURE_OFF_M:
-        doubts.append(f"it lies {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")
+        doubts.append(f"it is {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")
     return up, height_m, ", and ".join(doubts) or None
 
 

@@ -1,4 +1,4 @@
-"""Frames in .npz archives: known arrays alone, each bounded before it is unpacked, never an object."""
+"""Read frames from untrusted .npz archives: only known arrays of numbers, of bounded size."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     except InputError:
         raise
     except DAMAGED_ZIP as error:
-        raise InputError(path, "", f"not a .npz archive ({type(error).__name__})", _MEND) from None
+        raise InputError(path, "", f"is not a .npz archive ({type(error).__name__})", _MEND) from None
     if not found:
-        raise InputError(path, "", f"holds none of {', '.join(NAMES)}", _MEND)
+        raise InputError(path, "", f"has none of {', '.join(NAMES)}", _MEND)
     return found
 
 
@@ -57,12 +57,12 @@ def _array(path: Path, name: str, data: bytes) -> npt.NDArray[Any]:
         reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         shape, _, dtype = reader[version](file)
     except DAMAGED_ARRAY as error:
-        raise InputError(path, name, f"not an array ({type(error).__name__})", _MEND) from None
+        raise InputError(path, name, f"is not an array ({type(error).__name__})", _MEND) from None
     if dtype.hasobject or dtype.kind not in "buif":
         raise InputError(path, name, f"holds {dtype}, not numbers", _MEND)
     size = math.prod(shape) * dtype.itemsize
     sound = all(type(length) is int and 0 <= length <= len(data) for length in shape)
     if not sound or size != len(data) - file.tell():
-        raise InputError(path, name, f"promises {size:,} bytes of {len(data) - file.tell():,}", _MEND)
+        raise InputError(path, name, f"has {len(data) - file.tell():,} of {size:,} bytes", _MEND)
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)

@@ -44,7 +44,7 @@ def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
 
 
 def shown_rows(prediction: Prediction, most: int, around_m: float) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Rows of the seen points to draw: at most so many, near the target, without what hangs over all."""
+    """Rows of points to draw: a bounded number near the target, without those overhead."""
     points = prediction.seen.points_m
     rel = points[:, :2] - prediction.center_m[:2]
     near = (np.abs(rel) < around_m).all(axis=1) & (points[:, 2] > -0.3) & (points[:, 2] < 2.0)

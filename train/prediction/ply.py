@@ -1,4 +1,4 @@
-"""Point clouds in PLY files: vertices alone, ASCII or binary (Turk 1994), with every count checked first."""
+"""Read point clouds from untrusted PLY files, ASCII or binary (Turk 1994): only vertices."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def read_ply(path: Path) -> PlyCloud:
     data = read_regular(path, MAX_FILE_BYTES, FILE_MEND)
     form, count, properties, start = _header(path, data)
     if not count:
-        raise InputError(path, "element vertex", "no vertices", _MEND)
+        raise InputError(path, "element vertex", "has no vertices", _MEND)
     names = [name for name, _ in properties]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) < len(names):
@@ -66,7 +66,7 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
     """(format, vertices, their properties, where the body starts)."""
     end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     if not data.startswith(b"ply") or end < 0 or (line_end := data.find(b"\n", end)) < 0:
-        raise InputError(path, "header", "not a PLY file", _MEND)
+        raise InputError(path, "header", "is not that of a PLY file", _MEND)
     lines = data[:end].decode("ascii", errors="replace").splitlines()
     form, count, properties, element = "", -1, list[tuple[str, str]](), ""
     for number, line in enumerate(lines[1:], start=2):
@@ -88,9 +88,9 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
             case ["property", *_] if element and element != "vertex":
                 pass
             case _:
-                raise InputError(path, place, f"not understood: {line[:60]}", _MEND)
+                raise InputError(path, place, f"is not valid: {line[:60]}", _MEND)
     if not form or count < 0:
-        raise InputError(path, "header", "names no format, or no vertices", _MEND)
+        raise InputError(path, "header", "has no format, or no vertices", _MEND)
     return form, count, properties, line_end + 1
 
 
@@ -98,7 +98,7 @@ def _count(path: Path, place: str, text: str) -> int:
     if not (text.isascii() and text.isdigit()) or len(text) > 18:
         raise InputError(path, place, f"{text[:40]} is not a number of vertices", _MEND)
     if int(text) > MAX_POINTS:
-        raise InputError(path, place, f"{int(text):,} vertices", f"Give at most {MAX_POINTS:,}")
+        raise InputError(path, place, f"has {int(text):,} vertices", f"Give at most {MAX_POINTS:,}")
     return int(text)
 
 
@@ -117,7 +117,7 @@ def _binary(
 
 def _ascii(path: Path, body: memoryview, count: int, properties: list[tuple[str, str]], _: str) -> _Columns:
     if count > _MAX_ASCII_POINTS:
-        raise InputError(path, "format", f"{count:,} vertices as text", "Save it as binary PLY")
+        raise InputError(path, "format", f"has {count:,} vertices as text", "Save it as binary PLY")
     # A number takes a character and a space at least: nothing is made for vertices that cannot be there.
     if len(body) < count * (2 * len(properties) - 1):
         raise _short(path, count, len(body) // (2 * len(properties)))
@@ -125,7 +125,7 @@ def _ascii(path: Path, body: memoryview, count: int, properties: list[tuple[str,
     try:
         table = np.array([line.split() for line in lines], "S32").astype(np.float64)
     except ValueError:
-        raise InputError(path, "vertices", "rows that are not numbers, or of unlike length", _MEND) from None
+        raise InputError(path, "vertices", "are not rows of numbers of equal length", _MEND) from None
     if table.shape != (count, len(properties)):
         raise _short(path, count, len(table))
     return {name: _as_declared(table[:, k], kind) for k, (name, kind) in enumerate(properties)}
@@ -137,7 +137,7 @@ def _as_declared(values: npt.NDArray[np.float64], kind: str) -> npt.NDArray[np.g
 
 
 def _short(path: Path, count: int, found: int) -> InputError:
-    return InputError(path, "element vertex", f"{count:,} vertices promised, {found:,} in the file", _MEND)
+    return InputError(path, "element vertex", f"has {found:,} of {count:,} vertices", _MEND)
 
 
 def _colour(values: npt.NDArray[np.generic]) -> U8:

@@ -1,4 +1,4 @@
-"""From frames to a scored grid of base poses around the target, step by step."""
+"""Score a grid of base poses around the target from frames."""
 
 from __future__ import annotations
 
@@ -110,30 +110,30 @@ class Prediction:
 
     @property
     def sure(self) -> str:
-        """How sure the answer is, in plain words."""
+        """Confidence in the answer, as text."""
         if self.best is None:
-            return "no answer: no place around the target was seen to be clear"
+            return "no answer: no clear base pose was observed around the target"
         score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
         if score < _LIKELY:
             unseen = self.rows(UNSEEN)
             better = len(unseen) > 0 and float(self.score[unseen[0]]) >= _LIKELY
-            return "doubtful: the scorer calls even the best place bad" + (
-                "; there are better ones whose floor was not seen" if better else ""
+            return "doubtful: even the best base pose has a low score" + (
+                "; some whose floor is not visible score higher" if better else ""
             )
         if self.places.state[self.best] == STATES.index(UNSEEN):
-            return "good if the floor there is free, which was not seen"
+            return "good if the floor there is free, which is not visible"
         doubt = any(ground.doubt is not None for ground in self.grounds)
         if score < _SURE or thin or doubt or self.crop_seen < 0.1:
-            return "likely, not sure: " + (
-                "a middling score"
+            return "likely: " + (
+                "a medium score"
                 if score < _SURE
-                else "the floor is in doubt"
+                else "the floor is uncertain"
                 if doubt
                 else "few points of the target"
                 if thin
-                else "little was seen"
+                else "few surroundings were observed"
             )
-        return "sure, as far as scores go"
+        return "high, by the scores"
 
 
 _CROP = ObservationParams()
@@ -207,10 +207,10 @@ def _grounds(
     frames: Sequence[SensorFrame], camera_height_m: float | None, gravity: F64 | None
 ) -> list[Ground]:
     if not frames:
-        raise InputError("frames", "", "none is given", "Give at least one frame")
+        raise InputError("frames", "", "are missing", "Give at least one frame")
     for frame in frames:
         if len(frames) > 1 and frame.T_world_camera is None:
-            mend = "Several frames need T_world_camera each: pose.json in its folder, or in the .npz"
+            mend = "Give each of several frames its T_world_camera: pose.json in its folder, or in the .npz"
             raise InputError(frame.place, "pose", "missing", mend)
     height_m = camera_height_m if len(frames) == 1 else None
     return [find_ground(frame, height_m, gravity) for frame in frames]
@@ -223,9 +223,9 @@ def _with_target(
     first, image = frames[0], frames[0].image
     if click is not None:
         if image is None:
-            raise InputError("--click", "", "a cloud has no pixels", "Give a frame of pictures first")
+            raise InputError("--click", "", "needs an image, not a cloud", "Give a frame with an image first")
         if image.mask is not None:
-            raise InputError("--click", "", "the frame has a mask already", "Give one of --click and --mask")
+            raise InputError("--click", "", "is given with a mask", "Give one of --click and --mask")
         grown = replace(image, mask=grow_mask(image, click, grounds[0].T_world_camera))
         return [
             image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"}),
@@ -233,7 +233,7 @@ def _with_target(
         ]
     if not any(frame.on_target is not None for frame in frames):
         mend = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
-        raise InputError(first.place, "target", "nothing says which pixels are the target's", mend)
+        raise InputError(first.place, "target", "is not marked", mend)
     return list(frames)
 
 
@@ -256,10 +256,10 @@ def _locate(seen: SeenPoints) -> TargetBox:
 
 def _grid(cells: int, half_width_m: float) -> CandidateParams:
     if not 2 <= cells <= 200:
-        raise InputError("--grid", str(cells), "not between 2 and 200", "Ask for 25, as in training")
+        raise InputError("--grid", str(cells), "is not between 2 and 200", "Give 25, as in training")
     if not 0.05 <= half_width_m <= 5.0:
         raise InputError(
-            "--half-width", str(half_width_m), "not between 0.05 and 5", "Ask for 1.0, as in training"
+            "--half-width", str(half_width_m), "is not between 0.05 and 5", "Give 1.0, as in training"
         )
     return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
 
@@ -302,23 +302,21 @@ def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tu
     notes: list[str] = []
     for ground in grounds:
         if ground.doubt is not None:
-            notes.append(
-                f"what was taken for the floor is in doubt: {ground.doubt}; give --gravity or a pose"
-            )
+            notes.append(f"the detected floor is uncertain: {ground.doubt}; give --gravity or a pose")
         if ground.offset_m is not None and abs(ground.offset_m) > 0.03:
             notes.append(
-                f"the floor that is seen lies at {ground.offset_m:+.3f} m, not at 0: check its camera"
+                f"the observed floor is at {ground.offset_m:+.3f} m, not at 0: check the camera's pose"
             )
     if filled is not None and filled.missing_pixels:
         share = filled.missing_pixels / filled.mask_pixels
         notes.append(
-            f"{filled.missing_pixels} target pixels had no depth ({share:.0%}) and took their neighbour's"
+            f"{filled.missing_pixels} target pixels without depth ({share:.0%}) were filled from neighbours"
         )
     if cloud.n < _CROP.n_points:
         notes.append(
-            f"only {cloud.n} points within {_CROP.crop_radius_m:g} m of the target, {_CROP.n_points} wanted"
+            f"only {cloud.n} points within {_CROP.crop_radius_m:g} m of the target, of {_CROP.n_points}"
         )
     few = int(cloud.target_mask.sum())
     if few < _CROP.min_target_points:
-        notes.append(f"only {few} points on the target, {_CROP.min_target_points} wanted")
+        notes.append(f"only {few} points on the target, of {_CROP.min_target_points}")
     return tuple(notes)

@@ -1,4 +1,4 @@
-"""A prediction in words, and as a JSON document."""
+"""A prediction as text, and as a JSON document."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def world_axes(prediction: Prediction) -> str:
 
 
 def told(prediction: Prediction) -> list[tuple[str, str]]:
-    """The answer in lines of a head and a text, for people."""
+    """The answer as rows of a heading and a text."""
     p, robot = prediction, prediction.robot
     lines = [("best", "none"), ("sure", p.sure)]
     if p.best is not None:
@@ -38,12 +38,12 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
         lines.append(("unseen", f"their best scores {p.score[unseen[0]]:.3f} at ({x:.3f}, {y:.3f}) m"))
     x, y, z = p.target.center_m
     floor = p.grounds[0]
-    residual = "not seen" if floor.residual_m is None else f"residual {1000 * floor.residual_m:.1f} mm"
+    residual = "not visible" if floor.residual_m is None else f"residual {1000 * floor.residual_m:.1f} mm"
     missing = "" if p.missing_depth is None else f", {p.missing_depth:.1%} of the depth missing"
     lines += [
         ("target", f"({x:.3f}, {y:.3f}, {z:.3f}) m, {p.target_points} points; {p.target.how}"),
         ("floor", f"{residual}; from {floor.how}"),
-        ("cloud", f"{p.cloud.n} points, {p.crop_seen:.0%} of the crop seen{missing}"),
+        ("cloud", f"{p.cloud.n} points, {p.crop_seen:.0%} of the surroundings observed{missing}"),
         (
             "robot",
             f"camera {robot.camera_height_m:.2f} m, mount {robot.base_height_m:.2f} m, "

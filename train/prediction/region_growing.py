@@ -1,4 +1,4 @@
-"""The thing at a clicked pixel: what hangs together with it over what it stands on."""
+"""Segment the object at a clicked pixel by region growing above its support."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _BIN_M = 0.004
 
 
 def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> Bools:
-    """The pixels (H, W) of the thing at pixel (u, v): what hangs together with it over its support.
+    """Mask (H, W) of the object at pixel (u, v), by region growing above its support.
 
-    Grows from the pixel to neighbours of like depth, above the widest level surface that lies below the
-    clicked point; where it runs out over a higher surface, that one is the support.
-    InputError for a pixel outside the picture, or without depth.
+    The region grows to neighbours of similar depth, above the largest level surface below the clicked point;
+    where it spreads over a higher surface, that one is the support.
+        InputError for a pixel outside the picture, or without depth.
     """
     h, w = image.depth_m.shape
     u, v = click
     if not (0 <= u < w and 0 <= v < h):
-        raise InputError("--click", f"{u},{v}", f"outside the picture of {w}x{h}", "Give a pixel u,v in it")
+        raise InputError("--click", f"{u},{v}", f"is outside the image of {w}x{h}", "Give a pixel u,v in it")
     depth_m = image.depth_m
     if depth_m[v, u] == 0:
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
-        mend = "Click on another place of the target" if near else "Take the frame again, or give --mask"
-        raise InputError("--click", f"{u},{v}", "this pixel has no depth", mend)
+        mend = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
+        raise InputError("--click", f"{u},{v}", "has no depth", mend)
     grid, facets = image.world_grid(T_world_camera), image.facets(T_world_camera)
     seed = grid[v, u]
     far_m = np.linalg.norm(grid - seed, axis=2)

@@ -1,4 +1,4 @@
-"""Which points are the target's, and where its centre is, of which only a part is seen."""
+"""Find the target's points and estimate its centre from the visible part."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     middle = np.median(target_m, axis=0)
     kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
     if len(kept) < _LEAST_POINTS:
-        problem = f"{len(kept)} points seen, {_LEAST_POINTS} are needed"
-        mend = "Give a mask of the whole target, or a frame that sees more of it"
+        problem = f"has {len(kept)} points, but {_LEAST_POINTS} are needed"
+        mend = "Give a mask of the whole target, or a frame that shows more of it"
         raise InputError("target", "", problem, mend)
     ahead = kept[:, :2].mean(axis=0) - eye_m[:2]
     far_m = float(np.linalg.norm(ahead))

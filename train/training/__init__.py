@@ -1,1 +1,1 @@
-"""Stages of training: a plain loop over batches, and checkpoints that go on exactly where they stopped."""
+"""Training: a plain loop over batches, and checkpoints that resume exactly."""

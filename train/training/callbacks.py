@@ -50,7 +50,7 @@ class CallbackList:
 
 
 class TensorBoardCallback:
-    """Curves for TensorBoard. A training that goes on replaces what was drawn beyond `step`."""
+    """Curves for TensorBoardCallback. A resumed training replaces those beyond `step`."""
 
     def __init__(self, folder: str, step: int = 0) -> None:
         try:

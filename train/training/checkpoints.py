@@ -1,4 +1,4 @@
-"""A checkpoint: one file with a model's weights, where they come from, and all that training goes on from.
+"""A checkpoint: one file with a model's weights, their origin, and the state to resume training.
 
 On disk it is a file of `torch.save` with one flat dictionary: `head`, a JSON text, and tensors under
 `weights/` (the best epoch's) and `resume/` (the last step's model and optimiser). Numbers that are no
@@ -31,11 +31,11 @@ from datagen.train.training.torch_file_check import MAX_BYTES, refuse_foreign, r
 from datagen.train.training.validation import ValidationMetrics
 
 FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
-_MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
+_MEND = "Name a checkpoint of `datagen train`, or train it again"
 
 
 class EpochRecord(ValidationMetrics):
-    """What an epoch came to."""
+    """The results of an epoch."""
 
     epoch: int  # counted from 1
     step: int
@@ -45,7 +45,7 @@ class EpochRecord(ValidationMetrics):
 
 @dataclass(frozen=True)
 class CheckpointHead:
-    """What a checkpoint says of itself. Everything in it is plain data."""
+    """The metadata of a checkpoint, as plain data."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -71,7 +71,7 @@ class CheckpointHead:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A whole checkpoint: `weights` of the best epoch; `resume` and `loop` of the last step."""
+    """A complete checkpoint: `weights` of the best epoch; `resume` and `loop` of the last step."""
 
     head: CheckpointHead
     weights: dict[str, Tensor]
@@ -83,7 +83,7 @@ _HEAD = TypeAdapter(CheckpointHead)
 
 
 def load_model(path: str | Path, device: str | torch.device = "cpu") -> tuple[Model, CheckpointHead]:
-    """The model of a checkpoint with its best weights, in evaluation mode, and what is known of it.
+    """Load the model of a checkpoint with its best weights, in evaluation mode, and its metadata.
 
     InputError, one line, for what is missing, cut, foreign, of a newer format or does not fit its model.
     """
@@ -104,13 +104,13 @@ def put_weights(model: Model, weights: Mapping[str, Tensor], place: str) -> None
     for name, tensor in wanted.items():
         ours, theirs = (tuple(tensor.shape), tensor.dtype), (tuple(weights[name].shape), weights[name].dtype)
         if ours != theirs:
-            problem = f"{theirs[1]} {theirs[0]}, where the model has {ours[1]} {ours[0]}"
+            problem = f"is {theirs[1]} {theirs[0]}, but {ours[1]} {ours[0]} in the model"
             raise InputError(place, name, problem, _MEND)
     model.load_state_dict(weights)
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """All of a checkpoint, on the CPU. InputError as `load_model`; memory is bounded by the file's size."""
+    """Load a complete checkpoint on the CPU. InputError as `load_model`; memory is bounded by its size."""
     place, data = str(path), read_regular(Path(path), MAX_BYTES, _MEND)
     refuse_foreign(place, data)
     try:
@@ -133,7 +133,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Replace the file as a whole: after a crash at any point it is the old one or the new one.
+    """Replace the file atomically: after a crash it is the old one or the new one.
 
     InputError, and the file stays, where a weight or the optimiser's state is not finite.
     """
@@ -155,7 +155,7 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
 
 @contextmanager
 def only_writer(path: str | Path) -> Generator[None]:
-    """Hold the checkpoint for this process. InputError while another on this machine holds it."""
+    """Lock the checkpoint for this process. InputError while another one on this machine holds it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name}.lock")
@@ -167,7 +167,7 @@ def only_writer(path: str | Path) -> Generator[None]:
             mine = False
         if not mine:
             mend = "Wait for it, stop it, or give another --out"
-            raise InputError(path, "", "another process is training it", mend)
+            raise InputError(path, "", "is being trained by another process", mend)
         try:
             yield
         finally:
@@ -177,11 +177,11 @@ def only_writer(path: str | Path) -> Generator[None]:
 def _refuse_not_finite(place: str, tensors: Mapping[str, Tensor], mend: str) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise InputError(place, name, "holds NaN or infinite numbers", mend)
+            raise InputError(place, name, "has NaN or infinite numbers", mend)
 
 
 def _own(tensor: Tensor) -> Tensor:
-    """A dense copy on the CPU: a view would be saved with all of what it is a view of."""
+    """A dense copy on the CPU: a view would be saved with its whole base tensor."""
     return tensor.detach().cpu().contiguous().clone()
 
 
@@ -191,12 +191,12 @@ def _document(place: str, text: object) -> dict[str, Any]:
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(place, "head", "not a checkpoint of this program", _MEND)
+        raise InputError(place, "head", "is not that of a datagen checkpoint", _MEND)
     refuse_odd_values(place, document)
     version = document.get("format_version")
     if version != FORMAT_VERSION:
-        problem = f"{version!r:.20}, and this program reads {FORMAT_VERSION}"
-        raise InputError(place, "format_version", problem, "Use the version of the program that wrote it")
+        problem = f"is {version!r:.20}, but this program reads {FORMAT_VERSION}"
+        raise InputError(place, "format_version", problem, "Use the version of datagen that wrote it")
     return document
 
 

@@ -1,4 +1,4 @@
-"""What a training shows while it runs: its steps and epochs as progress."""
+"""Progress of a training: steps and epochs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that train together, and a Ctrl-C that lets them end their step first."""
+"""Start training processes, and let them finish their step after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from datagen.schemas.locked_folders import locked_folder
 from datagen.train.training.ranks import Ranks
 
 Stopping = Callable[[], bool]
-# What each process does, importable by name; True when it came to its end.
+# The function of each process, importable by name; True when it finished.
 ProcessWork = Callable[[Any, Ranks, Stopping], bool]
 _PREFIX = "datagen-ranks-"
 
 
 @contextmanager
 def interruptible() -> Generator[Stopping]:
-    """Give a function that tells whether Ctrl-C (or SIGTERM) came. A second one ends the block at once."""
+    """Give a function that returns whether Ctrl-C (or SIGTERM) came. A second one ends the block at once."""
     came = False
 
     def note(_number: int, _frame: FrameType | None) -> None:
@@ -45,7 +45,7 @@ def interruptible() -> Generator[Stopping]:
 
 
 def train_in_processes(work: ProcessWork, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
-    """Run `work(job, ranks, stopping)` in so many new processes that can reach each other.
+    """Run `work(job, ranks, stopping)` in new processes that can reach each other.
 
     What one of them raises as InputError is raised here, and ends the others; so does the end of this
     process. Returns whether they came to their end.
@@ -86,8 +86,8 @@ def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: St
             child = waiting.pop(here)  # type: ignore[arg-type]
             if answer is None:
                 child.join()
-                problem = f"a process ended with {child.exitcode} and said nothing"
-                mend = "The same command goes on; give it fewer --processes if memory was short"
+                problem = f"a process exited with code {child.exitcode} without a message"
+                mend = "Run the same command to resume, with fewer --processes if memory was short"
                 raise InputError("datagen train", "--processes", problem, mend)
             finished = finished and bool(answer)
     return finished

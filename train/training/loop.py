@@ -1,4 +1,4 @@
-"""The loop: batches, steps, validation, early stopping, and a position from which it goes on exactly.
+"""The training loop: batches, steps, validation, early stopping, and a position to resume from.
 
 Nothing random has a state that would have to be kept: batches follow from seed and epoch, and what a
 step draws (dropout) from seed, epoch, batch and rank.
@@ -141,7 +141,7 @@ def _step(
 
 
 def _end_epoch(training: Training, clock: _Clock, callback: TrainingCallback) -> None:
-    """Validate, keep the best weights in mind, and decide whether to go on."""
+    """Validate, keep the best weights, and decide whether to continue."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
     weight, loss, hits, samples = at.sums
@@ -178,8 +178,8 @@ def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> 
     raise InputError(
         f"training, epoch {at.epoch + 1}, batch {at.batch + 1}",
         what,
-        f"not a number, at {len(ids)} of its samples: {named}",
-        "Nothing was overwritten. Look at one by `datagen replay`, or give a smaller --lr and a new --out",
+        f"is not finite for {len(ids)} samples: {named}",
+        "Nothing was overwritten. Check one with `datagen replay`, or give a smaller --lr and a new --out",
     )
 
 

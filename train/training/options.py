@@ -1,4 +1,4 @@
-"""What a training is told, and what the three stages are."""
+"""Options of a training, and the three stages."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Options:
     epochs: int
     batch_scenes: int = 16
     house_share: float = 1.0  # of the houses that could be trained on; a larger share has those of a smaller
-    candidates_per_robot: int | None = None  # a random so many of each robot in each epoch; None for all
+    candidates_per_robot: int | None = None  # sampled per robot per epoch; None for all
     lr: float = 2e-3  # the highest of the schedule
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
     warmup: float = 0.05  # share of the steps in which the rate rises from 0

@@ -1,4 +1,4 @@
-"""What a file of `torch.save` declares, read as plain data: nothing is called, nothing larger than the file.
+"""Check a file of `torch.save` without executing code and with memory bounded by the file's size.
 
 `torch.load(weights_only=True)` calls no foreign code, yet it allocates what a pickle asks for, and not every
 release compares the size that a pickle states with that of the record. Whoever loads a checkpoint of unknown
@@ -25,7 +25,7 @@ _MAX_RECORDS = 100_000
 _MAX_AXES = 64
 _ITEM_BYTES = {f"torch {k}Storage": n for k, n in {"Float": 4, "Long": 8, "Byte": 1, "Bool": 1}.items()}
 _REBUILD, _HOOKS = "torch._utils _rebuild_tensor_v2", "collections OrderedDict"
-_MEND = "Name a checkpoint that `datagen train` wrote, or train it again"
+_MEND = "Name a checkpoint of `datagen train`, or train it again"
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ def refuse_foreign(place: str, data: bytes) -> None:
     try:
         _check(data)
     except zipfile.BadZipFile as e:
-        raise InputError(place, "", f"no checkpoint, or one that was cut ({e})", _MEND) from None
+        raise InputError(place, "", f"is not a checkpoint, or incomplete ({e})", _MEND) from None
     except (*DAMAGED_ZIP, IndexError, KeyError, TypeError) as e:
-        raise InputError(place, "", f"not a checkpoint of this program ({e})", _MEND) from None
+        raise InputError(place, "", f"is not a datagen checkpoint ({e})", _MEND) from None
 
 
 def refuse_odd_values(place: str, document: dict[str, Any]) -> None:

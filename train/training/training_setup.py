@@ -128,9 +128,9 @@ def _resume_position(
     batch, sums = there.loop.get("batch"), there.loop.get("sums")
     best = there.head.best_epoch
     if type(batch) is not int or batch < 0 or not isinstance(sums, list) or len(sums) != 4:
-        raise InputError(place, "loop", "no position to go on from", "Train it again to another file")
+        raise InputError(place, "loop", "has no position to resume from", "Train it again to another file")
     if best is not None and not 1 <= best <= len(there.head.history):
-        raise InputError(place, "best_epoch", "beyond the history", "Train it again to another file")
+        raise InputError(place, "best_epoch", "is beyond the history", "Train it again to another file")
     return Position(
         epoch=there.head.epoch,
         batch=batch,
@@ -147,7 +147,7 @@ def _resume_position(
 def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream]:
     options = job.options
     if options.batch_scenes % ranks.world:
-        problem = f"{options.batch_scenes} scenes cannot be shared out evenly among {ranks.world} processes"
+        problem = f"{options.batch_scenes} scenes cannot be divided evenly among {ranks.world} processes"
         raise InputError("datagen train", "--batch-scenes", problem, f"Give a multiple of {ranks.world}")
     sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
     sizes["allow_incomplete"] = job.allow_incomplete
@@ -180,14 +180,14 @@ def _refuse_other_labels(stage: str, stream: SampleStream) -> None:
         source = summary.part.schema
         if source not in wanted:
             fitting = " or ".join(name for name, other in STAGES.items() if source in other.label_sources)
-            problem = f"{source} labels, and {stage} learns from those of {' or '.join(wanted)}"
-            raise InputError(summary.part.place, "label_source", problem, f"Train {fitting} on it")
+            problem = f"is {source}, but {stage} trains on {' or '.join(wanted)} labels"
+            raise InputError(summary.part.place, "label_source", problem, f"Use it for {fitting}")
 
 
 def _refuse_known_houses(job: TrainingJob, began: CheckpointHead, val: SampleStream) -> None:
     known = sorted(val.house_ids() & set(began.house_ids))
     if known:
-        problem = f"{known[0]!r} was trained on by --init, and would be judged on ({len(known)} such houses)"
+        problem = f"{known[0]!r} is in the training data of --init ({len(known)} such houses)"
         raise InputError(job.init or "", "house_id", problem, "Name runs of other houses with --val")
 
 
@@ -206,8 +206,8 @@ def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
     if began is not None:
         other = began.head.model, began.head.model_config
         if other != (model.name, model.config):
-            problem = f"{other[0]} {other[1]}, where {model.name} {model.config} is asked for"
-            raise InputError(str(job.init), "model", problem, "Leave --model and --model-config out")
+            problem = f"is {other[0]} {other[1]}, not {model.name} {model.config}"
+            raise InputError(str(job.init), "model", problem, "Omit --model and --model-config")
         put_weights(model, began.weights, str(job.init))
     return model.to(job.device)
 
@@ -241,15 +241,15 @@ def _all(ours: Iterable[str], theirs: Iterable[str]) -> tuple[str, ...]:
 
 
 def refuse_other_training(place: str, there: CheckpointHead, here: CheckpointHead) -> None:
-    """InputError that names the fields in which a checkpoint was made otherwise than it would be now."""
+    """Raise InputError with the fields in which a checkpoint differs from these options."""
     theirs, ours = _decisive(there), _decisive(here)
     names = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
     if names:
         shown = [f"{name} ({theirs.get(name)}, now {ours.get(name)})" for name in names[:4]]
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-        problem = f"another training is kept here: {', '.join(shown)}{more} differ"
+        problem = f"holds another training: {', '.join(shown)}{more} differ"
         raise InputError(
-            place, names[0], problem, "Give the options that it was begun with, or another --out"
+            place, names[0], problem, "Give the options that it was started with, or another --out"
         )
 
 

@@ -1,4 +1,4 @@
-"""How well a model does on scenes of houses that it does not learn from."""
+"""Validation of a model on scenes of other houses than it trains on."""
 
 from __future__ import annotations
 

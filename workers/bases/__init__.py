@@ -1,1 +1,1 @@
-"""Base poses: where a robot may be asked to stand, and whether its body fits there."""
+"""Base poses: candidates around the target, and their clearance."""

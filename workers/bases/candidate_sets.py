@@ -1,4 +1,4 @@
-"""Which candidates figures are given for, and the bands of numbers by which they are told apart."""
+"""Candidate sets for statistics, and bands of quantities to group by."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating[Any]]
 Edges = Sequence[float | None]
 
-# From the narrowest. On a whole grid most candidates are far away or stand in a table, which any rule gets
-# right, so accuracy says little without the name of the set.
+# Narrowest first. On a whole grid most candidates are far away or inside furniture, which any rule gets
+# right, so accuracy is meaningless without the set.
 CANDIDATE_SETS = ("in-range", "clear", "grid")
 
 TENTHS = tuple(round(0.1 * k, 1) for k in range(11))
 DISTANCE_EDGES_M: Edges = (*TENTHS, None)
-# Those of the visibility score: hidden, partly seen, nearly free.
+# Edges of the visibility score: hidden, partly visible, nearly free.
 VISIBILITY_EDGES: Edges = (0.0, 0.04, 0.2, 0.4, 0.6, 0.8, None)
 
 
 def in_set(name: str, is_clear: Bools, mount_distance_m: Floats, arm_reach_m: Floats) -> Bools:
-    """Which candidates (N,) belong to a set of CANDIDATE_SETS: clear, clear and within reach, or all."""
+    """Mask (N,) of the candidates in a set of CANDIDATE_SETS: clear, clear and within reach, or all."""
     match name:
         case "in-range":
             return is_clear & (mount_distance_m <= arm_reach_m)
@@ -35,7 +35,7 @@ def in_set(name: str, is_clear: Bools, mount_distance_m: Floats, arm_reach_m: Fl
 
 
 def bands(values: Floats, edges: Edges) -> list[tuple[float, float | None, Bools]]:
-    """Rows (N,) in each band [low, high) that holds any; an edge None is beyond all values."""
+    """Masks (N,) of each non-empty band [low, high); an edge None is unbounded."""
     found: list[tuple[float, float | None, Bools]] = []
     for low, high in pairwise(edges):
         assert low is not None

@@ -1,4 +1,4 @@
-"""Base positions around the target, and the robots that stand there (GBPP, Sec. IV-A)."""
+"""Sample base positions around the target and their robots (GBPP, Sec. IV-A)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datagen.workers.scene_rejected import SceneRejected
 
 Bools = npt.NDArray[np.bool_]
 
-# Times that all cells are looked at, each with its own jitter, before a scene is given up.
+# Rounds over all cells, each with new jitter, before a scene is rejected.
 _ROUNDS = 8
 
 
@@ -58,12 +58,11 @@ def grid_offsets(params: CandidateParams) -> F64:
 def draw_candidates(
     target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
 ) -> SceneCandidates:
-    """All cells of the grid, or `per_scene` positions jittered within their cells, with robots on them.
+    """Return all cells of the grid, or `per_scene` positions jittered within cells, with their robots.
 
-    Cells are drawn from all without repetition, or from those that `within` asks for. Robots:
-    `robots_per_scene` of them with the candidates dealt out in turn, so that a model can encode a
-    scene once a robot; or one a candidate, as the paper has it. Raises SceneRejected("no_base") where
-    around this target there are too few places of the asked kind for these robots.
+    Cells are sampled from all without repetition, or from the set `within`. Candidates are assigned in turn
+    to `robots_per_scene` robots, so that a model encodes a scene once per robot; or each has its own robot,
+    as in the paper. Raises SceneRejected("no_base") where too few cells are in the set for these robots.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
@@ -113,7 +112,7 @@ def _stand(
     obstacles: Obstacles,
     params: CandidateParams,
 ) -> SceneCandidates:
-    """Robots put on their places (N, 2), world, with what is free around them."""
+    """SceneCandidates of robots at positions (N, 2), world, with their clearance."""
     camera_m, base_m = robots.camera_height_m[robot_index], robots.base_height_m[robot_index]
     clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, obstacles, params)
     reach_m = robots.arm_reach_m[robot_index]
@@ -128,10 +127,10 @@ def _places_within(
     robot_index: npt.NDArray[np.int16],
     rng: np.random.Generator,
 ) -> F32:
-    """A place (N, 2), world, of the asked kind for the robot of each candidate.
+    """A position (N, 2), world, in the required set for the robot of each candidate.
 
-    A round looks at every cell in a random order and gives each at most once; cells come a second
-    time only where a whole round did not hold enough.
+    A round visits every cell in random order and uses each at most once; further rounds follow only where one
+    does not give enough.
     """
     cells = grid_offsets(params)
     base_xy_m = np.empty((len(robot_index), 2), np.float32)
@@ -155,7 +154,7 @@ def _places_within(
 
 
 def _is_within(candidates: SceneCandidates, target_center_m: F64, params: CandidateParams) -> Bools:
-    """Which candidates (N,) are of the kind that `params.within` asks for."""
+    """Mask (N,) of the candidates in the set `params.within`."""
     clear = candidates.clearance_m >= 0
     if params.within == "clear":
         return clear

@@ -1,4 +1,4 @@
-"""Whether a robot's body fits where it would stand."""
+"""Clearance of a robot's body at base positions."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from datagen.workers.geometry.planar import (
 )
 from datagen.workers.houses.house import House
 
-# A base rolls over what is flatter than this, and floors lie below it.
+# Obstacles lower than this are ignored, and floors are below it.
 STEP_M = 0.02
-# Clearances beyond this are cut to it: only the neighbourhood is looked at.
+# Clearances are capped at this: only the neighbourhood is checked.
 FAR_M = 1.0
-_BLOCK = 64  # footprints looked at together; bounds memory
+_BLOCK = 64  # footprints per block; bounds memory
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Floor plan of a house: one convex footprint a body part, with the heights it spans."""
+    """Floor plan of a house: one convex footprint per body part, with its height range."""
 
     polygons_m: F64  # (P, K, 2), counter-clockwise, padded by repeating the last corner
     low_m: F64  # (P,)
@@ -47,12 +47,12 @@ def obstacles_of(house: House) -> Obstacles:
 def base_clearance_m(
     base_xy_m: F32, base_height_m: F32, camera_height_m: F32, obstacles: Obstacles, params: CandidateParams
 ) -> F32:
-    """Free distance (N,) around robots' bodies; negative where one cuts an obstacle or stands in no room.
+    """Clearance (N,) of robots' bodies (m); negative inside an obstacle or outside every room.
 
-    Robot k stands at `base_xy_m` (N, 2), world, with its arm's mount and its camera at the heights
-    (N,). Its body is a cylinder of `base_radius_m` from the floor to the mount and a mast of
-    `mast_radius_m` from there to the camera. An obstacle counts against the cylinder where it
-    begins below the mount, and against the mast where it lies between mount and camera.
+    Robot k is at `base_xy_m` (N, 2), world, with its arm's mount and its camera at the heights
+        (N,). Its body is a cylinder of `base_radius_m` from the floor to the mount and a mast of
+        `mast_radius_m` from there to the camera. An obstacle counts against the cylinder where it
+        begins below the mount, and against the mast where it lies between mount and camera.
     """
     xy = base_xy_m.astype(np.float64)
     mount_m = base_height_m.astype(np.float64)

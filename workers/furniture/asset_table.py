@@ -44,14 +44,14 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list).
     """
     path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
-    mend = "Put asset_sizes.json beside the houses; `datagen assets fetch` brings both."
+    mend = "Put asset_sizes.json into the folder; `datagen assets fetch procthor-10k` gets both."
     if path is None:
-        raise InputError(folder, "", f"no size table ({' or '.join(TABLE_NAMES)})", mend)
+        raise InputError(folder, "", f"has no size table ({' or '.join(TABLE_NAMES)})", mend)
     text = read_regular(path, _LARGEST_TABLE_BYTES, mend)
     root = parse_json(text, str(path))
     assets = [_own_entry(node) if own else _thor_entry(node) for node, own in _entries(root)]
     if not assets:
-        raise InputError(path, "", "the size table is empty", mend)
+        raise InputError(path, "", "is an empty size table", mend)
     return {asset.asset_id: asset for asset in assets}, text
 
 
@@ -62,9 +62,9 @@ def _entries(root: JsonNode) -> Iterator[tuple[JsonNode, bool]]:
         return
     members: Mapping[str, object] = root.value if isinstance(root.value, dict) else {}
     if not members:
-        raise root.error("neither an object of assets nor a list of them")
+        raise root.error("is neither an object of assets nor a list of them")
     if len(members) > _MAX_ASSETS:
-        raise root.error(f"more than {_MAX_ASSETS} entries")
+        raise root.error(f"has more than {_MAX_ASSETS} entries")
     for key, value in members.items():
         node = JsonNode(root.place, f"$.{key[:100]}", value)
         if isinstance(value, list):
@@ -80,7 +80,7 @@ def _own_entry(node: JsonNode) -> Asset:
     entry = JsonNode(node.place, node.path, value)
     sides = [_side(s) for s in entry.get("size").items(3)]
     if len(sides) != 3:
-        raise entry.get("size").error(f"{len(sides)} numbers where 3 belong")
+        raise entry.get("size").error(f"has {len(sides)} numbers, not 3")
     width, height, depth = sides
     rest = entry.find("surface_height_m")
     basis = entry.find("surface_basis")

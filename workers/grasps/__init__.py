@@ -1,1 +1,1 @@
-"""Grasps: where a parallel gripper can take an object, found once an object and kept by content."""
+"""Grasps of an object by a parallel gripper, computed once per object and cached by content."""

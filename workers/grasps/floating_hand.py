@@ -1,4 +1,4 @@
-"""Does a grasp hold? A hand without an arm closes on the object and is pulled about, by SAPIEN's PhysX."""
+"""Score grasps: a floating hand closes on the object, which is then pulled, in SAPIEN's PhysX."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grasps by content: worked out once, kept in memory and in the user's cache folder."""
+"""Cache of grasps by content, in memory and in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams) -> Gras
 
 
 def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> ScoredGrasps:
-    """All grasps that were scored, from memory, from the cache folder, or worked out and then kept.
+    """All scored grasps, from memory, from the cache folder, or computed and then cached.
 
     A cache that is broken or cannot be written costs seconds, never a result.
     """

@@ -1,4 +1,4 @@
-"""All that is found out about one object in one gripper: poses that fit, a varied few of them scored."""
+"""Search grasps of one object by one gripper: collision-free poses, of which a varied set is scored."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def search_grasps(
     volume.
     """
     if not model.convex_parts_m or not all(np.isfinite(part).all() for part in model.convex_parts_m):
-        return _none(0, "it has no collision parts, or a corner that is not finite")
+        return _none(0, "no collision parts, or a corner that is not finite")
     try:
         T, opening_m, n_tried = _free_poses(model, gripper, rng)
     except QhullError:
@@ -82,7 +82,7 @@ def search_grasps(
     poses = np.concatenate([T, turned[fits]])
     order = np.lexsort((np.arange(len(row)) >= len(T), row, -score[row]))[:per_object]
     row = row[order]
-    reason = "" if score.any() else "no grasp holds it"
+    reason = "" if score.any() else "no grasp holds the object"
     return ScoredGrasps(
         poses[order],
         opening_m[row].astype(np.float32),

@@ -1,4 +1,4 @@
-"""Which objects a gripper can take from a table, by the grasps that were found and tried."""
+"""Select objects that a gripper can lift from a table, by their scored grasps."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> G
 
 
 class Targets:
-    """The objects of a source that can be targets of one gripper; each is worked out when first asked for.
+    """The objects of a source that can be targets of one gripper, each computed on first use.
 
     Of a family of sizes at most `PER_FAMILY` are: the smallest and the largest that are graspable, and
-    so on inwards. What lies between is never worked out.
+    so on inwards. Those in between are never computed.
     """
 
     def __init__(

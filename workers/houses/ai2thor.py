@@ -90,7 +90,7 @@ class Ai2thorHouses:
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file and the field."""
         if house_id not in self.scenes:
-            raise InputError(self.root, "", f"no house {house_id!r}", "Choose an id that it holds.")
+            raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
         path = self.scenes[house_id]
         text = read_regular(path, _MAX_SCENE_BYTES, _MEND)
         scene = parse_json(text, str(path))
@@ -99,7 +99,7 @@ class Ai2thorHouses:
         digest.update(stage.digest)
         mesh = _without_ceiling(stage.mesh.transformed(_stage_pose(is_stage_turned)))
         if not len(mesh.faces):
-            raise scene.get("stage_instance").error("a stage without walls or floor", _MEND)
+            raise scene.get("stage_instance").error("has neither walls nor floor", _MEND)
         skipped: Counter[str] = Counter()
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
@@ -185,11 +185,11 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     roots = [base, base / "ai2thor", base / "scene_datasets/ai2thor", base / "data/scene_datasets/ai2thor"]
     root = next((r for r in roots if folder and (r / _SCENES).is_dir()), None)
     if root is None:
-        raise InputError(folder or "ai2thor", "", "no ai2thor-hab/configs/scenes folder in it", mend)
+        raise InputError(folder or "ai2thor", "", "has no folder ai2thor-hab/configs/scenes", mend)
     top = root / _SCENES
     sizes = {p.relative_to(top).as_posix().removesuffix(_SUFFIX): n for p, n in _sizes(top, f"*{_SUFFIX}")}
     if not sizes:
-        raise InputError(top, "", "no scenes in it", mend)
+        raise InputError(top, "", "has no scenes", mend)
     listing: list[object] = [[i, sizes[i]] for i in sorted(sizes)]
     places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
     files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
@@ -207,9 +207,9 @@ def _sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
         raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _MEND) from None
     odd = next((p for p, _ in found if not p.relative_to(folder).as_posix().isprintable()), None)
     if odd is not None:
-        raise InputError(odd, "", "a file name with unprintable characters", "Rename the file.")
+        raise InputError(odd, "", "has a name with unprintable characters", "Rename the file.")
     if len(found) > _MAX_FILES:
-        raise InputError(folder, "", f"more than {_MAX_FILES:,} files", "Take some out.")
+        raise InputError(folder, "", f"has more than {_MAX_FILES:,} files", "Remove some.")
     return sorted(found)
 
 
@@ -242,7 +242,7 @@ def _pose(entry: JsonNode) -> F64:
     found = entry.find("rotation")
     q = np.array([1.0, 0, 0, 0] if found is None else _numbers(found, 4, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
-        raise entry.get("rotation").error("not a unit quaternion")
+        raise entry.get("rotation").error("is not a unit quaternion")
     w, i, j, k = q / np.linalg.norm(q)
     rotation = np.array(
         [
@@ -265,7 +265,7 @@ def _pose(entry: JsonNode) -> F64:
 def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
     values = [n.number(-limit, limit) for n in node.items(count)]
     if len(values) != count:
-        raise node.error(f"{len(values)} numbers where {count} belong")
+        raise node.error(f"has {len(values)} numbers, not {count}")
     return values
 
 

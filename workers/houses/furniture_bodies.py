@@ -73,9 +73,9 @@ def _children(entry: JsonNode) -> Iterator[JsonNode]:
 def _body(node: JsonNode, asset: Asset, T: F64, kind: BodyKind, seen: set[str]) -> StaticBody:
     body_id = node.get("id").text()
     if body_id in seen:
-        raise node.get("id").error(f"two objects have the id {body_id!r}")
+        raise node.get("id").error(f"belongs to two objects: {body_id!r}")
     if len(seen) >= MAX_BODIES:
-        raise node.error(f"more than {MAX_BODIES} objects in one house", "Remove the house.")
+        raise node.error(f"has more than {MAX_BODIES} objects", "Remove the house.")
     seen.add(body_id)
     mesh, parts_m = placed(*asset_geometry(asset), T)
     return StaticBody(body_id, kind, asset.object_type, asset.asset_id, "", mesh, parts_m)

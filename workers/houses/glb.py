@@ -23,7 +23,7 @@ _MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
 _PLAIN = (180, 178, 174)
 _MEND = "Download the asset again, or remove the scenes that use it."
-# What a damaged file makes the reader stumble over.
+# Exceptions of the reader for damaged files.
 _DAMAGE = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, struct.error, RecursionError,
     NotImplementedError, ZeroDivisionError, OverflowError, Image.DecompressionBombError,
@@ -46,7 +46,7 @@ def read_glb(path: Path) -> Mesh:
         if 0 < count <= MAX_FACES:
             return _merged([m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)])
     except _DAMAGE as error:
-        raise InputError(path, "", f"a damaged glTF file ({type(error).__name__})", _MEND) from None
+        raise InputError(path, "", f"is a damaged glTF file ({type(error).__name__})", _MEND) from None
     problem = "no triangles" if count == 0 else f"{count} triangles, more than {MAX_FACES}"
     raise InputError(path, "", problem, _MEND)
 
@@ -54,10 +54,10 @@ def read_glb(path: Path) -> Mesh:
 def _check_header(path: Path, data: bytes) -> None:
     """Refuse by the counts that the file itself states, before anything is unpacked."""
     if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
-        raise InputError(path, "", "not a binary glTF file", _MEND)
+        raise InputError(path, "", "is not a binary glTF file", _MEND)
     length = int.from_bytes(data[12:16], "little")
     if length > _MAX_JSON_BYTES:
-        raise InputError(path, "", f"a description of {length:,} bytes", _MEND)
+        raise InputError(path, "", f"has a description of {length:,} bytes", _MEND)
     root = parse_json(data[20 : 20 + length], str(path))
     try:
         counts = [int(a["count"]) for a in root.value.get("accessors", [])]
@@ -69,9 +69,9 @@ def _check_header(path: Path, data: bytes) -> None:
             ]
             counts += [counts[k] for k in named]
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
-        raise InputError(path, "", "its description is not valid glTF", _MEND) from None
+        raise InputError(path, "", "has an invalid description", _MEND) from None
     if counts and (min(counts) < 0 or sum(counts) > _MAX_COUNT):
-        raise InputError(path, "accessors", "absurd counts of vertices or indices", _MEND)
+        raise InputError(path, "accessors", "have impossible counts of vertices or indices", _MEND)
 
 
 def _merged(pieces: list[Any]) -> Mesh:

@@ -72,13 +72,13 @@ class LineIndex:
         text = bytes(self.data[offset : offset + length])
         if self._is_row(row, text):
             return text
-        # The unpacked copy was damaged. Passing the house over would give other scenes in silence.
+        # The unpacked copy was damaged. Skipping the house would silently give other scenes.
         number = int(self.line_numbers[row])
         text = next((line for n, line in _lines(self.path) if n == number), b"")
         if self._is_row(row, text):
             return text
         place = f"{self.path}:{number}"
-        raise InputError(place, "", "its bytes changed since it was opened", "Start again.")
+        raise InputError(place, "", "has changed since it was opened", "Run the command again.")
 
     def _is_row(self, row: int, text: bytes) -> bool:
         return hashlib.sha256(text).digest() == self.digests[row].tobytes()
@@ -98,12 +98,12 @@ def open_lines(path: Path, cache: Path | None) -> LineIndex:
         return _build_in_memory(path)
     except OSError as error:
         if isinstance(error, gzip.BadGzipFile):
-            raise InputError(path, "", f"not a gzip file ({error})", _MEND) from None
+            raise InputError(path, "", f"is not a gzip file ({error})", _MEND) from None
         raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
     except EOFError:
-        raise InputError(path, "", "the compressed file ends too early", _MEND) from None
+        raise InputError(path, "", "is a truncated gzip file", _MEND) from None
     except zlib.error as error:
-        raise InputError(path, "", f"the compressed data is damaged ({error})", _MEND) from None
+        raise InputError(path, "", f"has damaged compressed data ({error})", _MEND) from None
 
 
 def houses_cache() -> Path | None:
@@ -134,7 +134,7 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
             if len(line) > MAX_LINE_BYTES or number > MAX_LINES or room < 0:
                 problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB"
                 if len(line) <= MAX_LINE_BYTES:
-                    problem = f"more than {MAX_LINES:,} lines" if room >= 0 else "it unpacks to far too much"
+                    problem = f"more than {MAX_LINES:,} lines" if room >= 0 else "unpacks to too many bytes"
                 raise InputError(f"{path}:{number}", "", problem, _MEND)
             if line := line.strip():
                 yield number, line
@@ -142,7 +142,7 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
     """A .json file is one house, or a list of houses, each of which counts as a line."""
-    text = read_regular(path, MAX_LINE_BYTES * 4, "Store one house a line (.jsonl).").strip()
+    text = read_regular(path, MAX_LINE_BYTES * 4, "Store one house per line (.jsonl).").strip()
     if not text.startswith(b"["):
         yield 1, text
         return
@@ -151,7 +151,7 @@ def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
         try:
             yield number, canonical_json(node.value).encode()
         except (ValueError, RecursionError):
-            raise node.error("NaN or infinity in a list of houses", "Store one house a line.") from None
+            raise node.error("has NaN or infinity in a list of houses", "Store one house per line.") from None
 
 
 def _file_digest(path: Path) -> str:
@@ -227,7 +227,7 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
         refresh(index_path)
         return _index(path, data, arrays)
     except (OSError, ValueError):
-        return None  # absent or damaged: it is built anew
+        return None  # absent or damaged: it is rebuilt
 
 
 def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
@@ -254,6 +254,6 @@ def _build_in_memory(path: Path) -> LineIndex:
         collector.add(number, line)
         data += line + b"\n"
         if collector.offset > _MAX_IN_MEMORY_BYTES:
-            mend = "Set DATAGEN_CACHE to a folder with room for the unpacked houses."
-            raise InputError(path, "", "too large to unpack in memory", mend)
+            mend = "Set DATAGEN_CACHE to a folder with space for the unpacked houses."
+            raise InputError(path, "", "is too large to unpack in memory", mend)
     return _index(path, data, collector.arrays())

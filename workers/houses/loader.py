@@ -74,7 +74,7 @@ def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], li
     for entry in node.items(MAX_ROOMS):
         room_id = entry.get("id").text()
         if not room_id or room_id in seen:
-            raise entry.get("id").error(f"two rooms have the id {room_id!r}, or it is empty")
+            raise entry.get("id").error(f"is empty or belongs to two rooms: {room_id!r}")
         seen.add(room_id)
         outline = entry.get("floorPolygon")
         corners = np.array([_ground(p) for p in outline.items(MAX_CORNERS)], np.float64).reshape(-1, 2)
@@ -86,7 +86,7 @@ def _rooms(node: JsonNode, heights: Mapping[str, float]) -> tuple[list[Room], li
         mesh, parts_m = join(floor_solids(polygon_m, material_rgb(entry.find("floorMaterial"), True)))
         floors.append(StaticBody(f"floor-{room_id}", "wall", "Floor", "", room_id, mesh, parts_m))
     if not rooms:
-        raise node.error("a house without rooms", "Remove the house.")
+        raise node.error("has no rooms", "Remove the house.")
     return rooms, floors
 
 
@@ -97,7 +97,7 @@ def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment
     for entry in node.items(MAX_WALLS):
         wall_id = entry.get("id").text()
         if wall_id in walls:
-            raise entry.get("id").error(f"two walls have the id {wall_id!r}")
+            raise entry.get("id").error(f"belongs to two walls: {wall_id!r}")
         empty = entry.find("empty")
         if empty is not None and empty.value is True:
             skipped["open wall"] += 1  # a passage between two rooms, listed as a wall
@@ -105,7 +105,7 @@ def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment
         outline = entry.get("polygon")
         points = [p.point() for p in outline.items(16)]
         if len(points) != 4:
-            raise outline.error(f"{len(points)} corners where a wall has 4")
+            raise outline.error(f"has {len(points)} corners, not 4")
         height_m = max(p[1] for p in points) - min(p[1] for p in points)
         start, end = (points[0][0], points[0][2]), (points[1][0], points[1][2])
         if not 0.1 <= height_m <= _MAX_HEIGHT_M:
@@ -131,7 +131,7 @@ def _holes(node: JsonNode | None, walls: Mapping[str, WallSegment], is_door: boo
         outline = entry.get("holePolygon")
         points = [p.point() for p in outline.items(16)]
         if len(points) < 2:
-            raise outline.error(f"{len(points)} corners where a hole has at least 2")
+            raise outline.error(f"has {len(points)} corners, not at least 2")
         low, high = (min(p[0] for p in points), max(p[0] for p in points))
         bottom, top = (min(p[1] for p in points), max(p[1] for p in points))
         if high - low < 0.01 or top - bottom < 0.01:

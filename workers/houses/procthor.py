@@ -45,7 +45,7 @@ class ProcthorHouses:
     def load(self, house_id: str) -> House:
         """The house. Raises InputError that names the file, its line, the house and the JSON path."""
         if house_id not in self.rows:
-            raise InputError(self.folder, "", f"no house {house_id!r}", "Choose an id that it holds.")
+            raise InputError(self.folder, "", f"has no house {house_id!r}", "Give one of its ids.")
         if house_id in self.clashes:
             mend = "Rename or remove one of them."
             raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", mend)
@@ -71,22 +71,22 @@ def open_procthor(folder: str) -> ProcthorHouses:
         found = (e.name for e in entries if e.name.endswith(_SUFFIXES) and e.name not in _NOT_HOUSES)
         names = sorted(itertools.islice(found, _MAX_FILES + 1))
     if not names:
-        raise InputError(path, "", "no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
+        raise InputError(path, "", "has no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
     if len(names) > _MAX_FILES:
-        raise InputError(path, "", f"more than {_MAX_FILES} files", "Join them as JSON lines.")
+        raise InputError(path, "", f"has more than {_MAX_FILES} files", "Join them as JSON lines.")
     cache = houses_cache()
     files, houses = list[LineIndex](), 0
     for name in names:
         if not name.isprintable():
-            raise InputError(path, name, "a file name with unprintable characters", "Rename the file.")
+            raise InputError(path, name, "has unprintable characters", "Rename the file.")
         # Single small files are read where they lie; only what holds many houses is worth unpacking.
         files.append(open_lines(path / name, None if name.endswith(".json") else cache))
         houses += len(files[-1].ids)
         if houses > MAX_LINES:
-            raise InputError(path, name, f"more than {MAX_LINES:,} houses", "Spread them over folders.")
+            raise InputError(path, name, f"has more than {MAX_LINES:,} houses", "Divide them among folders.")
     rows, clashes = _rows(files)
     if not rows:
-        raise InputError(path, "", "its files hold no house", mend)
+        raise InputError(path, "", "has files without houses", mend)
     digests = [[i, files[f].digests[r].tobytes().hex()] for i, (f, r) in rows.items()]
     digest = digest_of([digests, hash_bytes(table.decode("utf-8", "replace")).hex()])
     return ProcthorHouses(digest, path, assets, files, rows, clashes)

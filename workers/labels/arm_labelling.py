@@ -1,4 +1,4 @@
-"""What the label sources `plan` and `sim` share: candidate by candidate, to the stage that decides.
+"""Plan and trials of one candidate, shared by the label sources `plan` and `sim`.
 
 base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
 -> executed in physics, up to `max_attempts` grasps, or `repeats` times where a robot arrived nearby   (`sim`)
@@ -39,7 +39,7 @@ _PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; s
 
 @dataclass(frozen=True, eq=False)
 class CandidateTrial:
-    """All that was found out about one candidate."""
+    """The results for one candidate."""
 
     outcome: str
     report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
@@ -52,7 +52,7 @@ class CandidateTrial:
 
 @dataclass(eq=False)
 class ArmInScene:
-    """One robot in one scene; what planning and physics need is prepared when first asked for."""
+    """One robot in one scene; data for planning and physics is prepared on first use."""
 
     scene: SettledScene
     robot: Robot
@@ -120,9 +120,9 @@ def arm_of(spec: Specification) -> ArmParams:
 def try_candidate(
     at: ArmInScene, candidates: SceneCandidates, row: int, spec: Specification, record: bool = False
 ) -> CandidateTrial:
-    """Plan, and where the specification asks for trials execute, one candidate.
+    """Plan and, where the specification has trials, execute one candidate.
 
-    Depends on the scene, the candidate and the specification alone, not on what was tried before.
+    Depends only on the scene, the candidate and the specification, not on earlier candidates.
     """
     if candidates.clearance_m[row] < 0:
         return CandidateTrial("base_collision")
@@ -152,7 +152,7 @@ def _attempt(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Grasp after grasp, each in a fresh scene, until one lifts the target or they run out."""
+    """Execute grasps one after the other, each in a new scene, until one lifts the target."""
     trial = at.arm.trial
     assert trial is not None
     results: list[TrialResult] = []
@@ -189,10 +189,10 @@ def _repeat(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Arrive near the candidate once for each disturbance; good where at least half of them lift.
+    """Arrive near the candidate once per disturbance; positive where at least half of the trials lift.
 
-    The robot knows where it has arrived, since it sees the target from there, and plans anew. Where
-    `fits` (K,) is false its body does not fit; what else differs it does not know.
+    The robot knows its pose and plans again from there. Where `fits` (K,) is false its body is not clear; it
+    does not know the other disturbances.
     """
     planning, trials, clock = at.planning, at.trials, at.clock
     results: list[TrialResult] = []

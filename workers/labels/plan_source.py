@@ -1,4 +1,4 @@
-"""Label source `plan`: a candidate is good where the arm has a whole plan to a grasp and the lift."""
+"""Label source `plan`: positive where the arm has a complete plan for grasp and lift."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def label(
     clock: StageClock,
     rows: Sequence[int] | None = None,
 ) -> Columns:
-    """The columns of the heuristic, and what planning found out; `rows` chooses candidates."""
+    """The columns of the heuristic, and results of planning; `rows` selects candidates."""
     return label_with_trials(scene, candidates, spec, clock, rows)[0]
 
 

@@ -1,4 +1,4 @@
-"""Label source `sim`: a candidate is good where the planned grasp, executed in physics, lifts and holds."""
+"""Label source `sim`: positive where the planned grasp, executed in physics, lifts and holds the target."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def label(
     clock: StageClock,
     rows: Sequence[int] | None = None,
 ) -> Columns:
-    """The columns of `plan`, decided by execution, and what trials measured; `rows` chooses candidates."""
+    """The columns of `plan_source`, with outcomes and measurements of trials; `rows` selects candidates."""
     columns, trials = plan_source.label_with_trials(scene, candidates, spec, clock, rows)
 
     def column(dtype: str, values: list[float]) -> np.ndarray:

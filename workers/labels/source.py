@@ -1,4 +1,4 @@
-"""What a label source takes and gives."""
+"""The interface of label sources."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Columns = dict[str, np.ndarray[Any, Any]]
 class LabelSource:
     """A way to label the candidates of a scene.
 
-    `label` returns, one row a candidate, the columns of the schema that the candidate alone does
-    not decide: `label` and whatever explains it. `schema` names the record schema of its store,
-    and `version` rises whenever the same input may give another label. Where labels are slow,
-    `label_rows` gives those of some candidates alone, with the same values.
+    `label` returns, one row per candidate, the columns of the schema that depend on the scene: `label` and
+    its explanation. `schema` names the record schema of its store, and `version` is raised when the same
+    input may give another label. Where labels are slow, `label_rows` computes those of some candidates, with
+    equal values.
     """
 
     name: str

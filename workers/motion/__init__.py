@@ -1,1 +1,1 @@
-"""Motion: whether and how an arm gets its hand to a grasp, without physics."""
+"""Motion planning of an arm to a grasp, without physics."""

@@ -1,4 +1,4 @@
-"""An arm at one base pose among what is near it: which joint vectors collide."""
+"""Collision checks of an arm at one base pose."""
 
 from __future__ import annotations
 

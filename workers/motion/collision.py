@@ -1,4 +1,4 @@
-"""Contacts between many poses of moving convex parts and what stands still.
+"""Contacts between many poses of moving convex parts and static ones.
 
 Poses are handled together: bounding boxes of all of them are compared as arrays, and only pairs whose boxes
 overlap are given to GJK. Parts are solid, so a part inside another one is a contact too.

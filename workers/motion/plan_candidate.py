@@ -1,4 +1,4 @@
-"""One base pose: from inverse kinematics to a whole plan, or the cause of the try that came furthest."""
+"""Plan from one base pose: inverse kinematics, path, approach and lift, or the cause of failure."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from datagen.workers.motion.planning_scene import PlanningScene
 from datagen.workers.motion.reach_table import order_by_distance
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
-# The order in which a grasp is looked at, cheap questions first: a path is searched only to grasps
-# from which the rest is known to work. A later cause came further.
+# The order of checks of a grasp, cheap ones first: a path is searched only for grasps with approach and
+# lift. A later cause came further.
 STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_path", "success")
 _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where none is straight

@@ -1,4 +1,4 @@
-"""What planning needs of a scene and a robot, prepared once for all base poses."""
+"""A scene and a robot, prepared for planning from any base pose."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from datagen.workers.geometry.mesh import F64
 # The first of M configurations (M, A) that is in collision, or M where none is.
 FirstBlocked = Callable[[F64], int]
 _LONGEST_EDGE_RAD = 1.0
-_FIRST_LOOK = 8  # of a long line, one configuration in so many is looked at first
+_FIRST_LOOK = 8  # stride of the first, coarse check of a long line
 
 
 def straight(q_from: F64, q_to: F64, step_rad: float) -> F64:

@@ -53,7 +53,7 @@ class BuiltinObjects:
     def load(self, name: str) -> ObjectModel:
         """The model; the same object at every call. Raises InputError for an unknown name."""
         if name not in self._digests:
-            raise InputError("builtin objects", name, "there is no such object", "See `names()` for all")
+            raise InputError("builtin objects", name, "does not exist", "See `names()` for all")
         model = self._models.get(name)
         if model is None:
             model = self._models[name] = _model(name, self._digests[name])

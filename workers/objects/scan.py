@@ -1,4 +1,4 @@
-"""One scanned object, read from its files or from the cache of what was read before."""
+"""Read one scanned object, from its files or from the cache."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class YcbObjects:
             raise InputError(
                 index,
                 "",
-                "no object is left: all were excluded",
+                "has no usable object: all were excluded",
                 f"First reason: {next(iter(excluded.values()))}",
             )
         self.digest = digest_of({name: _digest(e, mass_kg) for name, (e, mass_kg) in self._entries.items()})
@@ -87,5 +87,5 @@ def _model(entry: Entry, mass_kg: float, scan: Scan) -> ObjectModel:
 def open_ycb(folder: str) -> YcbObjects:
     """The objects of a folder. Raises InputError where none is named, and as `YcbObjects` does."""
     if not folder:
-        raise InputError("ycb", "", "the folder is missing", "Write `ycb:DIR`")
+        raise InputError("ycb", "", "has no folder", "Write `ycb:DIR`")
     return YcbObjects(Path(folder).expanduser())

@@ -1,4 +1,4 @@
-"""What a folder of YCB objects says of itself, in either of the two layouts on disk.
+"""Read the index of a folder of YCB objects, in either of two layouts.
 
     DIR/objects.json                          DIR/info_pick_v0.json (or info_raw.json)
     DIR/<key>/textured.obj, collision.obj ..  DIR/models/<key>/textured.obj, collision.ply|obj ..
@@ -71,7 +71,7 @@ def read_layout(folder: Path) -> tuple[Path, list[Entry]]:
     Raises InputError that names the folder, or the index and the field, or the missing file.
     """
     if not folder.is_dir():
-        raise InputError(folder, "", "there is no such folder", "Give the folder that holds objects.json")
+        raise InputError(folder, "", "does not exist", "Give the folder with objects.json")
     index = folder / "objects.json"
     if index.is_file():
         return index, _bundle(folder, index)
@@ -83,7 +83,7 @@ def read_layout(folder: Path) -> tuple[Path, list[Entry]]:
     raise InputError(
         folder,
         "",
-        f"no YCB objects here: none of {wanted}",
+        f"has no YCB objects: none of {wanted}",
         "Run `datagen assets fetch` or give another folder",
     )
 

@@ -51,8 +51,8 @@ class BuiltinHouses:
         """Draw and build the house."""
         number = house_id.removeprefix("builtin-")
         if not number.isdecimal() or int(number) >= self.count or _house_id(int(number)) != house_id:
-            mend = f"Choose one of builtin-0000 to {_house_id(self.count - 1)}."
-            raise InputError("builtin", "", f"no house {house_id!r}", mend)
+            mend = f"Give one of builtin-0000 to {_house_id(self.count - 1)}."
+            raise InputError("builtin", "", f"has no house {house_id!r}", mend)
         document = house_document(int(number))
         digest = hash_bytes(canonical_json(document)).hex()
         return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
@@ -61,7 +61,7 @@ class BuiltinHouses:
 def open_builtin(text: str) -> BuiltinHouses:
     """The built-in houses; the text is how many, 400 if empty."""
     if text and not (text.isdecimal() and len(text) < 7 and 1 <= int(text) <= _MOST):
-        raise InputError("builtin", "", f"{text!r} is not a count", f"Name 1 to {_MOST}, as builtin:400.")
+        raise InputError("builtin", "", f"{text!r} is not a number", f"Give 1 to {_MOST}, as builtin:400.")
     count = int(text) if text else _DEFAULT_COUNT
     sizes = {a.asset_id: [a.object_type, *a.size_m] for a in BUILTIN_ASSETS.values()}
     return BuiltinHouses(count, digest_of(["builtin-houses", GENERATOR_VERSION, count, sizes]))
@@ -70,7 +70,7 @@ def open_builtin(text: str) -> BuiltinHouses:
 def house_document(number: int) -> dict[str, Any]:
     """The house of that number as a ProcTHOR document, the same on every machine.
 
-    Drawn again until it has a top of at least 0.5 x 0.4 m, 0.3 to 1.2 m high.
+    Resampled until it has a top of at least 0.5 x 0.4 m, 0.3 to 1.2 m high.
     """
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([_SEED, number])))
     while True:

@@ -1,4 +1,4 @@
-"""What every renderer takes and gives."""
+"""The interface of renderers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class SceneGeometry:
-    """What stands in front of the camera: a house and the objects placed in it."""
+    """A house and the objects placed in it."""
 
     house: House
     objects: Sequence[ObjectModel]

@@ -1,4 +1,4 @@
-"""What a stereo depth camera makes of an exact frame: noise that grows with depth, and holes.
+"""Noise model of a stereo depth camera: noise that grows with depth, and holes.
 
 Depth comes from matching: disparity = fx * baseline / depth. A matching error of sigma_d pixels
 therefore moves depth by sigma_z = depth^2 * sigma_d / (fx * baseline) (Khoshelham and Elberink 2012,

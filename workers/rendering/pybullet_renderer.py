@@ -94,7 +94,7 @@ class _Drawing:
     def __init__(self) -> None:
         self._world: int = pybullet.connect(pybullet.DIRECT)
         if self._world < 0:
-            mend = "Draw fewer scenes at once in one process, or take another renderer"
+            mend = "Render fewer scenes at once in one process, or use another renderer"
             raise InputError("--renderer", "pybullet", "Bullet cannot open another world", mend)
         self._label_of_body: list[int] = []
 

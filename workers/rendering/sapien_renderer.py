@@ -64,9 +64,9 @@ def _the_studio() -> _Studio:
             raise InputError(
                 "--renderer",
                 "sapien",
-                f"no render device ({error})",
+                f"finds no render device ({error})",
                 "See `datagen doctor`: install a GPU driver or Mesa 25 or newer with lavapipe, "
-                "or take --renderer embree",
+                "or use --renderer embree",
             ) from error
         scene = sapien.Scene([system])
         scene.set_ambient_light(_AMBIENT)

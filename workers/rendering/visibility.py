@@ -1,4 +1,4 @@
-"""rho: how much of the target a camera sees of what it would see without anything in between."""
+"""rho: the visible share of the target from a camera, compared with the target alone."""
 
 from __future__ import annotations
 

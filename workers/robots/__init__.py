@@ -27,7 +27,7 @@ _HIGHEST_MOUNT_M = 100.0
 
 
 def robot_limits(name: str) -> RobotLimits:
-    """What may be asked of a robot; reads constants alone. Raises InputError for an unknown name."""
+    """The ranges of a robot, from constants only. Raises InputError for an unknown name."""
     return _description(name).limits
 
 
@@ -42,7 +42,7 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     low, high = description.limits.reach_m
     if reach_m is None and description.extension is not None:
         raise InputError(
-            "--robot", name, "is scaled to a reach, and none is given", _within("reach", low, high)
+            "--robot", name, "is scaled to a reach, but none is given", _within("reach", low, high)
         )
     if reach_m is not None and not low - _STEP_M <= reach_m <= high + _STEP_M:
         raise InputError(

@@ -121,7 +121,7 @@ def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float])
                 continue
             if joint.kind != "fixed" and joint.name not in held:
                 mend = "Name it in the robot's file, or use the URDF that ManiSkill brings"
-                raise InputError(tree.path, f"joint {joint.name}", "nobody says where it is held", mend)
+                raise InputError(tree.path, f"joint {joint.name}", "has no fixed position", mend)
             T = found[parent][1] @ joint.T_parent_child
             if joint.kind == "prismatic":
                 T = T @ translation(*(joint.axis * held[joint.name]))
@@ -293,4 +293,4 @@ def _scaled_pose(T: F64, scale: float) -> F64:
 
 
 def _wrong(path: Path, field: str, problem: str) -> InputError:
-    return InputError(path, field, problem, "Use the URDF that ManiSkill brings, or mend the file")
+    return InputError(path, field, problem, "Use the URDF of ManiSkill, or correct the file")

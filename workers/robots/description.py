@@ -88,5 +88,5 @@ def robots_folder() -> Path:
     spec = find_spec("mani_skill")
     folders = list(spec.submodule_search_locations or []) if spec else []
     if not folders:
-        raise InputError("--robot", "mani_skill", "the package is not installed", SIM_MEND)
+        raise InputError("--robot", "mani_skill", "is not installed", SIM_MEND)
     return Path(folders[0]) / "assets" / "robots"

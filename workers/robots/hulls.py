@@ -21,7 +21,7 @@ from datagen.workers.robots.urdf import Shape
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _MAX_BYTES = 64 << 20
-_MEND = "Install mani_skill again, or mend the file"
+_MEND = "Install mani_skill again, or correct the file"
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50

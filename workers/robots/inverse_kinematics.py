@@ -20,7 +20,7 @@ _MAX_STEPS = 40
 _LONGEST_STEP_RAD = 1.0  # of any joint
 _DAMPING = 1e-4
 _DAMPING_PER_ERROR = 0.003
-# Given up when the best error has not fallen to this share within so many steps.
+# Fails when the best error has not fallen to this share within this number of steps.
 _PATIENCE, _PROGRESS = 8, 0.7
 
 

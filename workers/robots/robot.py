@@ -1,4 +1,4 @@
-"""What every robot is to the planner and to the physics: an arm on a mount, with a parallel gripper."""
+"""The interface of robots for planner and physics: an arm on a mount, with a parallel gripper."""
 
 from __future__ import annotations
 

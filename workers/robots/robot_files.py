@@ -26,7 +26,7 @@ from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 _MOST_FILES = 8192
 # Longer than any reader takes from asking for the path to reading the files.
 _IDLE_S = 3600.0
-# The folder is looked through at the first robot that a process writes, and at every so many more.
+# Old files are removed at the first robot that a process writes, and after this many more.
 _WRITTEN_BETWEEN_PRUNINGS = 256
 
 
@@ -58,7 +58,7 @@ class RobotFiles:
 
     def _kept_in(self, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
-        # Nobody drops a file between our finding it and our marking it as used.
+        # No process removes a file between the check and the mark of its use.
         with alone_in(folder):
             known = bool(self._paths) and self._paths[-1].parent == folder
             if not (known and all(refresh(path) for path in self._paths)):

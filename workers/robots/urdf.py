@@ -15,7 +15,7 @@ from datagen.workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20
 _MAX_LINKS = 1000
-_MEND = "Install mani_skill again, or mend the file"
+_MEND = "Install mani_skill again, or correct the file"
 _MOVING = ("revolute", "continuous", "prismatic")
 
 

@@ -1,4 +1,4 @@
-"""One scene from its random streams: draw, settle, sample bases, observe; redraw what does not work."""
+"""Sample one scene from its random streams: place, settle, sample bases, observe; retry on rejection."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _SURROUNDINGS_M = 0.3
 
 
 def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, SceneCandidates]:
-    """Scene `index` of the specification's endless sequence and its candidates: the first retry that works.
+    """Sample scene `index` of the specification and its candidates: the first accepted try.
 
-    Raises InputError when `scene.max_retries` redraws were not enough.
+    Raises InputError after `scene.max_retries` rejections.
     """
     redraws, detail = Counter[str](), ""
     for retry in range(world.spec.scene.max_retries):
@@ -49,7 +49,7 @@ def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, 
         f"scene {index}",
         "scene.max_retries",
         f"no usable scene in {world.spec.scene.max_retries} tries ({causes}) {detail}",
-        "Look at the most frequent cause: other houses or objects, or wider limits, may help",
+        "Check the most frequent cause: other houses or objects, or wider limits, may help",
     )
 
 

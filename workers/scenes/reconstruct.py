@@ -1,7 +1,6 @@
-"""A stored scene made whole again from its record: the same geometry, without drawing or physics.
+"""Rebuild a stored scene from its record: the same geometry, without sampling or physics.
 
-The store checks that bytes are those that were written; here is checked that they make sense, so that no
-label is worked out for poses that no body can have.
+The store checks bytes; this module checks values, so that no label is computed for impossible poses.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from datagen.workers.world import PreparedHouse, World
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
 
 _PLACE = "stored scenes"
-_MEND = "Make the run that stores them again"
+_MEND = "Make the run with these scenes again"
 # Of rotations, which engines give as float32.
 _ROUNDING = 1e-5
 _EXTENT_M = 1000.0  # no house is larger
@@ -34,7 +33,7 @@ _NEAR_M = 10.0
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedScene:
-    """What a scene's record stands for: a `SettledScene`, with the camera it was observed by."""
+    """A `SettledScene` from a scene's record, with its observation camera."""
 
     index: int
     retry: int
@@ -124,7 +123,7 @@ def _within(values: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray
 
 
 def _senseless(index: int, name: str) -> InputError:
-    return InputError(_PLACE, f"scene {index}, {name}", "holds values that no scene can have", _MEND)
+    return InputError(_PLACE, f"scene {index}, {name}", "has impossible values", _MEND)
 
 
 def _same(name: str, found: str, stored: str) -> None:

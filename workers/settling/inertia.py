@@ -1,4 +1,4 @@
-"""Centre of mass and inertia of a body made of convex parts, for engines that do not work them out."""
+"""Centre of mass and inertia of a body made of convex parts."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def mass_properties(name: str, parts_m: Sequence[F32], mass_kg: float) -> MassPr
         try:
             hull = ConvexHull(points)
         except QhullError as error:
-            mend = "Leave the part out or give it thickness"
-            raise InputError(name, f"convex_parts_m[{k}]", "the part has no volume", mend) from error
+            mend = "Remove the part or give it thickness"
+            raise InputError(name, f"convex_parts_m[{k}]", "has no volume", mend) from error
         corners = points[hull.simplices] - inside  # (T, 3, 3): tetrahedra with `inside` as apex
         v6 = np.abs(np.linalg.det(corners))  # six times each volume
         total = corners.sum(1)

@@ -35,7 +35,7 @@ def settle_pybullet(
     """
     world = pybullet.connect(pybullet.DIRECT)
     if world < 0:
-        mend = "Run fewer scenes at once in one process, or take another settler"
+        mend = "Run fewer scenes at once in one process, or use another settler"
         raise InputError("--settler", "pybullet", "Bullet cannot open another physics world", mend)
     try:
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:

@@ -27,8 +27,8 @@ def settle_sapien(
 ) -> SettleResult:
     """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
 
-    A scene is built anew each time: a reused one carries contacts and sleep counters over, and
-    outcomes then depend on what came before.
+    A new physics scene is built each time: a reused one keeps contacts and sleep counters, so that outcomes
+    would depend on earlier calls.
     """
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])

@@ -1,4 +1,4 @@
-"""What every physics engine takes and gives."""
+"""The interface of settlers."""
 
 from __future__ import annotations
 

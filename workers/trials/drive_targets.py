@@ -1,4 +1,4 @@
-"""What the drives are told, tick by tick, from the tucked pose to the end of holding."""
+"""Targets of the drives for each control period, from the tucked pose to the end of holding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One planned grasp executed in physics: reach, approach, close, lift, hold, and how it ended."""
+"""Execute one planned grasp in physics: reach, approach, close, lift, hold; and its outcome."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
 _RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
-_LOOK_STEPS = 4  # contacts are looked at after each of the last so many steps of a phase
+_LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
 _SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0

@@ -102,14 +102,14 @@ class DatagenGraspEnv(BaseEnv):
     def __init__(self, *args: Any, tasks: Sequence[GraspTask], **kwargs: Any) -> None:
         self.tasks = tuple(tasks)
         if not self.tasks:
-            raise InputError(ENV_ID, "tasks", "there is none", "Give one task for each environment")
+            raise InputError(ENV_ID, "tasks", "are missing", "Give one task per environment")
         self.robot: Robot = self.tasks[0].prepared.robot
         self.params: TrialParams = self.tasks[0].prepared.params
         if any(
             t.prepared.robot.urdf != self.robot.urdf or t.prepared.params != self.params for t in self.tasks
         ):
             mend = "Make one environment for each robot and set of parameters"
-            raise InputError(ENV_ID, "tasks", "they differ in robot or parameters", mend)
+            raise InputError(ENV_ID, "tasks", "differ in robot or parameters", mend)
         self.scripts = [_script(task) for task in self.tasks]
         self.rises_m = [planned_rise_m(task.plan, self.robot) for task in self.tasks]
         kwargs = {"sim_backend": "physx_cpu", "render_backend": "none", "reconfiguration_freq": 1} | kwargs

@@ -1,4 +1,4 @@
-"""One trial's world in SAPIEN's PhysX on the CPU: built anew for every trial, needs no render device."""
+"""One trial's world in SAPIEN's PhysX on the CPU, built for every trial; needs no render device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a trial in physics takes and gives."""
+"""Inputs and results of a trial in physics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from datagen.workers.geometry.mesh import F64
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """How the world differs from what the planner saw."""
+    """Differences of the world from the planned one."""
 
     T_target_moved: F64  # (4, 4), the target's true pose in its planned frame: T_true = T_planned @ this
     T_base_moved: F64  # (4, 4), the base's true pose in its planned frame

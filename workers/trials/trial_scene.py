@@ -1,4 +1,4 @@
-"""What all trials of one robot in one scene share: geometry, and no state of any engine."""
+"""Geometry shared by all trials of one robot in one scene."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def test_broken_locks_are_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_no_lock_and_nothing_to_lock(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no lock file"):
+    with pytest.raises(InputError, match="does not exist"):
         verify(tmp_path)
     with pytest.raises(InputError, match="no files"):
         lock(tmp_path)

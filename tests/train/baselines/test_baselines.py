@@ -151,9 +151,9 @@ def test_what_cannot_be_fitted_or_scored_is_said_in_one_line() -> None:
     batch = make_batch(0)
     one_class = replace(batch, label=np.zeros_like(batch.label))
     for name in ("distance", "scalars", "threshold-detector"):
-        with pytest.raises(InputError, match="labels are alike"):
+        with pytest.raises(InputError, match="labels are equal"):
             BASELINES[name]().fit([one_class])
-    with pytest.raises(InputError, match="no such baseline"):
+    with pytest.raises(InputError, match="is not a baseline"):
         make_baselines(["nearest"])
     with pytest.raises(InputError, match="not fitted"):
         Scalars().score(batch)

@@ -101,9 +101,9 @@ def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
 def test_a_score_that_is_no_number_and_a_run_named_twice_are_refused() -> None:
     rng = np.random.default_rng(0)
     for broken in (np.nan, np.inf, -np.inf):
-        with pytest.raises(InputError, match="x: score: no finite score for sample 0301"):
+        with pytest.raises(InputError, match="x: score: is not finite for sample 0301"):
             gather([(0, [make_batch(3, [1])])], {"x": ByX(broken=broken)}, rng)
-    with pytest.raises(InputError, match="03000000000000000000000000000000 comes twice"):
+    with pytest.raises(InputError, match="03000000000000000000000000000000 occurs twice"):
         gather([(0, [make_batch(3, [1])]), (0, [make_batch(3, [1])])], {"x": ByX()}, rng)
 
 

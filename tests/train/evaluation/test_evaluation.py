@@ -153,7 +153,7 @@ def test_sets_without_candidates_or_with_one_class_are_refused() -> None:
     columns = scored()
     weights = weights_for(columns, 10, 0)
     nothing = replace(columns, is_clear=np.zeros(len(columns), np.bool_))
-    with pytest.raises(InputError, match="--candidates: clear: no candidate of these runs is in it"):
+    with pytest.raises(InputError, match="--candidates: clear: has no candidate of these runs"):
         evaluate_set(nothing, METHODS, "clear", weights)
     bad = replace(columns, label=np.zeros(len(columns), np.bool_))
     with pytest.raises(InputError, match="grid: all 240 candidates have the label 0"):

@@ -101,7 +101,7 @@ def test_a_configuration_that_went_through_json_builds_the_same_model(name: str)
 @pytest.mark.parametrize(
     ("name", "config", "words"),
     [
-        ("papre", {}, "papre: no such model"),
+        ("papre", {}, "papre: is unknown"),
         ("shared", {"widht": 4}, "widht"),
         ("shared", {"width": 10**9}, "width"),
         ("shared", {"scales_m": [0.1] * 1000}, "scales_m"),

@@ -227,7 +227,7 @@ def test_unseen_places_are_chosen_only_when_asked(seen: Seen, scorer: ModelScore
     strict, lax = of(scorer, frame), of(scorer, frame, allow_unseen=True)
     assert strict.best is None and strict.margin is None and "no answer" in strict.sure
     assert lax.best is not None and lax.best == strict.rows("unseen")[0]
-    assert "not seen" in lax.sure
+    assert "not visible" in lax.sure
 
 
 def test_missing_depth_on_the_target_is_filled_and_told(seen: Seen, scorer: ModelScorer) -> None:
@@ -237,7 +237,7 @@ def test_missing_depth_on_the_target_is_filled_and_told(seen: Seen, scorer: Mode
     shot = Seen(seen.scene, replace(seen.frame, depth_m=np.where(holes, np.float32(0), seen.frame.depth_m)))
     answer = of(scorer, sensor_frame(shot))
     assert answer.filled is not None and answer.filled.missing_pixels == holes.sum()
-    assert any("had no depth" in note for note in answer.notes)
+    assert any("without depth" in note for note in answer.notes)
     assert np.linalg.norm(answer.center_m - of(scorer, whole).center_m) < 0.01
 
 

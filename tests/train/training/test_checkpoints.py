@@ -212,8 +212,8 @@ def test_what_is_no_checkpoint_is_named(tmp_path: Path):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     cases = [
-        (plain, "not a checkpoint of this program"),
-        (listed, "not a checkpoint of this program"),
+        (plain, "not a datagen checkpoint"),
+        (listed, "not a datagen checkpoint"),
         (newer, "format_version: 2, and this program reads 1. Use the version"),
         (tmp_path, "not a file"),
         (fifo, "not a file"),
@@ -237,8 +237,8 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path):
             Checkpoint(whole.head, {**whole.weights, "more": torch.zeros(1)}),
             "more: the model has no such weights",
         ),
-        (Checkpoint(whole.head, {**whole.weights, name: torch.zeros(1)}), f"{name}: .* where the model has"),
-        (Checkpoint(head_of(model="none"), whole.weights), "no such model"),
+        (Checkpoint(whole.head, {**whole.weights, name: torch.zeros(1)}), f"{name}: .* in the model"),
+        (Checkpoint(head_of(model="none"), whole.weights), "is unknown"),
         (Checkpoint(head_of(model_config={"width": 10**9}), whole.weights), "width"),
         (Checkpoint(head_of(epoch="x"), whole.weights), "epoch"),
         (Checkpoint(head_of(data=({"schema": "sim"},)), whole.weights), "spec_hashes"),
@@ -330,7 +330,10 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 def test_one_process_at_a_time_writes_it(tmp_path: Path):
     path = tmp_path / "c.ckpt"
     with only_writer(path), only_writer(tmp_path / "other.ckpt"):
-        with pytest.raises(InputError, match=r"c\.ckpt: another process is training it"), only_writer(path):
+        with (
+            pytest.raises(InputError, match=r"c\.ckpt: is being trained by another process"),
+            only_writer(path),
+        ):
             pass
         with pytest.raises(InputError), only_writer(path):
             pass

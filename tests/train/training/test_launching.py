@@ -122,5 +122,5 @@ def test_the_first_interrupt_is_noted_and_the_second_ends():
 
 
 def test_steps_share_out_whole_scenes(heuristic_run: Path, tmp_path: Path):
-    with pytest.raises(InputError, match="cannot be shared out evenly among 3"):
+    with pytest.raises(InputError, match="cannot be divided evenly among 3"):
         prepare_training(still_job(heuristic_run, tmp_path / "c.ckpt"), Ranks(0, 3))

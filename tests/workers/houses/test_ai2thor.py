@@ -221,12 +221,15 @@ def scene_of(stage: str) -> dict:
 
 
 BAD_SCENES = {
-    "no stage": ({"object_instances": []}, "'stage_instance' is missing"),
-    "no objects": ({"stage_instance": {"template_name": "stages/iTHOR/home"}}, "'object_instances' is"),
+    "no stage": ({"object_instances": []}, "has no key 'stage_instance'"),
+    "no objects": (
+        {"stage_instance": {"template_name": "stages/iTHOR/home"}},
+        "has no key 'object_instances'",
+    ),
     "escape": (scene_of("../../../etc/passwd"), "not a path below"),
     "absolute": (scene_of("/etc/passwd"), "not a path below"),
     "absent stage": (scene_of("stages/none"), "cannot be read"),
-    "list": ([], "a list where an object"),
+    "list": ([], "a list, not an object"),
 }
 
 
@@ -239,10 +242,10 @@ def test_broken_scenes_are_named(root: Path, case: str):
 
 
 BAD_INSTANCES = {
-    "translation short": ({"translation": [1, 2]}, "2 numbers where 3"),
+    "translation short": ({"translation": [1, 2]}, "has 2 numbers, not 3"),
     "translation NaN": ({"translation": [1, float("nan"), 3]}, r"translation\[1\]: nan"),
     "rotation zero": ({"rotation": [0, 0, 0, 0]}, "not a unit quaternion"),
-    "rotation text": ({"rotation": "none"}, "a text where a list"),
+    "rotation text": ({"rotation": "none"}, "a text, not a list"),
     "scale zero": ({"uniform_scale": 0}, "uniform_scale: 0"),
     "escape": ({"template_name": "objects/../../secret"}, "not a path below"),
 }
@@ -293,7 +296,7 @@ def test_meshes_beyond_the_limits_are_refused(root: Path, monkeypatch: pytest.Mo
 
 def test_a_stage_that_is_only_a_ceiling_is_refused(root: Path):
     export(root / "ai2thor/ai2thor-hab/assets/stages/iTHOR/home.glb", [floor_at(2.5)])
-    with pytest.raises(InputError, match="a stage without walls or floor"):
+    with pytest.raises(InputError, match="has neither walls nor floor"):
         load(root)
 
 

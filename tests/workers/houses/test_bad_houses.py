@@ -51,25 +51,25 @@ LINE = [xyz(0, 0, 0), xyz(1, 0, 0), xyz(2, 0, 0)]
 
 # (what is changed, what the message must name)
 BROKEN: dict[str, tuple[Callable[[dict], None], str]] = {
-    "no rooms": (put("rooms", value=[]), "$.rooms: a house without rooms"),
-    "rooms missing": (drop("rooms"), "'rooms' is missing"),
-    "rooms null": (put("rooms", value=None), "$.rooms: null where a list"),
-    "rooms an object": (put("rooms", value={}), "$.rooms: an object where a list"),
-    "too many rooms": (put("rooms", value=[{}] * 300), "$.rooms: 300 entries"),
-    "room a number": (put("rooms", 0, value=3), "$.rooms[0]: a number where an object"),
+    "no rooms": (put("rooms", value=[]), "$.rooms: has no rooms"),
+    "rooms missing": (drop("rooms"), "has no key 'rooms'"),
+    "rooms null": (put("rooms", value=None), "$.rooms: is null, not a list"),
+    "rooms an object": (put("rooms", value={}), "$.rooms: is an object, not a list"),
+    "too many rooms": (put("rooms", value=[{}] * 300), "$.rooms: has 300 entries"),
+    "room a number": (put("rooms", 0, value=3), "$.rooms[0]: is a number, not an object"),
     "room id twice": (put("rooms", 1, "id", value="room|0"), "$.rooms[1].id"),
     "room id empty": (put("rooms", 1, "id", value=""), "$.rooms[1].id"),
-    "room type missing": (drop("rooms", 0, "roomType"), "$.rooms[0]: key 'roomType'"),
+    "room type missing": (drop("rooms", 0, "roomType"), "$.rooms[0]: has no key 'roomType'"),
     "floor with two corners": (put("rooms", 0, "floorPolygon", value=LINE[:2]), "$.rooms[0].floorPolygon"),
     "floor on a line": (put("rooms", 0, "floorPolygon", value=LINE), "$.rooms[0].floorPolygon"),
     "floor crosses itself": (put("rooms", 0, "floorPolygon", value=BOW_TIE), "$.rooms[0].floorPolygon"),
     "floor with 100 corners": (put("rooms", 0, "floorPolygon", value=LINE * 34), "102 entries"),
     "floor corner NaN": (put("rooms", 0, "floorPolygon", 0, "x", value=NAN), "floorPolygon[0].x: nan"),
     "floor corner far": (put("rooms", 0, "floorPolygon", 0, "x", value=5000), "floorPolygon[0].x: 5000"),
-    "floor corner text": (put("rooms", 0, "floorPolygon", 0, "z", value="1"), "floorPolygon[0].z: a text"),
-    "walls missing": (drop("walls"), "'walls' is missing"),
+    "floor corner text": (put("rooms", 0, "floorPolygon", 0, "z", value="1"), "floorPolygon[0].z: is a text"),
+    "walls missing": (drop("walls"), "has no key 'walls'"),
     "wall id twice": (put("walls", 1, "id", value="w|0|west"), "$.walls[1].id"),
-    "wall with 3 corners": (drop("walls", 0, "polygon", 3), "$.walls[0].polygon: 3 corners"),
+    "wall with 3 corners": (drop("walls", 0, "polygon", 3), "$.walls[0].polygon: has 3 corners"),
     "wall without height": (put("walls", 0, "polygon", value=[xyz(0, 0, 0)] * 4), "$.walls[0].polygon"),
     "wall of 100 m": (put("walls", 0, "polygon", 2, "y", value=100), "$.walls[0].polygon: a wall 100 m"),
     "wall corner infinite": (put("walls", 0, "polygon", 1, "x", value=INFINITY), "polygon[1].x: inf"),
@@ -78,21 +78,21 @@ BROKEN: dict[str, tuple[Callable[[dict], None], str]] = {
     "hole past the wall": (
         put("doors", 0, "holePolygon", value=[xyz(9, 0, 0), xyz(10, 2, 0)]), "$.doors[0].holePolygon"),
     "hole with one corner": (put("doors", 0, "holePolygon", value=[xyz(0, 0, 0)]), "$.doors[0].holePolygon"),
-    "door wall a list": (put("doors", 0, "wall0", value=[]), "$.doors[0].wall0: a list"),
-    "windows a text": (put("windows", value="none"), "$.windows: a text"),
-    "objects missing": (drop("objects"), "'objects' is missing"),
+    "door wall a list": (put("doors", 0, "wall0", value=[]), "$.doors[0].wall0: is a list"),
+    "windows a text": (put("windows", value="none"), "$.windows: is a text"),
+    "objects missing": (drop("objects"), "has no key 'objects'"),
     "object id twice": (put("objects", 0, "children", 0, "id", value="0|table"), "children[0].id"),
-    "object position missing": (drop("objects", 0, "position"), "$.objects[0]: key 'position'"),
-    "object y missing": (drop("objects", 0, "position", "y"), "position: key 'y'"),
-    "object true": (put("objects", 0, "position", "x", value=True), "position.x: a truth value"),
+    "object position missing": (drop("objects", 0, "position"), "$.objects[0]: has no key 'position'"),
+    "object y missing": (drop("objects", 0, "position", "y"), "position: has no key 'y'"),
+    "object true": (put("objects", 0, "position", "x", value=True), "position.x: is a truth value"),
     "object far": (put("objects", 0, "position", "x", value=-1e30), "position.x: -1e+30"),
     "object yaw NaN": (put("objects", 0, "rotation", "y", value=NAN), "rotation.y: nan"),
     "object huge integer": (put("objects", 0, "position", "x", value=10**400), "position.x: a huge number"),
-    "asset a number": (put("objects", 0, "assetId", value=7), "$.objects[0].assetId: a number"),
+    "asset a number": (put("objects", 0, "assetId", value=7), "$.objects[0].assetId: is a number"),
     "id of 10,000 letters": (put("objects", 0, "id", value="x" * 10_000), "$.objects[0].id"),
     "children an object": (put("objects", 0, "children", value={"a": 1}), "$.objects[0].children"),
     "too many children": (put("objects", 0, "children", value=[0] * 2000), "2000 entries"),
-    "too many objects": (put("objects", value=[0] * 6000), "$.objects: 6000 entries"),
+    "too many objects": (put("objects", value=[0] * 6000), "$.objects: has 6000 entries"),
 }  # fmt: skip
 
 
@@ -118,8 +118,8 @@ LINES: dict[str, tuple[bytes, str]] = {
     "cut off": (json.dumps(two_rooms()).encode()[25:500], "not JSON"),
     "nested 100,000 deep": (b"[" * 100_000, "nested too deeply"),
     "not UTF-8": (b'{"rooms": "\xff\xfe"}', "not UTF-8"),
-    "a number": (b"12", "a number where an object"),
-    "null": (b"null", "null where an object"),
+    "a number": (b"12", "a number, not an object"),
+    "null": (b"null", "null, not an object"),
     "a number of 10,000 digits": (b'{"rooms": ' + b"9" * 10_000 + b"}", "too many digits"),
 }
 
@@ -138,7 +138,7 @@ def test_a_line_that_is_no_house_is_named(tmp_path: Path, case: str):
 TABLES: dict[str, tuple[Any, str]] = {
     "empty": ({}, "neither an object of assets"),
     "a number": (5, "neither an object of assets"),
-    "no size": ({"A": {"objectType": "Bed"}}, "$.A: key 'size'"),
+    "no size": ({"A": {"objectType": "Bed"}}, "$.A: has no key 'size'"),
     "two sides": ({"A": {"objectType": "Bed", "size": [1, 2]}}, "2 numbers"),
     "negative side": ({"A": {"objectType": "Bed", "size": [1, -2, 1]}}, "-2 is not within"),
     "kilometre side": ({"A": {"objectType": "Bed", "size": [1, 2000, 1]}}, "2000 is not within"),
@@ -164,16 +164,16 @@ def test_folders_and_references_that_do_not_exist(tmp_path: Path):
     with pytest.raises(InputError, match="ai2thor, builtin, procthor"):
         open_houses("castle:x")
     for ref in ("builtin:0", "builtin:-1", "builtin:many", "builtin:99999999"):
-        with pytest.raises(InputError, match="not a count"):
+        with pytest.raises(InputError, match="not a number"):
             open_houses(ref)
     write_houses(tmp_path, [two_rooms()], sizes=None)
-    with pytest.raises(InputError, match="no size table"):
+    with pytest.raises(InputError, match="has no size table"):
         open_houses(f"procthor:{tmp_path}")
 
 
 def test_a_folder_without_houses(tmp_path: Path):
     write_houses(tmp_path, [])
-    with pytest.raises(InputError, match="no house"):
+    with pytest.raises(InputError, match="without houses"):
         open_houses(f"procthor:{tmp_path}")
     (tmp_path / "houses.jsonl.gz").unlink()
     with pytest.raises(InputError, match="file with houses"):
@@ -222,7 +222,7 @@ def test_a_house_of_more_things_than_memory_would_bear(tmp_path: Path, monkeypat
     document = two_rooms()
     document["objects"] = [thing(f"0|{k}", "Mug_1", xyz(1, 0.05, 1)) for k in range(60)]
     source = open_houses(f"procthor:{write_houses(tmp_path, [document])}")
-    with pytest.raises(InputError, match=r"objects\[50\]: more than 50 objects"):
+    with pytest.raises(InputError, match=r"objects\[50\]: has more than 50 objects"):
         source.load("two-rooms")
 
 

@@ -193,7 +193,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "texture bomb": (_write(IMAGE, _huge_png()), "texture.png"),
     "parts flat": (_write(PARTS, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "flat"),
     "parts elsewhere": (_write(PARTS, COLLISION_OBJ.replace("v 0.0", "v 0.9")), "bounding box"),
-    "all left out": (_set("mass_kg", 49), "no object is left"),
+    "all left out": (_set("mass_kg", 49), "has no usable object"),
 }
 
 

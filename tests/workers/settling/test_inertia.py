@@ -60,7 +60,7 @@ def test_parts_add_up_to_the_box_that_they_fill() -> None:
 
 def test_a_part_without_volume_is_refused_by_name() -> None:
     flat = box_vertices((0.1, 0.1, 0.0))
-    with pytest.raises(InputError, match=r"plate: convex_parts_m\[1\]: the part has no volume"):
+    with pytest.raises(InputError, match=r"plate: convex_parts_m\[1\]: has no volume"):
         mass_properties("plate", [box_vertices((0.1, 0.1, 0.1)), flat], 1.0)
     with pytest.raises(InputError, match="nothing: convex_parts_m"):
         mass_properties("nothing", [], 1.0)
