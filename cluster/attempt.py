@@ -24,7 +24,7 @@ from datagen.workers.world import World, open_world
 def run_attempt(task: ShardTask, meter: Meter) -> AttemptResult:
     """Compute the shard's arrays, write them, and commit them unless another attempt was first.
 
-    Raises JobCannotContinue where the run or its sources cannot be opened, or the disk is full. Other exceptions
+    Raises JobCannotContinue where run or sources cannot be opened, or the disk is full. Other exceptions
     are not caught and concern this attempt only (see `guarded`).
     """
     spec_hash = task.spec.hash()

@@ -62,7 +62,7 @@ def repair_runs(
     """Check, repair what can be repaired, and check again, until no more can be repaired.
 
     `regenerate` returns all files of a shard by path, or raises; with more `workers` several shards are made
-    concurrently. A regenerated file is written only where all bad files of its shard have the committed digests.
+    concurrently. A regenerated file is written only if all bad files of its shard have the committed digests.
     The result holds the remaining findings. InputError as `check_runs`.
     """
     repaired = Repaired()
