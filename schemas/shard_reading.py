@@ -112,7 +112,8 @@ class ShardPlace:
 
     `ordinal` is the shard's place in the folder's arrays: 0 in its own folder. `scenes` and
     `samples` are the rows wanted of it. `digests` are the committed files' sha256 by path, "" once they were
-    checked; None where no commit came along.
+    checked; None where no commit came along. `wall_s_per_sample` is the time that its attempt took
+    over its number of samples; NaN where no commit came along.
     """
 
     storage: Storage
@@ -123,6 +124,7 @@ class ShardPlace:
     full_scenes: int
     full_samples: int
     digests: dict[str, bytes] | None = None
+    wall_s_per_sample: float = math.nan
 
     def metadata(self, names: Iterable[str]) -> dict[str, StoredArray]:
         """The named arrays' metadata. InputError names a missing, foreign or damaged file."""
@@ -186,7 +188,8 @@ def committed_place(
         for entry in commit.files
         if entry.path.partition("/")[0] in wanted
     }
-    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, digests)
+    wall_s = commit.cost.all_s["wall"] / max(commit.samples, 1)
+    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, digests, wall_s)
 
 
 def read_committed(storage: Storage, commit: Commit, names: Sequence[str]) -> dict[str, Array]:
