@@ -12,21 +12,25 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from datagen.evaluating.evaluate import evaluate
-    from datagen.jobs.labelling import JobResult, resume, submit
+    from datagen.commands.evaluate import evaluate
+    from datagen.commands.predict import predict
+    from datagen.commands.resume import resume
+    from datagen.commands.submit import submit
+    from datagen.commands.train import train_model
+    from datagen.jobs.job import JobResult
     from datagen.schemas.errors import InputError
     from datagen.schemas.run import Run
     from datagen.sources import houses, label_sources, objects, robots
     from datagen.tables.candidates import candidates
     from datagen.tables.dataset import open_dataset
-    from datagen.train.prediction.from_files import predict
+    from datagen.train.prediction.frames import SensorFrame
     from datagen.train.torch_stream import TorchStream, stream
-    from datagen.training.train_model import train_model
 
 __all__ = [
     "InputError",
     "JobResult",
     "Run",
+    "SensorFrame",
     "TorchStream",
     "__version__",
     "candidates",
@@ -44,16 +48,19 @@ __all__ = [
 ]
 
 _HOMES = {
-    "datagen.evaluating.evaluate": ("evaluate",),
-    "datagen.jobs.labelling": ("JobResult", "resume", "submit"),
+    "datagen.commands.evaluate": ("evaluate",),
+    "datagen.commands.predict": ("predict",),
+    "datagen.commands.resume": ("resume",),
+    "datagen.commands.submit": ("submit",),
+    "datagen.commands.train": ("train_model",),
+    "datagen.jobs.job": ("JobResult",),
     "datagen.schemas.errors": ("InputError",),
     "datagen.schemas.run": ("Run",),
     "datagen.sources": ("houses", "label_sources", "objects", "robots"),
     "datagen.tables.candidates": ("candidates",),
     "datagen.tables.dataset": ("open_dataset",),
-    "datagen.train.prediction.from_files": ("predict",),
+    "datagen.train.prediction.frames": ("SensorFrame",),
     "datagen.train.torch_stream": ("TorchStream", "stream"),
-    "datagen.training.train_model": ("train_model",),
 }
 
 

@@ -28,9 +28,9 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
 # Verb -> (where it lives, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
-    "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.commands.resume:resume", "Make what is missing of a run, or of merged runs."),
-    "extend": ("datagen.commands.extend:extend", "Want more labels of a run, and make them."),
+    "submit": ("datagen.commands.submit:verb", "Make labels: start a run, or resume it."),
+    "resume": ("datagen.commands.resume:verb", "Make what is missing of a run, or of merged runs."),
+    "extend": ("datagen.commands.extend:verb", "Want more labels of a run, and make them."),
     "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop, and wait for their end."),
     "logs": ("datagen.commands.logs:logs", "What happened in a run, in order of time."),
     "status": ("datagen.commands.status:status", "How far a run is, and what failed."),
@@ -46,14 +46,14 @@ VERBS: dict[str, tuple[str, str]] = {
     "gc": ("datagen.commands.gc:gc", "Remove what a run holds and nothing names."),
     "show": ("datagen.commands.show:show", "A picture of one scene of a run."),
     "train": (
-        "datagen.commands.train:train",
+        "datagen.commands.train:verb",
         "Train a model on labels: stage 1, stage 2, or sim labels alone.",
     ),
     "evaluate": (
-        "datagen.commands.evaluate:evaluate",
+        "datagen.commands.evaluate:verb",
         "How good models are, beside baselines and the paper.",
     ),
-    "predict": ("datagen.commands.predict:predict", "A base pose from a depth camera's frame."),
+    "predict": ("datagen.commands.predict:verb", "A base pose from a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "What this machine can do, and how to mend what it cannot."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
 }

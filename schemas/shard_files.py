@@ -141,8 +141,8 @@ def zarr_metadata(
 ) -> dict[str, bytes]:
     """zarr.json files of a group with so many rows a table; chunks are those of the layout's shards.
 
-    `of_arrays` are further attributes of arrays, by name. zarr-python takes 3 ms an array, so it is asked once
-    a layout; rows and attributes are put in after.
+    `of_arrays` are further attributes of arrays, by name. zarr-python takes 3 ms an array, so it is asked
+    once a layout; rows and attributes are put in after.
     """
     files: dict[str, bytes] = {}
     for path, data in _made_by_zarr(*_key(schema, layout)).items():

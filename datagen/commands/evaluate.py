@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -15,7 +16,7 @@ from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 
-def evaluate(
+def verb(
     places: Annotated[
         list[str],
         Parameter(negative=(), help="Checkpoints of `datagen train`, and runs of sim (or plan) labels."),
@@ -60,6 +61,74 @@ def evaluate(
     those within the arm's reach too), with intervals by resampling scenes. Files are checkpoints, folders
     and s3:// addresses runs. A house that a model was trained on is refused.
     """
+    report = evaluate(
+        places,
+        candidates=candidates,
+        fit=fit,
+        baselines=baselines,
+        detector=detector,
+        heuristic=heuristic,
+        bootstrap=bootstrap,
+        seed=seed,
+        allow_seen_houses=allow_seen_houses,
+        allow_incomplete=allow_incomplete,
+        threads=threads,
+        html=html,
+        json=json,
+    )
+    if json:
+        print_json(report)
+        return 0
+    from datagen.evaluating.tables import print_evaluation
+
+    print_evaluation(report)
+    if html is not None:
+        print_rows("written", [("page", str(html))])
+    return 0
+
+
+def evaluate(
+    paths: Sequence[str | Path],
+    *,
+    candidates: Sequence[Literal["grid", "clear", "in-range"]] | None = None,
+    fit: Sequence[str | Path] | None = None,
+    baselines: Sequence[str] | None = None,
+    detector: str | Path | None = None,
+    heuristic: str | Path | None = None,
+    bootstrap: int = 1000,
+    seed: int = 0,
+    allow_seen_houses: bool = False,
+    allow_incomplete: bool = False,
+    threads: int | None = None,
+    html: str | Path | None = None,
+    json: bool = False,
+) -> dict[str, Any]:
+    """Compare models and baselines with simulated labels; return tables and curves as plain values.
+
+    The result is what `datagen evaluate --json` prints; docs/evaluation.md describes it.
+
+    Args:
+        paths: Checkpoints of `train_model`, and runs of sim (or plan) labels.
+        candidates: Candidate sets to report [all in the runs].
+        fit: Runs in validation houses, to fit baselines on.
+        baselines: Names of baselines, or ["none"] [all].
+        detector: Folder of a zero-shot object detector, for the baseline with one.
+        heuristic: Parameters of the analytic baseline, as `datagen calibrate` writes them.
+        bootstrap: Resamples of scenes behind each interval.
+        seed: Seed of resamples and of the scenes shown.
+        allow_seen_houses: Report training houses separately instead of failing.
+        allow_incomplete: Read runs that lack a part of their labels.
+        threads: Threads that models compute on.
+        html: Page to write, with tables, curves and grids.
+        json: Report progress as JSON lines.
+
+    Raises:
+        InputError: A checkpoint, a run or an option cannot be used.
+
+    Example:
+        >>> report = datagen.evaluate([checkpoint, sim_run], bootstrap=10)  # doctest: +SKIP
+        >>> sorted(report["methods"])  # doctest: +SKIP
+    """
     # Imported here: other verbs wait neither for these nor for torch.
     import numpy as np
 
@@ -67,11 +136,12 @@ def evaluate(
     from datagen.evaluating.lineup import line_up, read_heuristic
     from datagen.evaluating.places import open_places, refuse_seen_houses, sets_of, tell_apart
     from datagen.evaluating.report import evaluation_report
-    from datagen.evaluating.tables import print_evaluation
     from datagen.train.evaluation.columns import gather
 
+    fit = [str(path) for path in fit or ()]
+    detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
     _refuse_odd(bootstrap, seed, threads, html)
-    checkpoints, runs = tell_apart(places)
+    checkpoints, runs = tell_apart([str(path) for path in paths])
     if threads is not None:
         from datagen.train.scorers import use_threads
 
@@ -83,7 +153,15 @@ def evaluate(
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
     lineup = line_up(
-        baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
+        baselines,
+        fit,
+        detector,
+        rule,
+        seed,
+        opened,
+        allow_seen_houses,
+        allow_incomplete,
+        json,
     )
     contestants = [*lineup.baselines, *models]
     if not contestants:
@@ -107,7 +185,7 @@ def evaluate(
         opened,
         sets,
         seen_houses=houses,
-        fit=fit or [],
+        fit=fit,
         left_out=lineup.left_out,
         resamples=bootstrap,
         seed=seed,
@@ -117,13 +195,7 @@ def evaluate(
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(report, gathered).encode())
-    if json:
-        print_json(report)
-        return 0
-    print_evaluation(report)
-    if html is not None:
-        print_rows("written", [("page", str(html))])
-    return 0
+    return report
 
 
 def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:

@@ -12,7 +12,9 @@ from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, open_work, source_words
+from datagen.jobs.job import JobResult
 from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
+from datagen.jobs.report import reported
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged import open_runs
@@ -21,7 +23,7 @@ from datagen.schemas.storage import open_storage
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 
 
-def extend(
+def verb(
     run: RunPlace,
     *,
     n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in all; not fewer than now.")],
@@ -32,6 +34,10 @@ def extend(
 
     Merged runs share the further labels evenly, in whole shards.
     """
+    return reported(lambda: _extend(run, n, given, placing))
+
+
+def _extend(run: str, n: int, given: Sources, placing: Placing) -> JobResult:
     placing.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
@@ -50,7 +56,7 @@ def extend(
             part.grow(more)
     if placing.detach:
         return detach_job(words, run, placing)
-    return go_on(place, run, works, placing, began_s, given)
+    return go_on(place, run, works, placing, began_s, [*words, *placing.address_words()], given)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

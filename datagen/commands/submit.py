@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+from typing_extensions import Unpack
 
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
 from datagen.jobs.going_on import go_on, refuse_unusable_engines
-from datagen.jobs.job import Work
-from datagen.jobs.options import HERE, Placing, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.jobs.job import JobResult, Work
+from datagen.jobs.options import HERE, Placing, Where, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.jobs.report import reported
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
@@ -36,7 +38,7 @@ _OF_SCENES = (
 )
 
 
-def submit(
+def verb(
     label_source: Annotated[str, Parameter(help="How candidates are labelled: heuristic, plan or sim.")],
     /,
     *,
@@ -97,6 +99,96 @@ def submit(
     specification is refused with the fields that differ. Ctrl-C once finishes what is in flight,
     twice ends it at once; nothing that is committed is lost.
     """
+    return reported(
+        lambda: submit(
+            label_source,
+            n=n,
+            out=out,
+            houses=houses,
+            objects=objects,
+            scenes_from=scenes_from,
+            robot=robot,
+            perturb=perturb,
+            candidates=candidates,
+            candidates_per_scene=candidates_per_scene,
+            robots_per_scene=robots_per_scene,
+            split=split,
+            seed=seed,
+            settler=settler,
+            renderer=renderer,
+            noise=noise,
+            config=config,
+            placing=placing,
+        )
+    )
+
+
+def submit(
+    label_source: str,
+    *,
+    n: int,
+    out: str | Path,
+    houses: str | None = None,
+    objects: str | None = None,
+    scenes_from: str | Path | None = None,
+    robot: str | None = None,
+    perturb: int | None = None,
+    candidates: Literal["grid", "clear", "in-range"] | None = None,
+    candidates_per_scene: int | str | None = None,
+    robots_per_scene: int | None = None,
+    split: Literal["train", "val", "test", "all"] | None = None,
+    seed: int | None = None,
+    settler: str | None = None,
+    renderer: str | None = None,
+    noise: bool = False,
+    config: str | Path | None = None,
+    placing: Placing | None = None,
+    **where: Unpack[Where],
+) -> JobResult:
+    """Make labels and return what was done: start a run, or continue the one in the folder.
+
+    The call blocks and reports progress on standard error; in a notebook an interrupt of the kernel lets
+    the shards in flight finish, and the same call, or `resume`, continues. Options are those of
+    `datagen submit`, which `datagen submit --help` describes; the same options make the same bytes for
+    any number of workers.
+
+    Args:
+        label_source: One of `datagen.label_sources`: heuristic, plan or sim.
+        n: Labels wanted; a larger number later extends the run.
+        out: The run's folder or s3:// address.
+        houses: One of `datagen.houses`, as `procthor:DIR` [builtin].
+        objects: One of `datagen.objects`, as `ycb:DIR` [builtin].
+        scenes_from: A run whose scenes and candidates are labelled again.
+        robot: One of `datagen.robots` [plan, sim: panda-scaled].
+        perturb: Trials at each candidate under disturbances (sim) [undisturbed].
+        candidates: Which cells of the grid around the target are candidates.
+        candidates_per_scene: Candidates of a scene [60]; "grid" for all 625.
+        robots_per_scene: Robots that share a scene's candidates [4, and 1 on a whole grid].
+        split: Houses to use, disjoint by split [all].
+        seed: Seed of the whole run [0].
+        settler: Physics engine: sapien or pybullet.
+        renderer: Renderer of the RGB-D frame: embree, sapien or pybullet [embree].
+        noise: Add the sensor noise model to the frame.
+        config: TOML file with any field of the specification.
+        placing: What the command line gives instead of `where`.
+        where: `workers` (processes [one a core]; 0 works in this process), `address` (of a Ray cluster
+            [local]), `max_quarantined` (share of shards that may fail [0.01]), `detach` (let Ray continue
+            when this process ends) and `quiet` (report no progress).
+
+    Raises:
+        InputError: An option, a source or the run cannot be used.
+        KeyboardInterrupt: The job was stopped; the run can be resumed.
+
+    Example:
+        >>> result = datagen.submit(
+        ...     "heuristic", n=8, out=folder / "new", candidates_per_scene=8, workers=0, quiet=True
+        ... )
+        >>> result.complete, result.labels, result.path == str(folder / "new")
+        (True, 8, True)
+    """
+    out, placing = str(out), placing or Placing(**where)
+    scenes_from = None if scenes_from is None else str(scenes_from)
+    config = None if config is None else Path(config)
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # refuses an unknown one
     refuse_odd_n(n)
@@ -160,7 +252,7 @@ def submit(
     if placing.detach:
         return detach_job(words, out, placing)
     work = Work(run, sources["houses"], sources["objects"], source_url)
-    return go_on(run.storage, out, [work], placing, began_s)
+    return go_on(run.storage, out, [work], placing, began_s, [*words, *placing.address_words()])
 
 
 def _layout_there(out: str) -> Layout | None:
@@ -183,9 +275,9 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         raise InputError("--houses", houses, f"gives no scene: {error.problem}", error.mend) from error
 
 
-def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:
+def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[str, int | str | None]:
     """What --candidates and --candidates-per-scene say, by dotted name."""
-    number = _per_scene(per_scene)
+    number = _per_scene(None if per_scene is None else str(per_scene))
     if kind == "grid":
         if number not in (None, "grid"):
             mend = "Give --candidates clear or in-range to draw some, or leave the number out"

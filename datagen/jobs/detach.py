@@ -16,7 +16,7 @@ from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
-from datagen.jobs.job import JOBS_API, SUBMISSION
+from datagen.jobs.job import JOBS_API, SUBMISSION, JobResult
 from datagen.jobs.options import Placing
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
@@ -25,8 +25,8 @@ _BEGUN_WITHIN_S = 60.0
 _LOOK_S = 0.3
 
 
-def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
-    """Let the command of these words run as a Ray job, and say how to follow it.
+def detach_job(words: Sequence[str], place: str, placing: Placing) -> JobResult:
+    """Let the command of these words run as a Ray job, and print how to follow it.
 
     With the address `local`, on a head of this machine that is started where none runs. Comes back once
     the command has begun, or waits for room on its cluster. InputError where the cluster cannot be
@@ -58,7 +58,7 @@ def detach_job(words: Sequence[str], place: str, placing: Placing) -> int:
     if placing.address == "local":
         rows.append(("Ray stays", f"for later jobs; {command_line(['cancel', '--head'])} ends it"))
     print_rows(f"detached: {command_line(words)}", rows)
-    return 0
+    return JobResult(place, "detached")
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:

@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detached_words
-from datagen.jobs.job import JobPlan, Work, carry_out
+from datagen.jobs.job import JobInterrupted, JobPlan, JobResult, Work, carry_out
 from datagen.jobs.options import Placing, absolute_place, absolute_source
 from datagen.remaking.shards import open_origin
 from datagen.remaking.sources import AS_FOUND, Sources
@@ -64,13 +64,20 @@ def go_on(
     works: Sequence[Work],
     placing: Placing,
     began_s: float,
+    command: Sequence[str],
     given: Sources = AS_FOUND,
-) -> int:
-    """Run the job of what is missing; the exit code. `name` is the place as the user wrote it."""
+) -> JobResult:
+    """Run the job of what is missing, which is that of the words `command`.
+
+    `name` is the place as the user wrote it. Raises JobInterrupted where it was asked to stop.
+    """
     words = ["resume", absolute_place(name), *source_words(given), *placing.words()]
     words += detached_words() or placing.address_words()
     with resumable(words):
-        return carry_out(JobPlan(place, name, works, placing, began_s, words))
+        result = carry_out(JobPlan(place, name, works, placing, began_s, command, words))
+    if result.end == "interrupted":
+        raise JobInterrupted(result)
+    return result
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:

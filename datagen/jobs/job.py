@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.books import RunBooks, close_lost_attempts
@@ -26,11 +26,11 @@ from datagen.cluster.stop import StopRequest, stop_on_signals
 from datagen.cluster.tally import JobSummary, Tally, no_work
 from datagen.cluster.task import ShardTask
 from datagen.cluster.watch import Watch
-from datagen.console.command_lines import command_line, say_interrupted
-from datagen.console.printing import counted, listed, print_rows, seconds
+from datagen.console.command_lines import command_line
+from datagen.console.printing import counted
 from datagen.jobs.board import JobBoard
 from datagen.jobs.options import Placing
-from datagen.schemas.errors import InputError, one_line
+from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import now
@@ -40,6 +40,46 @@ from datagen.schemas.storage import Storage
 
 # Set for the driver of a detached job: its name at the Jobs API, and where that listens.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
+
+
+@dataclass(frozen=True, eq=False)
+class JobResult:
+    """What a job did, and what its run holds now. Quarantined shards are those that kept failing."""
+
+    path: str  # the run, as it was named
+    # detached: Ray makes the labels. failed: more shards are quarantined than allowed.
+    end: Literal["complete", "failed", "interrupted", "aborted", "detached"]
+    n: int = 0  # labels wanted
+    labels: int = 0  # made by this job
+    positives: int = 0  # of those
+    shards: int = 0  # that were missing when the job began
+    remaining: int = 0  # of those, still missing
+    quarantined: tuple[int, ...] = ()
+    retries: int = 0
+    start_s: float = 0.0  # until the first shard began
+    elapsed_s: float = 0.0  # from then on
+    store: str = ""  # the sealed store, which zarr and xarray open
+    cause: str = ""  # of an aborted job, and the most frequent one of a failed job
+    resume: tuple[str, ...] = ()  # the words of the command that continues
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run has all labels that were wanted, but for the allowed share in quarantine."""
+        return self.end == "complete"
+
+    @property
+    def exit_code(self) -> int:
+        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
+        return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
+
+
+class JobInterrupted(KeyboardInterrupt):
+    """A job ended because it was asked to; what is committed stays, and `result` says what that is."""
+
+    def __init__(self, result: JobResult) -> None:
+        self.result = result
+        left = counted(result.remaining, "shard")
+        super().__init__(f"{left} to go. Continue with: {command_line(result.resume)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +101,15 @@ class JobPlan:
     works: Sequence[Work]
     placing: Placing
     began_s: float  # by the monotonic clock, when the command began to open them
+    command: Sequence[str]  # the words of the command that it is
     resume: Sequence[str]  # the words of the command that goes on with it
 
 
-def carry_out(plan: JobPlan) -> int:
-    """Make every missing shard, seal, and say how it went; the exit code.
+def carry_out(plan: JobPlan) -> JobResult:
+    """Make every missing shard, seal, and return what was done.
 
     While it works, the job is known in the place, and heeds requests to stop that are left there.
+    InputError where it met what no retry cures.
     """
     if not _count_missing(plan):
         for work in plan.works:
@@ -77,13 +119,13 @@ def carry_out(plan: JobPlan) -> int:
     try:
         summary = _judged(plan, make_missing(plan, board))
         board.seal()
-        code = _finish(plan, summary)
+        result = _finish(plan, summary)
     except BaseException as error:
         end, code = _end_of(error)
         board.end(end, code, " ".join(str(error).split())[:1000])
         raise
-    board.end(summary.end, code, summary.cause, summary)
-    return code
+    board.end(summary.end, result.exit_code, summary.cause, summary)
+    return result
 
 
 def _end_of(error: BaseException) -> tuple[JobEnd, int]:
@@ -98,7 +140,7 @@ def open_board(plan: JobPlan) -> JobBoard:
     """Make the job known in its place."""
     record = JobRecord(
         id=new_job_id(),
-        command=("datagen", *sys.argv[1:]),
+        command=("datagen", *plan.command),
         host=platform.node(),
         pid=os.getpid(),
         started=now(),
@@ -123,7 +165,7 @@ def make_missing(plan: JobPlan, board: JobBoard) -> JobSummary:
     whole = no_work()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
-        shown = stack.enter_context(Progress(placing.json))
+        shown = stack.enter_context(placing.display())
         executor = _executor(placing, sum(map(len, missing)), stack, shown)
         stack.enter_context(stop_on_signals(stop, interrupt=placing.workers == 0))
         for work, shards in zip(plan.works, missing, strict=True):
@@ -207,47 +249,28 @@ class _CannotGoOn(InputError):
     """The job met what no retry cures."""
 
 
-def _finish(plan: JobPlan, summary: JobSummary) -> int:
-    """Seal what there is, say how it went and how to go on; return the exit code."""
-    tally, runs, name = summary.tally, [work.run for work in plan.works], plan.name
-    n, resume = sum(run.n for run in runs), command_line(plan.resume)
-    given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
-    if tally.shards:
-        labels = f"{tally.labels:,} new, {n:,} wanted"
-    elif given_up:
-        labels = f"nothing to do: the shards of {n:,} labels are made or given up"
-    else:
-        labels = f"nothing to do: all {n:,} labels are there"
-    rows = [
-        ("labels", labels),
-        ("positive", f"{100 * tally.positives / tally.labels:.1f}%" if tally.labels else "-"),
-        ("time", _time(summary)),
-        ("retries", str(tally.retries)),
-    ]
-    if given_up:
-        again = command_line(["resume", name, "--quarantined"])
-        those = f"{counted(len(given_up), 'shard')} ({listed([shard for _, shard in given_up])})"
-        shown = f"{those}: {again} tries again"
-        rows.append(("quarantined", shown))
-    if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
-        sealed = seal(plan.place)
-        rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
-    print_rows(f"{summary.end}: {name}", rows)
+def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
+    """Seal what there is, unless interrupted; what was done."""
+    tally, runs = summary.tally, [work.run for work in plan.works]
+    causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
+    result = JobResult(
+        path=plan.name,
+        end=summary.end,
+        n=sum(run.n for run in runs),
+        labels=tally.labels,
+        positives=tally.positives,
+        shards=tally.shards,
+        remaining=summary.remaining,
+        quarantined=tuple(shard for run in runs for shard in sorted(run.quarantined())),
+        retries=tally.retries,
+        start_s=summary.start_s,
+        elapsed_s=summary.elapsed_s,
+        cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
+        resume=tuple(plan.resume),
+    )
     if summary.end == "aborted":
-        raise _CannotGoOn(name, "", f"the job cannot go on: {summary.cause}", f"Then resume: {resume}")
-    if summary.end == "failed":
-        causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
-        most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
-        see = command_line(["status", name])
-        sys.stderr.write(one_line(f"error: {name}: too many shards failed{most}. See: {see}") + "\n")
-    if summary.end == "interrupted":
-        say_interrupted(f" with {counted(summary.remaining, 'shard')} to go", plan.resume)
-    return summary.exit_code
-
-
-def _time(summary: JobSummary) -> str:
-    if not summary.tally.labels:
-        return seconds(summary.start_s + summary.elapsed_s)
-    rate = summary.tally.labels / max(summary.elapsed_s, 1e-6)
-    parts = f"start {seconds(summary.start_s)}, labels {seconds(summary.elapsed_s)}"
-    return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts} at {rate:,.0f}/s"
+        mend = f"Then resume: {command_line(plan.resume)}"
+        raise _CannotGoOn(plan.name, "", f"the job cannot go on: {summary.cause}", mend)
+    if summary.end != "interrupted" and any(run.committed() for run in runs):
+        result = replace(result, store=seal(plan.place))
+    return result

@@ -8,6 +8,7 @@ from pathlib import Path
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMAS, Field, Table
 from datagen.schemas.merged import open_runs
+from datagen.schemas.shard_files import TABLES
 from datagen.train.sealed import is_sealed_store, open_sealed
 
 Paths = Sequence[str | Path]
@@ -23,8 +24,7 @@ def fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
         schema = SCHEMAS[sealed.schema].at(sealed.schema_version)
     else:
         schema = open_runs(str(path))[0].schema
-    named: dict[str, tuple[Table, Field]] = {field.name: ("scene", field) for field in schema.scene_fields}
-    return named | {field.name: ("sample", field) for field in schema.sample_fields}
+    return {field.name: (table, field) for table in TABLES for field in schema.table(table)}
 
 
 def refuse_no_path(paths: Paths, function: str) -> None:
