@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from datagen.commands.evaluate import evaluate
+    from datagen.commands.merge import merge
     from datagen.commands.predict import predict
     from datagen.commands.resume import resume
     from datagen.commands.submit import submit
@@ -37,6 +38,7 @@ __all__ = [
     "evaluate",
     "houses",
     "label_sources",
+    "merge",
     "objects",
     "open_dataset",
     "predict",
@@ -49,6 +51,7 @@ __all__ = [
 
 _HOMES = {
     "datagen.commands.evaluate": ("evaluate",),
+    "datagen.commands.merge": ("merge",),
     "datagen.commands.predict": ("predict",),
     "datagen.commands.resume": ("resume",),
     "datagen.commands.submit": ("submit",),

@@ -36,7 +36,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "status": ("datagen.commands.status:status", "How far a run is, and what failed."),
     "seal": ("datagen.commands.seal:seal", "One Zarr store over a run, that any zarr reader opens."),
     "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
-    "merge": ("datagen.commands.merge:merge", "One run of several that were made apart."),
+    "merge": ("datagen.commands.merge:verb", "One run of several that were made apart."),
     "verify": ("datagen.commands.verify:verify", "Whether a run is what it says, to the last byte."),
     "repair": ("datagen.commands.repair:repair", "Mend what verify finds, and touch nothing else."),
     "replay": ("datagen.commands.replay:replay", "One sample's scene made again, beside what is stored."),

@@ -23,9 +23,9 @@ class Registry(Generic[T]):
         >>> list(datagen.robots)
         ['fetch', 'panda', 'panda-scaled', 'xarm7']
         >>> datagen.robots["fetch"].reach_m
-        (0.94, 0.94)
+        (1.11, 1.11)
         >>> datagen.houses["builtin:3"].house_ids()
-        ['builtin-0', 'builtin-1', 'builtin-2']
+        ['builtin-0000', 'builtin-0001', 'builtin-0002']
     """
 
     def __init__(self, entries: Mapping[str, str], load: Callable[[str], T]) -> None:

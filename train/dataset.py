@@ -166,9 +166,9 @@ class SampleStream:
     def epoch(self, k: int, skip_batches: int = 0, every: int = 1) -> Generator[Batch[Array]]:
         """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping.
 
-        Of these each `every`-th, for processes that share an epoch. The next shards are read in a thread while
-        a batch is used. Close the iterator, or use it up, to end the thread; what is skipped is not read where
-        whole shards are.
+        Of these each `every`-th, for processes that share an epoch. The next shards are read in a thread
+        while a batch is used. Close the iterator, or use it up, to end the thread; what is skipped is not
+        read where whole shards are.
         """
         _refuse_below("epoch", k, 0)
         _refuse_below("skip_batches", skip_batches, 0)

@@ -122,13 +122,13 @@ def candidates(
         ['house', 'label']
     """
     refuse_no_path(paths, "candidates")
-    fields = {path: fields_of(path) for path in paths}
-    valid = list(dict.fromkeys(name for of_path in fields.values() for name in _valid(of_path)))
+    fields = [fields_of(path) for path in paths]
+    valid = list(dict.fromkeys(name for of_path in fields for name in _valid(of_path)))
     refuse_unknown(columns or (), valid, "candidates")
     names = list(columns) if columns is not None else [name for name in _DEFAULT if name in valid]
     gathered: dict[str, list[Array]] = {name: [] for name in names}
     opened: list[Part] = []
-    for path, of_path in fields.items():
+    for path, of_path in zip(paths, fields, strict=True):
         there = [name for name in names if name in _valid(of_path)]
         needed = [n for name in there for n in (_DERIVED[name][0] if name in _DERIVED else (name,))]
         parts = open_parts([path], list(dict.fromkeys([*JOIN_FIELDS, *needed])), allow_incomplete)

@@ -1,0 +1,111 @@
+"""`import datagen`: cheap, lazily loaded, documented by examples that run."""
+
+from __future__ import annotations
+
+import doctest
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import datagen
+from datagen import cli
+from datagen.sources import Registry
+from tests.small_runs import make_small_run
+
+FUNCTIONS = [n for n in datagen.__all__ if callable(getattr(datagen, n)) and n.islower()]
+
+
+def in_new_python(code: str) -> Any:
+    """What the code prints as JSON, in a process that has imported nothing."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_importing_loads_no_library_and_none_of_our_modules() -> None:
+    code = "import datagen, json, sys; dir(datagen); print(json.dumps(sorted(sys.modules)))"
+    modules = in_new_python(code)
+    libraries = {
+        "cyclopts",
+        "numpy",
+        "pandas",
+        "pydantic",
+        "ray",
+        "sapien",
+        "torch",
+        "trimesh",
+        "xarray",
+        "zarr",
+    }
+    assert libraries.isdisjoint(modules)
+    assert [name for name in modules if name.partition(".")[0] == "datagen"] == ["datagen"]
+
+
+@pytest.mark.parametrize("name", ["open_dataset", "candidates", "robots", "Run", "InputError"])
+def test_reading_runs_needs_neither_ray_nor_torch_nor_a_simulator(name: str) -> None:
+    code = f"import datagen, json, sys; datagen.{name}; print(json.dumps(sorted(sys.modules)))"
+    assert {"ray", "torch", "sapien", "pybullet", "trimesh", "mani_skill"}.isdisjoint(in_new_python(code))
+
+
+def test_every_name_is_there_and_documented() -> None:
+    assert dir(datagen) == datagen.__all__ == sorted(datagen.__all__)
+    for name in datagen.__all__:
+        value = getattr(datagen, name)
+        assert name == "__version__" or value.__doc__
+        assert name not in FUNCTIONS or "Example:" in value.__doc__
+
+
+def test_an_unknown_name_lists_the_others() -> None:
+    with pytest.raises(AttributeError, match=r"no attribute 'sumbit'\. It offers: InputError, JobResult"):
+        _ = datagen.sumbit  # type: ignore[attr-defined]
+
+
+def test_the_command_line_calls_the_same_functions() -> None:
+    verbs = {"submit", "resume", "merge", "evaluate", "predict"}
+    for verb in verbs:
+        home, _ = cli.VERBS[verb][0].split(":")
+        assert getattr(datagen, verb).__module__ == home
+    assert datagen.train_model.__module__ == cli.VERBS["train"][0].split(":")[0]
+
+
+def test_registries_have_names_and_refuse_others_with_the_valid_ones() -> None:
+    assert list(datagen.houses) == ["ai2thor", "builtin", "procthor"] and len(datagen.objects) == 2
+    assert "sim" in datagen.label_sources and "tiago" not in datagen.robots
+    assert datagen.label_sources["heuristic"].name == "heuristic"
+    with pytest.raises(datagen.InputError, match="Choose one of: fetch, panda, panda-scaled, xarm7"):
+        datagen.robots["tiago"]
+    assert repr(datagen.objects) == "Registry(builtin, ycb)"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The names that the examples in docstrings use."""
+    folder = tmp_path_factory.mktemp("docs")
+    run = make_small_run(folder / "run", 16)
+    other = make_small_run(folder / "other", 16, "--seed", "1")
+    return {"datagen": datagen, "torch": torch, "folder": folder, "run": run, "other": other}
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Registry"])
+def test_the_examples_in_docstrings_run(name: str, world: dict[str, Any]) -> None:
+    value = Registry if name == "Registry" else getattr(datagen, name)
+    tests = doctest.DocTestFinder(recurse=False).find(value, name, module=False, globs=dict(world))
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    said: list[str] = []
+    for test in tests:
+        runner.run(test, out=said.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(said)
+    assert runner.tries, "no example"
+
+
+def test_a_job_returns_what_it_did_and_prints_nothing_when_quiet(
+    world: dict[str, Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    result = datagen.resume(world["run"], workers=0, quiet=True)
+    assert (result.complete, result.n, result.labels, result.remaining) == (True, 16, 0, 0)
+    assert result.store == str(world["run"] / "data.zarr") and Path(result.store).is_dir()
+    assert capfd.readouterr() == ("", "")
