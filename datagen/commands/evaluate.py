@@ -126,8 +126,9 @@ def evaluate(
         InputError: A checkpoint, a run or an option cannot be used.
 
     Example:
-        >>> report = datagen.evaluate([checkpoint, sim_run], bootstrap=10)  # doctest: +SKIP
-        >>> sorted(report["methods"])  # doctest: +SKIP
+        >>> report = datagen.evaluate([checkpoint, sim_run], baselines=["proximity"], bootstrap=10)
+        >>> len(report["methods"]), report["candidates"]
+        (2, ['in-range'])
     """
     # Imported here: other verbs wait neither for these nor for torch.
     import numpy as np

@@ -163,10 +163,12 @@ def predict(
         InputError: A frame, the checkpoint or an option cannot be used.
 
     Example:
+        >>> robot = datagen.robots["fetch"]
         >>> answer = datagen.predict(
-        ...     checkpoint, frame=["cloud.ply"], base_height=0.9, reach=0.8, camera_height=1.2
-        ... )  # doctest: +SKIP
-        >>> answer.T_world_base(answer.best)  # doctest: +SKIP
+        ...     checkpoint, frame=[frame], base_height=robot.base_height_m[0], reach=robot.reach_m[1]
+        ... )
+        >>> answer.base_xy_m.shape, answer.T_world_base(0).shape
+        ((625, 2), (4, 4))
     """
     # Imported here: training's libraries take seconds, and other verbs need none of them.
     from datagen.train.prediction import RobotSize, load_scorer

@@ -16,6 +16,11 @@ import datagen
 from datagen import cli
 from datagen.sources import Registry
 from tests.small_runs import make_small_run
+from tests.train.conftest import shared_folder, sim_run
+from tests.train.prediction.checkpoints import write_untrained
+from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
+
+__all__ = ["shared_folder", "sim_run"]
 
 FUNCTIONS = [n for n in datagen.__all__ if callable(getattr(datagen, n)) and n.islower()]
 
@@ -87,11 +92,19 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("docs")
     run = make_small_run(folder / "run", 16)
     other = make_small_run(folder / "other", 16, "--seed", "1")
-    return {"datagen": datagen, "torch": torch, "folder": folder, "run": run, "other": other}
+    checkpoint = folder / "untrained.ckpt"
+    write_untrained(checkpoint, MODEL)
+    frame = write_frame(folder / "frame", draw_seen(0))
+    names = {"folder": folder, "run": run, "other": other, "checkpoint": checkpoint, "frame": frame}
+    return {"datagen": datagen, "torch": torch, **names}
 
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, "Registry"])
-def test_the_examples_in_docstrings_run(name: str, world: dict[str, Any]) -> None:
+def test_the_examples_in_docstrings_run(
+    name: str, world: dict[str, Any], request: pytest.FixtureRequest
+) -> None:
+    if name == "evaluate":
+        world = world | {"sim_run": request.getfixturevalue("sim_run")}
     value = Registry if name == "Registry" else getattr(datagen, name)
     tests = doctest.DocTestFinder(recurse=False).find(value, name, module=False, globs=dict(world))
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)

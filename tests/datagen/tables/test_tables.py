@@ -150,4 +150,6 @@ def test_outcomes_are_words_and_missing_where_labels_are_heuristic(
     assert set(simulated["robot"]) == {"panda-scaled"} and simulated["trials"].notna().all()
     rest = table[table["run"] != str(sim_run)]
     assert rest["outcome"].isna().all() and rest["trials"].isna().all() and rest["robot"].isna().all()
-    assert set(datagen.open_dataset(sim_run, runs[0]).data_vars).isdisjoint({"outcome", "trials"})
+    assert datagen.open_dataset(sim_run, runs[0], columns=["label"]).sizes["candidate"] == len(table)
+    with pytest.raises(datagen.InputError, match="columns: outcome"):
+        datagen.open_dataset(sim_run, runs[0], columns=["outcome"])
