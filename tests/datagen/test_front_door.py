@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import doctest
 import json
+import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +17,12 @@ import torch
 
 import datagen
 from datagen import cli
+from datagen.cluster.attempt import run_attempt
+from datagen.cluster.guard import Meter
+from datagen.cluster.task import Product, ShardTask
+from datagen.jobs import job
 from datagen.sources import Registry
-from tests.small_runs import make_small_run
+from tests.small_runs import CONFIG, make_small_run
 from tests.train.conftest import shared_folder, sim_run
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
@@ -122,3 +129,36 @@ def test_a_job_returns_what_it_did_and_prints_nothing_when_quiet(
     assert (result.complete, result.n, result.labels, result.remaining) == (True, 16, 0, 0)
     assert result.store == str(world["run"] / "data.zarr") and Path(result.store).is_dir()
     assert capfd.readouterr() == ("", "")
+
+
+def test_an_interrupt_leaves_a_run_that_the_same_call_finishes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "small.toml").write_text(CONFIG)
+
+    def submit() -> datagen.JobResult:
+        return datagen.submit(
+            "heuristic",
+            n=32,
+            out=tmp_path / "run",
+            candidates_per_scene=8,
+            config=tmp_path / "small.toml",
+            workers=0,
+            quiet=True,
+        )
+
+    def interrupted(task: ShardTask, meter: Meter) -> Product:
+        if task.shard == 0:
+            os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C, or a notebook's stop button
+        return run_attempt(task, meter)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(job, "run_attempt", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=r"shards? to go\. Continue with: datagen resume"):
+            submit()
+    made = len(datagen.candidates(tmp_path / "run", allow_incomplete=True))
+    assert made in (8, 16)
+    with ThreadPoolExecutor(1) as pool:  # where no signal arrives
+        result = pool.submit(submit).result()
+    assert (result.complete, result.labels) == (True, 32 - made)
+    assert len(datagen.candidates(result.path)) == 32
