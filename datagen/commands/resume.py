@@ -80,5 +80,6 @@ def resume(
             return detach_job(words, run, placing)
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
-            sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
+            if not placing.quiet:
+                sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
     return go_on(place, run, works, placing, began_s, [*words, *placing.address_words()], given)

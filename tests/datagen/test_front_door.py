@@ -147,8 +147,11 @@ def test_an_interrupt_leaves_a_run_that_the_same_call_finishes(
             quiet=True,
         )
 
+    began: list[int] = []
+
     def interrupted(task: ShardTask, meter: Meter) -> Product:
-        if task.shard == 0:
+        began.append(task.shard)
+        if len(began) == 1:
             os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C, or a notebook's stop button
         return run_attempt(task, meter)
 
@@ -157,7 +160,7 @@ def test_an_interrupt_leaves_a_run_that_the_same_call_finishes(
         with pytest.raises(KeyboardInterrupt, match=r"shards? to go\. Continue with: datagen resume"):
             submit()
     made = len(datagen.candidates(tmp_path / "run", allow_incomplete=True))
-    assert made in (8, 16)
+    assert made == 8 * len(began) < 32  # shards that were in flight are finished
     with ThreadPoolExecutor(1) as pool:  # where no signal arrives
         result = pool.submit(submit).result()
     assert (result.complete, result.labels) == (True, 32 - made)

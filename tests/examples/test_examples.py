@@ -11,6 +11,8 @@ import pytest
 
 import datagen
 
+# Three starts of Ray on a machine that may be busy.
+pytestmark = pytest.mark.timeout(900)
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
