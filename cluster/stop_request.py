@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Generator
 from contextlib import contextmanager
+from threading import current_thread, main_thread
 from types import FrameType
 
 
@@ -41,7 +42,9 @@ def stop_on_signals(stop: StopRequest, interrupt: bool = False) -> Generator[Sto
         if interrupt and stop.force:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    # Python lets the main thread alone handle signals; a job in another one is stopped by `datagen cancel`.
+    numbers = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield stop
     finally:

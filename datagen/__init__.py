@@ -1,3 +1,79 @@
-"""The user's verbs: planning, resuming, showing and auditing runs, on the command line."""
+"""Labelled robot base poses: make them, read them, train on them, and use the model on a robot.
+
+This is the Python front door; docs/python.md describes it, and the command line calls the same functions.
+Importing it is cheap: each name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from datagen.commands.evaluate import evaluate
+    from datagen.commands.merge import merge
+    from datagen.commands.predict import predict
+    from datagen.commands.resume import resume
+    from datagen.commands.submit import submit
+    from datagen.commands.train import train_model
+    from datagen.jobs.job import JobResult
+    from datagen.schemas.errors import InputError
+    from datagen.schemas.run import Run
+    from datagen.sources import houses, label_sources, objects, robots
+    from datagen.tables.candidates import candidates
+    from datagen.tables.dataset import open_dataset
+    from datagen.train.prediction.frames import SensorFrame
+    from datagen.train.torch_stream import TorchStream, stream
+
+__all__ = [
+    "InputError",
+    "JobResult",
+    "Run",
+    "SensorFrame",
+    "TorchStream",
+    "__version__",
+    "candidates",
+    "evaluate",
+    "houses",
+    "label_sources",
+    "merge",
+    "objects",
+    "open_dataset",
+    "predict",
+    "resume",
+    "robots",
+    "stream",
+    "submit",
+    "train_model",
+]
+
+_HOMES = {
+    "datagen.commands.evaluate": ("evaluate",),
+    "datagen.commands.merge": ("merge",),
+    "datagen.commands.predict": ("predict",),
+    "datagen.commands.resume": ("resume",),
+    "datagen.commands.submit": ("submit",),
+    "datagen.commands.train": ("train_model",),
+    "datagen.jobs.job": ("JobResult",),
+    "datagen.schemas.errors": ("InputError",),
+    "datagen.schemas.run": ("Run",),
+    "datagen.sources": ("houses", "label_sources", "objects", "robots"),
+    "datagen.tables.candidates": ("candidates",),
+    "datagen.tables.dataset": ("open_dataset",),
+    "datagen.train.prediction.frames": ("SensorFrame",),
+    "datagen.train.torch_stream": ("TorchStream", "stream"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(home), name)
+            return value
+    raise AttributeError(f"module 'datagen' has no attribute {name!r}. It offers: {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -133,11 +133,16 @@ def root_attributes(schema: RecordSchema, layout: Layout, spec_hash: str) -> dic
 
 
 def zarr_metadata(
-    schema: RecordSchema, layout: Layout, rows: Mapping[str, int], attributes: Mapping[str, Any]
+    schema: RecordSchema,
+    layout: Layout,
+    rows: Mapping[str, int],
+    attributes: Mapping[str, Any],
+    of_arrays: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> dict[str, bytes]:
     """Return the zarr.json files of a group with `rows` per table, chunked like the layout's shards.
 
-    zarr-python takes 3 ms per array, so it is called once per layout; rows and attributes are filled in.
+    `of_arrays` are further attributes of arrays, by name. zarr-python takes 3 ms per array, so it is called
+    once per layout; rows and attributes are filled in.
     """
     files: dict[str, bytes] = {}
     for path, data in _made_by_zarr(*_key(schema, layout)).items():
@@ -146,6 +151,7 @@ def zarr_metadata(
             meta["attributes"] = dict(attributes)
         else:
             meta["shape"][0] = rows[meta["dimension_names"][0]]
+            meta["attributes"] |= (of_arrays or {}).get(path.partition("/")[0], {})
         files[path] = json.dumps(meta, indent=2).encode()
     return files
 

@@ -112,7 +112,7 @@ class ShardPlace:
 
     `ordinal` is the shard's position in the folder's arrays: 0 in its own folder. `scenes` and `samples` are
     the rows wanted of it. `digests` has the sha256 of committed files by path, "" once checked; None without
-    commit.
+    commit. `wall_s_per_sample` is the time of the attempt over its number of samples; NaN without commit.
     """
 
     storage: Storage
@@ -123,6 +123,7 @@ class ShardPlace:
     full_scenes: int
     full_samples: int
     digests: dict[str, bytes] | None = None
+    wall_s_per_sample: float = math.nan
 
     def metadata(self, names: Iterable[str]) -> dict[str, StoredArray]:
         """Read the metadata of the named arrays. InputError for a missing, foreign or damaged file."""
@@ -186,7 +187,8 @@ def committed_place(
         for entry in commit.files
         if entry.path.partition("/")[0] in wanted
     }
-    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, digests)
+    wall_s = commit.cost.all_s["wall"] / max(commit.samples, 1)
+    return ShardPlace(storage, folder, 0, scenes, samples, commit.scenes, commit.samples, digests, wall_s)
 
 
 def read_committed(storage: Storage, commit: Commit, names: Sequence[str]) -> dict[str, Array]:

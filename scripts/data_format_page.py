@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from datagen.schemas.description import CONVENTIONS
 from datagen.schemas.fields import SCHEMA_VERSION, SCHEMAS, Field, RecordSchema
 from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.run_records import FORMAT_VERSION
@@ -58,13 +59,21 @@ so a missing file is damage, and a fill value never stands for rows that were no
 Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`,
 and `flag_meanings`: the words that the codes 0, 1, ... stand for.
 
-`data.zarr` has consolidated metadata, and the specification in its root's attributes:
+`data.zarr` has consolidated metadata. Its root's attributes hold the specification and, by the conventions
+{CONVENTIONS}, `title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`,
+`history` and `comment`; they follow from the specification and n alone. Its arrays also have
+`coordinates`, and `flag_values` beside `flag_meanings`. Stores that an older program sealed lack these
+attributes and remain valid; sealing again adds them.
 
 ```python
 import xarray, zarr
 zarr.open("RUN/data.zarr", mode="r")["label"][:]
 xarray.open_zarr("RUN/data.zarr")
 ```
+
+Scenes and samples are two tables. A data frame over both dimensions would have a row for every pair of a
+scene and a sample, so `xarray.Dataset.to_dataframe` is not of use here: `datagen.candidates("RUN")` returns
+the pandas table of samples joined with their scenes ([Python](python.md)).
 
 ## Versions
 

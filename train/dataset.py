@@ -163,11 +163,12 @@ class SampleStream:
             for summary in self.parts
         ]
 
-    def epoch(self, k: int, skip_batches: int = 0) -> Generator[Batch[Array]]:
+    def epoch(self, k: int, skip_batches: int = 0, every: int = 1) -> Generator[Batch[Array]]:
         """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping.
 
-        The next shards are read in a thread while a batch is used. Close the iterator, or use it up, to
-        end the thread; what is skipped is not read where whole shards are.
+        Of these each `every`-th, for processes that share an epoch. The next shards are read in a thread
+        while a batch is used. Close the iterator, or use it up, to end the thread; what is skipped is not
+        read where whole shards are.
         """
         _refuse_below("epoch", k, 0)
         _refuse_below("skip_batches", skip_batches, 0)
@@ -175,27 +176,28 @@ class SampleStream:
         plan = plan_epoch(
             self._scenes.shard, self.scenes_per_batch, self.buffer_shards, rng, self.rank, self.world
         )
-        return self._batches(plan, k, skip_batches)
+        return self._batches(plan, k, range(skip_batches, len(plan.cuts) - 1, every))
 
-    def _batches(self, plan: EpochPlan, k: int, skip: int) -> Generator[Batch[Array]]:
-        if skip >= len(plan.cuts) - 1:
+    def _batches(self, plan: EpochPlan, k: int, batches: range) -> Generator[Batch[Array]]:
+        if not batches:
             return
         with ThreadPoolExecutor(1, "read-ahead") as pool:
             ahead = max(2, self.buffer_shards)
-            loaded = concurrent_map(pool, ahead, self._load, self._reads(plan, int(plan.cuts[skip])))
+            loaded = concurrent_map(pool, ahead, self._load, self._reads(plan, batches))
             try:
                 held: dict[int, StoredScene] = {}
-                for first, past in zip(plan.cuts[skip:-1], plan.cuts[skip + 1 :], strict=True):
-                    wanted = plan.order[first:past].tolist()
+                for number in batches:
+                    wanted = plan.order[plan.cuts[number] : plan.cuts[number + 1]].tolist()
                     while not all(scene in held for scene in wanted):
                         held.update(next(loaded))
                     yield self._batch([held.pop(scene) for scene in wanted], k)
             finally:
                 loaded.close()
 
-    def _reads(self, plan: EpochPlan, start: int) -> list[tuple[int, npt.NDArray[np.int64]]]:
-        """(shard, its scenes that are wanted) from a place of the order on, buffer by buffer."""
-        scenes, buffer = plan.order[start:], plan.buffer[start:]
+    def _reads(self, plan: EpochPlan, batches: range) -> list[tuple[int, npt.NDArray[np.int64]]]:
+        """(shard, its scenes that are wanted) of these batches, buffer by buffer."""
+        wanted = np.repeat(np.isin(np.arange(len(plan.cuts) - 1), batches), np.diff(plan.cuts))
+        scenes, buffer = plan.order[wanted], plan.buffer[wanted]
         by_shard = np.lexsort([scenes, self._scenes.shard[scenes], buffer])
         scenes = scenes[by_shard]
         shards = self._scenes.shard[scenes]

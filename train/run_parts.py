@@ -11,6 +11,7 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_reading import ShardPlace, StoredArray, committed_place
+from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 from datagen.train.sealed import is_sealed_store, open_sealed
 
@@ -19,12 +20,13 @@ from datagen.train.sealed import is_sealed_store, open_sealed
 class RunPart:
     """One run's shards and arrays, or those of a sealed store without its run.
 
-    `spec_hashes` has several where such a store was merged. `cost` adds up the commits' wall and CPU
-    seconds, with those of the labels that a run was relabelled from; None where no commit came along.
+    `spec_hashes` and `specs` have several where such a store was merged. `cost` adds up the commits' wall
+    and CPU seconds, with those of the labels that a run was relabelled from; None where no commit came along.
     """
 
     place: str
     spec_hashes: tuple[str, ...]
+    specs: tuple[Specification, ...]
     schema: str
     schema_version: int
     shards: Sequence[ShardPlace]
@@ -53,6 +55,17 @@ def open_parts(
     return parts
 
 
+def refuse_twins(parts: Sequence[RunPart]) -> None:
+    """InputError where two parts are of one specification: their samples would count twice."""
+    seen: dict[str, str] = {}
+    for part in parts:
+        for spec_hash in part.spec_hashes:
+            if spec_hash in seen:
+                problem = f"has the specification of {seen[spec_hash]}, so samples would occur twice"
+                raise InputError(part.place, "", problem, "Name it once, or merge them with `datagen merge`")
+            seen[spec_hash] = part.place
+
+
 def _words(array: StoredArray) -> str:
     return f"{array.dtype} {array.shape[1:]} a {array.dims[0]}"
 
@@ -65,6 +78,7 @@ def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> li
             RunPart(
                 str(place),
                 sealed.spec_hashes,
+                sealed.specs,
                 sealed.schema,
                 sealed.schema_version,
                 sealed.shards,
@@ -111,7 +125,8 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
         return None
     manifest = run.manifest
     version = manifest.schema_version
-    return RunPart(url, (manifest.spec_hash,), manifest.schema_name, version, shards, arrays, cost)
+    specs = (manifest.spec,)
+    return RunPart(url, (manifest.spec_hash,), specs, manifest.schema_name, version, shards, arrays, cost)
 
 
 def _refuse_unknown(url: str, names: Sequence[str], commit: Commit) -> None:

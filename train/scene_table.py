@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
-from datagen.train.run_parts import RunPart
+from datagen.train.run_parts import RunPart, refuse_twins
 
 I64 = npt.NDArray[np.int64]
 
@@ -64,7 +64,7 @@ def read_scene_table(
     parts: Sequence[RunPart], per_robot: int | None, houses: Callable[[str], bool] | None
 ) -> SceneTable:
     """The scenes of the houses that count. InputError where there is none, or a run is named twice."""
-    _refuse_twins(parts)
+    refuse_twins(parts)
     shard: list[int] = []
     row: list[int] = []
     samples: list[int] = []
@@ -126,14 +126,3 @@ def _taken(robot_index: npt.NDArray[np.integer], per_robot: int | None) -> int:
 
 def _texts(columns: Columns, name: str, row: int) -> set[str]:
     return {str(text) for text in np.atleast_1d(columns[name][row])}
-
-
-def _refuse_twins(parts: Sequence[RunPart]) -> None:
-    """Two places with one specification hold the same samples, which then would count twice."""
-    seen: dict[str, str] = {}
-    for part in parts:
-        for spec_hash in part.spec_hashes:
-            if spec_hash in seen:
-                problem = f"has the specification of {seen[spec_hash]}, so samples would occur twice"
-                raise InputError(part.place, "", problem, "Name it once, or merge them with `datagen merge`")
-            seen[spec_hash] = part.place

@@ -12,6 +12,7 @@ from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.keys import MERGED
 from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray
+from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 
 _MEND = "Seal the run again, and copy the whole data.zarr"
@@ -22,6 +23,7 @@ class SealedStore:
     """What the store says of itself, its shards, and the arrays that were asked for."""
 
     spec_hashes: tuple[str, ...]  # of the runs that it holds
+    specs: tuple[Specification, ...]
     schema: str
     schema_version: int
     shards: Sequence[ShardPlace]
@@ -53,7 +55,9 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
         per_scene = int(attributes["candidates_per_scene"])
         stored = list(meta["consolidated_metadata"]["metadata"])
         schema, version = str(attributes["schema"]), int(attributes["schema_version"])
-        spec_hashes = tuple(str(part["spec_hash"]) for part in attributes.get("parts", [attributes]))
+        told = attributes.get("parts", [attributes])
+        spec_hashes = tuple(str(part["spec_hash"]) for part in told)
+        specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in told)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"is not the root of a sealed store ({e})", _MEND) from e
     if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
@@ -87,4 +91,4 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
         )
         for i in range(shards)
     ]
-    return SealedStore(spec_hashes, schema, version, slices, arrays)
+    return SealedStore(spec_hashes, specs, schema, version, slices, arrays)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -15,7 +16,7 @@ from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 
-def evaluate(
+def verb(
     places: Annotated[
         list[str],
         Parameter(
@@ -66,6 +67,75 @@ def evaluate(
 
     For example: datagen evaluate model.ckpt runs/sim-test --html report.html
     """
+    report = evaluate(
+        places,
+        candidates=candidates,
+        fit=fit,
+        baselines=baselines,
+        detector=detector,
+        heuristic=heuristic,
+        bootstrap=bootstrap,
+        seed=seed,
+        allow_seen_houses=allow_seen_houses,
+        allow_incomplete=allow_incomplete,
+        threads=threads,
+        html=html,
+        json=json,
+    )
+    if json:
+        print_json(report)
+        return 0
+    from datagen.evaluation_report.terminal import print_evaluation
+
+    print_evaluation(report)
+    if html is not None:
+        print_rows("written", [("page", str(html))])
+    return 0
+
+
+def evaluate(
+    paths: Sequence[str | Path],
+    *,
+    candidates: Sequence[Literal["grid", "clear", "in-range"]] | None = None,
+    fit: Sequence[str | Path] | None = None,
+    baselines: Sequence[str] | None = None,
+    detector: str | Path | None = None,
+    heuristic: str | Path | None = None,
+    bootstrap: int = 1000,
+    seed: int = 0,
+    allow_seen_houses: bool = False,
+    allow_incomplete: bool = False,
+    threads: int | None = None,
+    html: str | Path | None = None,
+    json: bool = False,
+) -> dict[str, Any]:
+    """Compare models and baselines with simulated labels; return tables and curves as plain values.
+
+    The result is what `datagen evaluate --json` prints; docs/guides/evaluate.md describes it.
+
+    Args:
+        paths: Checkpoints of `train_model`, and runs of sim (or plan) labels.
+        candidates: Candidate sets to report [all in the runs].
+        fit: Runs in validation houses, to fit baselines on.
+        baselines: Names of baselines, or ["none"] [all].
+        detector: Folder of a zero-shot object detector, for the baseline with one.
+        heuristic: Parameters of the analytic baseline, as `datagen calibrate` writes them.
+        bootstrap: Resamples of scenes behind each interval.
+        seed: Seed of resamples and of the scenes shown.
+        allow_seen_houses: Report training houses separately instead of failing.
+        allow_incomplete: Read runs that lack a part of their labels.
+        threads: Threads that models compute on.
+        html: Page to write, with tables, curves and grids.
+        json: Report progress as JSON lines.
+
+    Raises:
+        InputError: A checkpoint, a run or an option cannot be used.
+
+    Example:
+        >>> report = datagen.evaluate([checkpoint, sim_run], baselines=["proximity"], bootstrap=10)
+        >>> len(report["methods"]), report["candidates"]
+        (2, ['in-range'])
+    """
     # Imported here, so that other verbs do not wait for them and for torch.
     import numpy as np
 
@@ -78,11 +148,12 @@ def evaluate(
     )
     from datagen.evaluation_report.methods import open_models
     from datagen.evaluation_report.report import evaluation_report
-    from datagen.evaluation_report.terminal import print_evaluation
     from datagen.train.evaluation.columns import gather
 
+    fit = [str(path) for path in fit or ()]
+    detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
     _refuse_odd(bootstrap, seed, threads, html)
-    checkpoints, runs = split_paths(places)
+    checkpoints, runs = split_paths([str(path) for path in paths])
     if threads is not None:
         from datagen.train.scorers import use_threads
 
@@ -94,7 +165,15 @@ def evaluate(
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
     baseline_set = baseline_methods(
-        baselines, fit or [], detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
+        baselines,
+        fit,
+        detector,
+        rule,
+        seed,
+        opened,
+        allow_seen_houses,
+        allow_incomplete,
+        json,
     )
     evaluated = [*baseline_set.baselines, *models]
     if not evaluated:
@@ -118,7 +197,7 @@ def evaluate(
         opened,
         sets,
         seen_houses=houses,
-        fit=fit or [],
+        fit=fit,
         left_out=baseline_set.left_out,
         resamples=bootstrap,
         seed=seed,
@@ -128,13 +207,7 @@ def evaluate(
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(report, gathered).encode())
-    if json:
-        print_json(report)
-        return 0
-    print_evaluation(report)
-    if html is not None:
-        print_rows("written", [("page", str(html))])
-    return 0
+    return report
 
 
 def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:

@@ -12,6 +12,8 @@ from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
+from datagen.jobs.job import JobResult
+from datagen.jobs.job_report import reported
 from datagen.jobs.options import HERE, JobOptions, absolute_place, opening, refuse_odd_n
 from datagen.jobs.start_job import open_job_run, source_words, start_job
 from datagen.regeneration.sources import AS_FOUND, Sources
@@ -21,7 +23,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 
-def extend(
+def verb(
     run: RunPlace,
     /,
     *,
@@ -35,6 +37,10 @@ def extend(
 
     For example: datagen extend runs/first --n 360,000
     """
+    return reported(lambda: _extend(run, n, given, job_options))
+
+
+def _extend(run: str, n: int, given: Sources, job_options: Placing) -> JobResult:
     job_options.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]
@@ -53,7 +59,9 @@ def extend(
             part.grow(more)
     if job_options.detach:
         return detach_job(words, run, job_options)
-    return start_job(place, run, job_runs, job_options, began_s, given)
+    return start_job(
+        place, run, job_runs, job_options, began_s, [*words, *job_options.address_words()], given
+    )
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
@@ -20,8 +22,8 @@ from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
 
 
-def merge(
-    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs, or merged runs, to merge.")],
+def verb(
+    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs, or merged runs, to verb.")],
     /,
     *,
     out: Annotated[str, Parameter(help="Folder or s3:// address of the result, which may exist.")],
@@ -35,6 +37,34 @@ def merge(
 
     For example: datagen merge runs/a runs/b --out runs/all
     """
+    report = merge(runs, out=out, json=json)
+    if json:
+        print_json(report)
+    else:
+        _print(report)
+    return 0
+
+
+def merge(runs: Sequence[str | Path], *, out: str | Path, json: bool = False) -> dict[str, Any]:
+    """Make one run of several and return what it holds: labels, shards, cost and origin of each part.
+
+    The result is what `datagen merge --json` prints. Runs may differ in seed, split, houses, objects and
+    the run that their scenes are from. The same call again finishes a merge that was interrupted.
+
+    Args:
+        runs: Folders or s3:// addresses of runs, or of merged runs.
+        out: The result's folder or address; runs that are there stay.
+        json: Report progress as JSON lines.
+
+    Raises:
+        InputError: The runs cannot be merged, or one is damaged.
+
+    Example:
+        >>> merged = datagen.merge([run, other], out=folder / "merged")
+        >>> merged["labels"], len(merged["runs"])
+        (32, 2)
+    """
+    runs, out = [str(run) for run in runs], str(out)
     words = ["merge", *map(absolute_place, runs), *words_of({"--out": absolute_place(out), "--json": json})]
     with resumable(words):
         commits = sum(len(run.committed()) for place in runs for run in open_runs(place))
@@ -42,12 +72,7 @@ def merge(
             planned = plan_merge(runs, out, step)
         with steps("records written", planned.records, json) as step:
             result = merge_runs(planned, step)
-    report = merge_report(planned, result)
-    if json:
-        print_json(report)
-    else:
-        _print(report)
-    return 0
+    return merge_report(planned, result)
 
 
 def merge_report(planned: MergePlan, result: MergeResult) -> dict[str, Any]:

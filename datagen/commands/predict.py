@@ -23,6 +23,7 @@ from datagen.schemas.whole_files import whole_file
 from datagen.workers.geometry.mesh import F64
 
 if TYPE_CHECKING:
+    from datagen.train.prediction import Prediction
     from datagen.train.prediction.frames import SensorFrame
 
 _LARGEST_M = 10.0
@@ -30,7 +31,7 @@ _MOST_FRAMES = 64
 _MOST_ENTRIES = 10_000
 
 
-def predict(
+def verb(
     checkpoint: Annotated[Path, Parameter(name="CHECKPOINT", help="Checkpoint of `datagen train`.")],
     /,
     *,
@@ -76,10 +77,105 @@ def predict(
 
     For example: datagen predict model.ckpt --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
     """
+    from datagen.train.prediction.prediction_report import document, told
+
+    answer = predict(
+        checkpoint,
+        base_height=base_height,
+        reach=reach,
+        rgb=rgb,
+        depth=depth,
+        intrinsics=intrinsics,
+        mask=mask,
+        click=None if click is None else _pixel(click),
+        frame=frame,
+        frame_dir=frame_dir,
+        camera_height=camera_height,
+        camera_pose=camera_pose,
+        gravity=None if gravity is None else _numbers(gravity),
+        robot_camera_height=robot_camera_height,
+        depth_scale=depth_scale,
+        grid=grid,
+        half_width=half_width,
+        allow_unseen=allow_unseen,
+        out=out,
+        html=html,
+    )
+    if as_json:
+        print_json(document(answer))
+    else:
+        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
+        print_rows(f"base poses by {answer.scorer}", [*told(answer), *written])
+    return 0 if answer.best is not None else 1
+
+
+def predict(
+    checkpoint: str | Path,
+    *,
+    base_height: float,
+    reach: float,
+    rgb: str | Path | None = None,
+    depth: str | Path | None = None,
+    intrinsics: str | Path | None = None,
+    mask: str | Path | None = None,
+    click: tuple[int, int] | None = None,
+    frame: Sequence[str | Path | SensorFrame] | None = None,
+    frame_dir: str | Path | None = None,
+    camera_height: float | None = None,
+    camera_pose: str | Path | None = None,
+    gravity: Sequence[float] | None = None,
+    robot_camera_height: float | None = None,
+    depth_scale: float = 0.001,
+    grid: int = 25,
+    half_width: float = 1.0,
+    allow_unseen: bool = False,
+    out: str | Path | None = None,
+    html: str | Path | None = None,
+) -> Prediction:
+    """Score a grid of base poses around a target that a depth camera sees; return all of them.
+
+    Of the result, `best` is the row of the best clear pose (None where none was seen to be clear),
+    `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x towards the target),
+    `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) says how good they are, and
+    `sure` how far to trust the answer. World is the frame of `T_world_camera` where frames have it, as a
+    robot's map; else its origin is on the floor below the camera.
+
+    Args:
+        checkpoint: A file that `train_model` wrote.
+        base_height: Height of the arm's mount above the floor, m.
+        reach: Reach of the arm, m.
+        rgb: Colour picture, aligned with the depth.
+        depth: 16-bit depth PNG.
+        intrinsics: JSON with fx, fy, cx, cy, width, height.
+        mask: PNG of the target's pixels, white on black.
+        click: A pixel (u, v) on the target of the first frame.
+        frame: Folders, .npz or .ply files, or SensorFrame objects; several with poses are fused.
+        frame_dir: A folder of such frames, taken by name.
+        camera_height: Height of the camera that took the frame, m.
+        camera_pose: JSON with T_world_camera (4x4); world z up, floor at z = 0.
+        gravity: Where things fall (x, y, z), in the camera's frame (x right, y down).
+        robot_camera_height: Height of the robot's own camera, m [that of the frame's].
+        depth_scale: Metres per step of 16-bit depth.
+        grid: Cells on a side of the grid around the target.
+        half_width: Half the grid's side, m.
+        allow_unseen: Choose also among poses whose floor was not seen.
+        out: PNG picture to write.
+        html: HTML page to write.
+
+    Raises:
+        InputError: A frame, the checkpoint or an option cannot be used.
+
+    Example:
+        >>> robot = datagen.robots["fetch"]
+        >>> answer = datagen.predict(
+        ...     checkpoint, frame=[frame], base_height=robot.base_height_m[0], reach=robot.reach_m[1]
+        ... )
+        >>> answer.base_xy_m.shape, answer.T_world_base(0).shape
+        ((625, 2), (4, 4))
+    """
     # Imported here: the libraries of training take seconds to import.
     from datagen.train.prediction import RobotSize, load_scorer
     from datagen.train.prediction import predict as scored
-    from datagen.train.prediction.prediction_report import document, told
 
     lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
@@ -87,10 +183,15 @@ def predict(
     if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
         mend = "Give metres per step: 0.001 for millimetres"
         raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", mend)
-    pixel = None if click is None else _pixel(click)
     falls = None if gravity is None else _direction(gravity)
-    frames = _frames(rgb, depth, intrinsics, mask, camera_pose, frame, frame_dir, depth_scale)
-    _refuse_outputs(out, html, [checkpoint, rgb, depth, intrinsics, mask, camera_pose, *(frame or [])])
+    rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html = (
+        None if path is None else Path(path)
+        for path in (rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html)
+    )
+    named = [Path(each) if isinstance(each, str) else each for each in frame or ()]
+    frames = _frames(rgb, depth, intrinsics, mask, camera_pose, named, frame_dir, depth_scale)
+    files = [each for each in named if isinstance(each, Path)]
+    _refuse_outputs(out, html, [Path(checkpoint), rgb, depth, intrinsics, mask, camera_pose, *files])
     own_height = robot_camera_height if robot_camera_height is not None else camera_height
     if own_height is None:
         own_height = float(frames[0].T_world_camera[2, 3]) if frames[0].T_world_camera is not None else None
@@ -104,7 +205,7 @@ def predict(
         RobotSize(own_height, base_height, reach),
         camera_height_m=camera_height,
         gravity=falls,
-        click=pixel,
+        click=click,
         allow_unseen=allow_unseen,
         grid=grid,
         half_width_m=half_width,
@@ -119,12 +220,7 @@ def predict(
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(answer).encode())
-    if as_json:
-        print_json(document(answer))
-    else:
-        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
-        print_rows(f"base poses by {answer.scorer}", [*told(answer), *written])
-    return 0 if answer.best is not None else 1
+    return answer
 
 
 def _frames(
@@ -133,7 +229,7 @@ def _frames(
     intrinsics: Path | None,
     mask: Path | None,
     camera_pose: Path | None,
-    places: Sequence[Path] | None,
+    places: Sequence[Path | SensorFrame],
     folder: Path | None,
     depth_scale_m: float,
 ) -> list[SensorFrame]:
@@ -141,7 +237,7 @@ def _frames(
     from datagen.train.prediction.files import read_pose
     from datagen.train.prediction.frames import read_frame, read_place
 
-    named = list(places or [])
+    named = list(places)
     if folder is not None:
         if not folder.is_dir():
             raise InputError(folder, "--frame-dir", "does not exist", "Name a folder of frames")
@@ -166,7 +262,7 @@ def _frames(
     elif camera_pose is not None and len(named) != 1:
         mend = "Put pose.json into each frame's folder, or T_world_camera into its .npz"
         raise InputError("--camera-pose", "", f"is one pose for {len(named)} frames", mend)
-    frames += [read_place(place, depth_scale_m) for place in named]
+    frames += [read_place(each, depth_scale_m) if isinstance(each, Path) else each for each in named]
     if not frames:
         raise InputError(
             "--rgb, --depth", "", "no frame is given", "Give --rgb, --depth and --intrinsics, or --frame"
@@ -188,15 +284,19 @@ def _pixel(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def _direction(text: str) -> F64:
+def _numbers(text: str) -> list[float]:
     try:
-        values = np.array([float(part) for part in text.split(",")])
+        return [float(part) for part in text.split(",")]
     except ValueError:
-        values = np.zeros(0)
+        return []
+
+
+def _direction(given: Sequence[float]) -> F64:
+    values = np.array(given, np.float64)
     sound = values.shape == (3,) and bool(np.isfinite(values).all())
     if not sound or not 1e-6 < float(np.abs(values).max()) < 1e6:
         mend = "Give x,y,z in the camera frame: 0,1,0 for a level camera"
-        raise InputError("--gravity", text[:60], "is not a direction", mend)
+        raise InputError("--gravity", ",".join(f"{value:g}" for value in given), "is not a direction", mend)
     return values
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from typing_extensions import Unpack
 
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
-from datagen.jobs.options import HERE, JobOptions, absolute_place, opening
+from datagen.jobs.job import JobResult
+from datagen.jobs.job_report import reported
+from datagen.jobs.options import HERE, JobOptions, Placing, Where, absolute_place, opening
 from datagen.jobs.start_job import open_job_run, source_words, start_job
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.merged_runs import open_runs
@@ -19,7 +23,7 @@ from datagen.schemas.quarantine import lift_quarantine
 from datagen.schemas.storage import open_storage
 
 
-def resume(
+def verb(
     run: RunPlace,
     /,
     *,
@@ -35,6 +39,36 @@ def resume(
 
     For example: datagen resume runs/first
     """
+    return reported(lambda: resume(run, quarantined=quarantined, given=given, job_options=job_options))
+
+
+def resume(
+    run: str | Path,
+    *,
+    quarantined: bool = False,
+    given: Sources = AS_FOUND,
+    job_options: Placing | None = None,
+    **where: Unpack[Where],
+) -> JobResult:
+    """Make every missing shard of a run or of merged runs, seal it, and return what was done.
+
+    Args:
+        run: The run's folder or s3:// address.
+        quarantined: Try the shards in quarantine again.
+        given: Where houses, objects and the run of its scenes lie now, if they have moved.
+        job_options: What the command line gives instead of `where`.
+        where: As of `submit`: `workers`, `address`, `max_quarantined`, `detach` and `quiet`.
+
+    Raises:
+        InputError: The run or a source cannot be used.
+        KeyboardInterrupt: The job was stopped; the run can be resumed.
+
+    Example:
+        >>> result = datagen.resume(run, workers=0, quiet=True)
+        >>> result.complete, result.labels, result.remaining
+        (True, 0, 0)
+    """
+    run, job_options = str(run), job_options or Placing(**where)
     job_options.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += job_options.words()
@@ -48,5 +82,8 @@ def resume(
             return detach_job(words, run, job_options)
         if quarantined:
             lifted = sum(len(lift_quarantine(part)) for part in runs)
-            sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return start_job(place, run, job_runs, job_options, began_s, given)
+            if not job_options.quiet:
+                sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
+    return start_job(
+        place, run, job_runs, job_options, began_s, [*words, *job_options.address_words()], given
+    )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+from typing_extensions import Unpack
 
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.configuration.manifest import manifest_of
@@ -19,8 +20,18 @@ from datagen.configuration.stored_scenes import (
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
-from datagen.jobs.job import JobRun
-from datagen.jobs.options import HERE, JobOptions, absolute_place, absolute_source, opening, refuse_odd_n
+from datagen.jobs.job import JobResult, JobRun
+from datagen.jobs.job_report import reported
+from datagen.jobs.options import (
+    HERE,
+    JobOptions,
+    Placing,
+    Where,
+    absolute_place,
+    absolute_source,
+    opening,
+    refuse_odd_n,
+)
 from datagen.jobs.start_job import refuse_unusable_engines, start_job
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
@@ -46,7 +57,7 @@ _BUILTIN = (
 )
 
 
-def submit(
+def verb(
     label_source: Annotated[str, Parameter(name="LABEL_SOURCE", help="heuristic, plan or sim.")],
     /,
     *,
@@ -104,6 +115,96 @@ def submit(
 
     For example: datagen submit heuristic --n 1e5 --out runs/first
     """
+    return reported(
+        lambda: submit(
+            label_source,
+            n=n,
+            out=out,
+            houses=houses,
+            objects=objects,
+            scenes_from=scenes_from,
+            robot=robot,
+            perturb=perturb,
+            candidates=candidates,
+            candidates_per_scene=candidates_per_scene,
+            robots_per_scene=robots_per_scene,
+            split=split,
+            seed=seed,
+            settler=settler,
+            renderer=renderer,
+            noise=noise,
+            config=config,
+            placing=placing,
+        )
+    )
+
+
+def submit(
+    label_source: str,
+    *,
+    n: int,
+    out: str | Path,
+    houses: str | None = None,
+    objects: str | None = None,
+    scenes_from: str | Path | None = None,
+    robot: str | None = None,
+    perturb: int | None = None,
+    candidates: Literal["grid", "clear", "in-range"] | None = None,
+    candidates_per_scene: int | str | None = None,
+    robots_per_scene: int | None = None,
+    split: Literal["train", "val", "test", "all"] | None = None,
+    seed: int | None = None,
+    settler: str | None = None,
+    renderer: str | None = None,
+    noise: bool = False,
+    config: str | Path | None = None,
+    placing: Placing | None = None,
+    **where: Unpack[Where],
+) -> JobResult:
+    """Make labels and return what was done: start a run, or continue the one in the folder.
+
+    The call blocks and reports progress on standard error; in a notebook an interrupt of the kernel lets
+    the shards in flight finish, and the same call, or `resume`, continues. Options are those of
+    `datagen submit`, which `datagen submit --help` describes; the same options make the same bytes for
+    any number of workers.
+
+    Args:
+        label_source: One of `datagen.label_sources`: heuristic, plan or sim.
+        n: Labels wanted; a larger number later extends the run.
+        out: The run's folder or s3:// address.
+        houses: One of `datagen.houses`, as `procthor:DIR` [builtin].
+        objects: One of `datagen.objects`, as `ycb:DIR` [builtin].
+        scenes_from: A run whose scenes and candidates are labelled again.
+        robot: One of `datagen.robots` [plan, sim: panda-scaled].
+        perturb: Trials at each candidate under disturbances (sim) [undisturbed].
+        candidates: Which cells of the grid around the target are candidates.
+        candidates_per_scene: Candidates of a scene [60]; "grid" for all 625.
+        robots_per_scene: Robots that share a scene's candidates [4, and 1 on a whole grid].
+        split: Houses to use, disjoint by split [all].
+        seed: Seed of the whole run [0].
+        settler: Physics engine: sapien or pybullet.
+        renderer: Renderer of the RGB-D frame: embree, sapien or pybullet [embree].
+        noise: Add the sensor noise model to the frame.
+        config: TOML file with any field of the specification.
+        placing: What the command line gives instead of `where`.
+        where: `workers` (processes [one a core]; 0 works in this process), `address` (of a Ray cluster
+            [local]), `max_quarantined` (share of shards that may fail [0.01]), `detach` (let Ray continue
+            when this process ends) and `quiet` (report no progress).
+
+    Raises:
+        InputError: An option, a source or the run cannot be used.
+        KeyboardInterrupt: The job was stopped; the run can be resumed.
+
+    Example:
+        >>> result = datagen.submit(
+        ...     "heuristic", n=8, out=folder / "new", candidates_per_scene=8, workers=0, quiet=True
+        ... )
+        >>> result.complete, result.labels, result.path == str(folder / "new")
+        (True, 8, True)
+    """
+    out, placing = str(out), placing or Placing(**where)
+    scenes_from = None if scenes_from is None else str(scenes_from)
+    config = None if config is None else Path(config)
     refuse_missing_packages(label_source)
     load_label_source(label_source)  # InputError for an unknown one
     refuse_odd_n(n)
@@ -170,7 +271,9 @@ def submit(
     if job_options.detach:
         return detach_job(words, out, job_options)
     job_run = JobRun(run, sources["houses"], sources["objects"], source_url)
-    return start_job(run.storage, out, [job_run], job_options, began_s)
+    return start_job(
+        run.storage, out, [job_run], job_options, began_s, [*words, *job_options.address_words()]
+    )
 
 
 def _layout_there(out: str) -> Layout | None:
@@ -193,9 +296,9 @@ def _refuse_no_scene(world: World, houses: str) -> None:
         raise InputError("--houses", houses, f"no scene can be made: {error.problem}", error.mend) from error
 
 
-def _candidate_options(kind: str | None, per_scene: str | None) -> dict[str, int | str | None]:
+def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[str, int | str | None]:
     """Fields of --candidates and --candidates-per-scene, by dotted name."""
-    number = _per_scene(per_scene)
+    number = _per_scene(None if per_scene is None else str(per_scene))
     if kind == "grid":
         if number not in (None, "grid"):
             mend = "Give --candidates clear or in-range to sample some, or omit the number"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Whole = Annotated[int | None, WHOLE_NUMBER]
 
 
-def train(
+def verb(
     stage: Annotated[
         Literal["stage1", "stage2", "sim-only"],
         Parameter(name="STAGE", help="Heuristic labels, then sim labels, or sim labels alone."),
@@ -80,6 +80,106 @@ def train(
 
     For example: datagen train stage1 runs/first --out model.ckpt
     """
+    finished = True
+    try:
+        train_model(
+            stage,
+            runs,
+            out=out,
+            val=val,
+            init=init,
+            model=model,
+            model_config=model_config,
+            epochs=epochs,
+            batch_scenes=batch_scenes,
+            house_share=house_share,
+            candidates_per_robot=candidates_per_robot,
+            lr=lr,
+            weight_decay=weight_decay,
+            seed=seed,
+            patience=patience,
+            augment=augment,
+            device=device,
+            processes=processes,
+            threads=threads,
+            tensorboard=tensorboard,
+            allow_incomplete=allow_incomplete,
+            json=json,
+        )
+    except TrainingInterrupted:
+        finished = False
+    return _report(out, finished, json)
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """A training ended because it was asked to; its checkpoint has the last step."""
+
+
+def train_model(
+    stage: Literal["stage1", "stage2", "sim-only"],
+    runs: Sequence[str | Path],
+    *,
+    out: str | Path,
+    val: Sequence[str | Path] | None = None,
+    init: str | Path | None = None,
+    model: Literal["paper", "shared"] | None = None,
+    model_config: Sequence[str] | None = None,
+    epochs: int | None = None,
+    batch_scenes: int = 16,
+    house_share: float = 1.0,
+    candidates_per_robot: int | None = None,
+    lr: float | None = None,
+    weight_decay: float | None = None,
+    seed: int = 0,
+    patience: int = 8,
+    augment: str | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    processes: int | None = None,
+    threads: int | None = None,
+    tensorboard: str | Path | None = None,
+    allow_incomplete: bool = False,
+    json: bool = False,
+) -> CheckpointHead:
+    """Train a model on labels, keep it in one file, and return what the file says of itself.
+
+    Options are those of `datagen train`, which `datagen train --help` describes; the same call on the same
+    file continues a training that was interrupted.
+
+    Args:
+        stage: stage1 on heuristic labels, stage2 from there on plan or sim labels, or sim-only.
+        runs: Runs to learn from, also merged or sealed ones.
+        out: The checkpoint's file.
+        val: Runs that decide when to stop [a tenth of the houses is held out].
+        init: The checkpoint of stage 1 that stage2 begins from.
+        model: paper or shared [shared, or that of `init`].
+        model_config: Sizes of the model: TOML files, or field=value.
+        epochs: Most epochs [12 in stage1, else 20].
+        batch_scenes: Scenes in a step, of all processes together.
+        house_share: Share of the houses to learn from.
+        candidates_per_robot: Candidates sampled per robot per epoch [all].
+        lr: Highest learning rate [0.002; 0.001 in stage2].
+        weight_decay: Weight decay [0 in stage1, else 0.01].
+        seed: Seed of weights, order and dropout.
+        patience: Epochs without a lower validation loss before training stops.
+        augment: Effects, as "noise,holes", or a TOML file.
+        device: auto, cpu or cuda.
+        processes: Processes that train together [one a GPU; on CPUs one].
+        threads: Threads of each process [cores over processes].
+        tensorboard: Folder for TensorBoard's curves.
+        allow_incomplete: Read runs that lack a part of their labels.
+        json: Report progress as JSON lines.
+
+    Raises:
+        InputError: An option or a run cannot be used.
+        KeyboardInterrupt: Training was stopped; the same call continues it.
+
+    Example:
+        >>> head = datagen.train_model(
+        ...     "stage1", [run], val=[other], out=folder / "model.ckpt", epochs=1, device="cpu"
+        ... )
+        >>> head.finished, head.epoch, len(head.history)
+        (True, 1, 1)
+    """
     if not runs:
         raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
     each = share_cores(processes, threads)
@@ -110,21 +210,23 @@ def train(
     where, n_processes = choose_device(device, processes)
     job = TrainingJob(
         options,
-        tuple(runs),
-        tuple(val or ()),
+        tuple(map(str, runs)),
+        tuple(map(str, val or ())),
         str(out),
         augmentation,
         str(init) if init else None,
         where,
         each,
-        tensorboard=tensorboard,
+        tensorboard=None if tensorboard is None else str(tensorboard),
         json_lines=json,
         allow_incomplete=allow_incomplete,
     )
-    return _report(out, _train(job, n_processes), json)
+    if not _train(job, n_processes):
+        raise TrainingInterrupted(f"Training stopped; the same call on {out} continues it")
+    return read_checkpoint(out).head
 
 
-def _refuse_odd_init(stage: str, init: Path | None, needs_one: bool) -> None:
+def _refuse_odd_init(stage: str, init: str | Path | None, needs_one: bool) -> None:
     if init is None and needs_one:
         problem = f"is missing: {stage} starts from a checkpoint of stage 1"
         raise InputError("datagen train", "--init", problem, "Give --init CKPT, or train sim-only")

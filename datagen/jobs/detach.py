@@ -16,7 +16,7 @@ from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
-from datagen.jobs.job import JOBS_API, SUBMISSION
+from datagen.jobs.job import JOBS_API, SUBMISSION, JobResult
 from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
@@ -25,7 +25,7 @@ _BEGUN_WITHIN_S = 60.0
 _LOOK_S = 0.3
 
 
-def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> int:
+def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> JobResult:
     """Run the command of these words as a Ray job, and print how to follow it.
 
     With the address `local`, it runs on a Ray head of this machine, which is started if needed. Returns once
@@ -57,7 +57,7 @@ def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> int
     if job_options.address == "local":
         rows.append(("Ray", f"keeps running for later jobs; stop it: {command_line(['cancel', '--head'])}"))
     print_rows(f"detached: {command_line(words)}", rows)
-    return 0
+    return JobResult(place, "detached")
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.driver import AttemptOrder, drive
@@ -26,12 +26,12 @@ from datagen.cluster.retry_policy import RetryPolicy, too_many_quarantined
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import ShardTask
-from datagen.console.command_lines import command_line, say_interrupted
-from datagen.console.printing import counted, listed, print_rows, seconds
+from datagen.console.command_lines import command_line
+from datagen.console.printing import counted
 from datagen.jobs.job_recorder import JobRecorder
 from datagen.jobs.options import JobOptions
 from datagen.reports.specification_summary import made_from
-from datagen.schemas.errors import InputError, one_line
+from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import utc_now
@@ -41,6 +41,47 @@ from datagen.schemas.storage import Storage
 
 # Set for the driver of a detached job: its name at the Jobs API, and the address of that.
 SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
+
+
+@dataclass(frozen=True, eq=False)
+class JobResult:
+    """What a job did, and what its run holds now. Quarantined shards are those that failed repeatedly."""
+
+    path: str  # the run, as the user wrote it
+    # detached: Ray makes the labels. failed: more shards are quarantined than allowed.
+    end: Literal["complete", "failed", "interrupted", "aborted", "detached"]
+    n: int = 0  # labels wanted
+    made_from: str = ""  # houses, objects and robot
+    labels: int = 0  # made by this job
+    positives: int = 0  # of those
+    shards: int = 0  # that were missing when the job began
+    remaining: int = 0  # of those, still missing
+    quarantined: tuple[int, ...] = ()
+    retries: int = 0
+    start_s: float = 0.0  # until the first shard began
+    elapsed_s: float = 0.0  # from then on
+    store: str = ""  # the sealed store, which zarr and xarray open
+    cause: str = ""  # of an aborted job, and the most frequent one of a failed job
+    resume: tuple[str, ...] = ()  # the words of the command that continues
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run has all labels that were wanted, but for the allowed share in quarantine."""
+        return self.end == "complete"
+
+    @property
+    def exit_code(self) -> int:
+        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
+        return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
+
+
+class JobInterrupted(KeyboardInterrupt):
+    """A job ended because it was asked to; what is committed stays, and `result` says what that is."""
+
+    def __init__(self, result: JobResult) -> None:
+        self.result = result
+        left = counted(result.remaining, "shard")
+        super().__init__(f"{left} left. Continue with: {command_line(result.resume)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +103,15 @@ class JobPlan:
     runs: Sequence[JobRun]
     options: JobOptions
     began_s: float  # by the monotonic clock, when the command began to open them
-    resume: Sequence[str]  # the words of the command that goes on with it
+    command: Sequence[str]  # the words of the command that started it
+    resume: Sequence[str]  # the words of the command that resumes it
 
 
-def run_job(plan: JobPlan) -> int:
-    """Make every missing shard, seal, and print a summary; return the exit code.
+def run_job(plan: JobPlan) -> JobResult:
+    """Make every missing shard, seal, and return what was done.
 
-    While it works, the job is known there, and handles requests to stop that are left there.
+    Meanwhile the job publishes its state in the run, and obeys stop requests that it finds there. Raises
+    InputError for an error that no retry can fix.
     """
     if not _count_missing(plan):
         for job_run in plan.runs:
@@ -78,13 +121,13 @@ def run_job(plan: JobPlan) -> int:
     try:
         summary = _judged(plan, make_missing(plan, recorder))
         recorder.seal()
-        code = _finish(plan, summary)
+        result = _finish(plan, summary)
     except BaseException as error:
         end, code = _end_of(error)
         recorder.end(end, code, " ".join(str(error).split())[:1000])
         raise
-    recorder.end(summary.end, code, summary.cause, summary)
-    return code
+    recorder.end(summary.end, result.exit_code, summary.cause, summary)
+    return result
 
 
 def _end_of(error: BaseException) -> tuple[JobEnd, int]:
@@ -99,7 +142,7 @@ def open_recorder(plan: JobPlan) -> JobRecorder:
     """Publish the job's record."""
     record = JobRecord(
         id=new_job_id(),
-        command=("datagen", *sys.argv[1:]),
+        command=("datagen", *plan.command),
         host=platform.node(),
         pid=os.getpid(),
         started=utc_now(),
@@ -124,7 +167,7 @@ def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
     whole = empty_summary()
     with ExitStack() as stack:
         notes = stack.enter_context(notes_of_a_job())
-        shown = stack.enter_context(Progress(job_options.json))
+        shown = stack.enter_context(job_options.display())
         executor = _executor(job_options, sum(map(len, missing)), stack, shown)
         stack.enter_context(stop_on_signals(stop, interrupt=job_options.workers == 0))
         for job_run, shards in zip(plan.runs, missing, strict=True):
@@ -208,48 +251,28 @@ class _CannotContinue(InputError):
     """The job met an error that no retry can fix."""
 
 
-def _finish(plan: JobPlan, summary: JobSummary) -> int:
-    """Seal the run, print a summary and how to continue; return the exit code."""
-    totals, runs, path = summary.totals, [job_run.run for job_run in plan.runs], plan.path
-    n, resume = sum(run.n for run in runs), command_line(plan.resume)
-    given_up = [(run, shard) for run in runs for shard in sorted(run.quarantined())]
-    if totals.shards:
-        labels = f"{totals.labels:,} new of {n:,} wanted"
-    elif given_up:
-        labels = f"nothing to do: the shards of {n:,} labels are committed or quarantined"
-    else:
-        labels = f"nothing to do: all {n:,} labels are committed"
-    rows = [
-        ("labels", labels),
-        ("made from", made_from(run.manifest for run in runs)),
-        ("positive", f"{100 * totals.positives / totals.labels:.1f}%" if totals.labels else "-"),
-        ("time", _time(summary)),
-        ("retries", str(totals.retries)),
-    ]
-    if given_up:
-        again = command_line(["resume", path, "--quarantined"])
-        those = f"{counted(len(given_up), 'shard')} ({listed([shard for _, shard in given_up])})"
-        shown = f"{those}; try again: {again}"
-        rows.append(("quarantined", shown))
-    if summary.end in ("complete", "failed") and any(run.committed() for run in runs):
-        sealed = seal(plan.storage)
-        rows.append(("store", f"{sealed}: zarr.open or xarray.open_zarr reads it"))
-    print_rows(f"{summary.end}: {path}", rows)
+def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
+    """Seal the run, unless the job was stopped, and return what was done."""
+    totals, runs = summary.totals, [job_run.run for job_run in plan.runs]
+    causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
     if summary.end == "aborted":
-        raise _CannotContinue(path, "", f"the job cannot continue: {summary.cause}", f"Then resume: {resume}")
-    if summary.end == "failed":
-        causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
-        most = f", most often by: {causes.most_common(1)[0][0]}" if causes else ""
-        see = command_line(["status", path])
-        sys.stderr.write(one_line(f"error: {path}: too many shards are quarantined{most}. See: {see}") + "\n")
-    if summary.end == "interrupted":
-        say_interrupted(f"; {counted(summary.remaining, 'shard')} left", plan.resume)
-    return summary.exit_code
-
-
-def _time(summary: JobSummary) -> str:
-    if not summary.totals.labels:
-        return seconds(summary.start_s + summary.elapsed_s)
-    rate = summary.totals.labels / max(summary.elapsed_s, 1e-6)
-    parts = f"start {seconds(summary.start_s)}, labels {seconds(summary.elapsed_s)}"
-    return f"{seconds(summary.start_s + summary.elapsed_s)}: {parts} at {rate:,.0f}/s"
+        mend = f"Then resume: {command_line(plan.resume)}"
+        raise _CannotContinue(plan.path, "", f"the job cannot continue: {summary.cause}", mend)
+    does_seal = summary.end != "interrupted" and any(run.committed() for run in runs)
+    return JobResult(
+        path=plan.path,
+        end=summary.end,
+        n=sum(run.n for run in runs),
+        made_from=made_from(run.manifest for run in runs),
+        labels=totals.labels,
+        positives=totals.positives,
+        shards=totals.shards,
+        remaining=summary.remaining,
+        quarantined=tuple(shard for run in runs for shard in sorted(run.quarantined())),
+        retries=totals.retries,
+        start_s=summary.start_s,
+        elapsed_s=summary.elapsed_s,
+        store=seal(plan.storage) if does_seal else "",
+        cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
+        resume=tuple(plan.resume),
+    )

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from typing import Any
 
-from datagen.console.printing import counted, seconds
+from datagen.console.command_lines import command_line, say_interrupted
+from datagen.console.printing import counted, listed, print_rows, seconds
+from datagen.jobs.job import JobInterrupted, JobResult
+from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import Storage
 
@@ -48,3 +53,52 @@ def health_line(job: StoredJob) -> str:
         doing += ", asked to stop"
     silent = "silent, " if health == "silent" else ""
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"
+
+
+def reported(job: Callable[[], JobResult]) -> int:
+    """Run a job, print its summary, also where it was interrupted, and return the exit code."""
+    try:
+        result = job()
+    except JobInterrupted as stopped:
+        result = stopped.result
+    if result.end != "detached":
+        _print(result)
+    return result.exit_code
+
+
+def _print(result: JobResult) -> None:
+    n, path = result.n, result.path
+    if result.shards:
+        labels = f"{result.labels:,} new of {n:,} wanted"
+    elif result.quarantined:
+        labels = f"nothing to do: the shards of {n:,} labels are committed or quarantined"
+    else:
+        labels = f"nothing to do: all {n:,} labels are committed"
+    rows = [
+        ("labels", labels),
+        ("made from", result.made_from),
+        ("positive", f"{100 * result.positives / result.labels:.1f}%" if result.labels else "-"),
+        ("time", _time(result)),
+        ("retries", str(result.retries)),
+    ]
+    if result.quarantined:
+        again = command_line(["resume", path, "--quarantined"])
+        those = f"{counted(len(result.quarantined), 'shard')} ({listed(result.quarantined)})"
+        rows.append(("quarantined", f"{those}; try again: {again}"))
+    if result.store:
+        rows.append(("store", f"{result.store}: zarr.open or xarray.open_zarr reads it"))
+    print_rows(f"{result.end}: {path}", rows)
+    if result.end == "failed":
+        most = f", most often by: {result.cause}" if result.cause else ""
+        see = command_line(["status", path])
+        sys.stderr.write(one_line(f"error: {path}: too many shards are quarantined{most}. See: {see}") + "\n")
+    if result.end == "interrupted":
+        say_interrupted(f"; {counted(result.remaining, 'shard')} left", result.resume)
+
+
+def _time(result: JobResult) -> str:
+    if not result.labels:
+        return seconds(result.start_s + result.elapsed_s)
+    rate = result.labels / max(result.elapsed_s, 1e-6)
+    parts = f"start {seconds(result.start_s)}, labels {seconds(result.elapsed_s)}"
+    return f"{seconds(result.start_s + result.elapsed_s)}: {parts} at {rate:,.0f}/s"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.console.command_lines import resumable, words_of
@@ -42,6 +44,7 @@ class JobOptions:
     json: Annotated[bool, Parameter(negative=(), help="Print progress as JSON lines to standard error.")] = (
         False
     )
+    quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
 
     def refuse_bad(self) -> None:
         """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
@@ -54,6 +57,10 @@ class JobOptions:
         if self.workers != 0 and not self.detach:
             refuse_unusable(self.address)
 
+    def display(self) -> Progress:
+        """What reports progress on standard error."""
+        return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
+
     def words(self) -> list[str]:
         """The words of these options, without --detach and --address."""
         share = None if self.max_quarantined == DEFAULT_SHARE else self.max_quarantined
@@ -65,6 +72,16 @@ class JobOptions:
 
 
 HERE = JobOptions()
+
+
+class Where(TypedDict, total=False):
+    """The fields of Placing as keyword arguments of functions."""
+
+    workers: int | None
+    address: str
+    max_quarantined: float
+    detach: bool
+    quiet: bool
 
 
 def refuse_odd_n(n: int) -> None:
@@ -80,7 +97,7 @@ def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
     Gives its start by the monotonic clock.
     """
     began_s = time.monotonic()
-    with resumable([*words, *job_options.address_words()]), Progress(job_options.json) as shown:
+    with resumable([*words, *job_options.address_words()]), job_options.display() as shown:
         shown.phase("opening houses and objects")
         yield began_s
 

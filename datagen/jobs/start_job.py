@@ -10,7 +10,7 @@ from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detached_words
-from datagen.jobs.job import JobPlan, JobRun, run_job
+from datagen.jobs.job import JobInterrupted, JobPlan, JobResult, JobRun, run_job
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source
 from datagen.regeneration.shards import open_sources
 from datagen.regeneration.sources import AS_FOUND, Sources
@@ -64,13 +64,20 @@ def start_job(
     job_runs: Sequence[JobRun],
     job_options: JobOptions,
     began_s: float,
+    command: Sequence[str],
     given: Sources = AS_FOUND,
-) -> int:
-    """Make the missing shards; return the exit code. `path` is the path as the user wrote it."""
+) -> JobResult:
+    """Make the missing shards; `command` is what the user gave, `path` the path as they wrote it.
+
+    Raises JobInterrupted where the job was asked to stop.
+    """
     words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
     words += detached_words() or job_options.address_words()
     with resumable(words):
-        return run_job(JobPlan(storage, path, job_runs, job_options, began_s, words))
+        result = run_job(JobPlan(storage, path, job_runs, job_options, began_s, command, words))
+    if result.end == "interrupted":
+        raise JobInterrupted(result)
+    return result
 
 
 def refuse_unusable_engines(spec: Specification, address: str) -> None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
+from datagen.schemas.description import cf_attributes, described
 from datagen.schemas.record_files import MAX_RECORD_BYTES
 from datagen.schemas.sealing.contents import Contents, SealedRun
 from datagen.schemas.shard_files import TABLES, root_attributes, zarr_metadata
@@ -54,8 +55,11 @@ def sealed_root(place: Storage) -> SealedRoot | None:
         return None
 
 
-def sealed_metadata(contents: Contents) -> dict[str, bytes]:
-    """zarr.json files of the store by path; the root's has consolidated metadata."""
+def sealed_metadata(contents: Contents, for_readers: bool = True) -> dict[str, bytes]:
+    """zarr.json files of the store by path; the root's has consolidated metadata.
+
+    Older stores are not `for_readers`: they lack the attributes of CF and ACDD.
+    """
     first = contents.runs[0]
     attributes = root_attributes(contents.schema, contents.layout, first.run.manifest.spec_hash)
     if contents.is_merged:
@@ -65,7 +69,14 @@ def sealed_metadata(contents: Contents) -> dict[str, bytes]:
         attributes |= _part(first)
     attributes["rows_sha256"] = contents.digests[-1]
     rows = {table: contents.rows(table) for table in TABLES}
-    files = zarr_metadata(contents.schema, contents.layout, rows, attributes)
+    of_arrays: dict[str, dict[str, Any]] = {}
+    if for_readers:
+        specs = [part.run.manifest.spec for part in contents.runs]
+        attributes = described(specs, [part.n for part in contents.runs]) | attributes
+        of_arrays = {
+            f.name: cf_attributes(f, table) for table in TABLES for f in contents.schema.table(table)
+        }
+    files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays)
     make = default_buffer_prototype().buffer.from_bytes
     store = {path: make(data) for path, data in files.items()}
     with warnings.catch_warnings():

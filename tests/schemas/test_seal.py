@@ -19,8 +19,10 @@ from datagen.schemas import shard_files
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
-from datagen.schemas.sealing import SEALED, seal
+from datagen.schemas.sealing import SEALED, seal, sealed_metadata
 from datagen.schemas.sealing import local as seal_local
+from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.specification import Source
 from tests.made_runs import check_digests, files_of, make_run, rows_of, small_spec, write
 
 
@@ -275,3 +277,43 @@ def test_whatever_has_the_name_makes_way(tmp_path: Path, kind: str):
     assert_equal(zarr.open_group(seal(run.storage), mode="r"), expected(run, [0, 1], 4, 20))
     assert [p.name for p in sealed.parent.iterdir() if p.name.startswith(SEALED)] == [SEALED]
     assert (elsewhere / "kept").exists()
+
+
+def test_the_store_says_its_conventions_source_licences_and_coordinates(tmp_path: Path):
+    spec = small_spec().model_copy(
+        update={
+            "houses": Source(kind="procthor", digest="1" * 64),
+            "objects": Source(kind="ycb", digest="2" * 64),
+        }
+    )
+    run = make_run(tmp_path / "a", n=13, spec=spec)
+    data = xarray.open_zarr(seal(run.storage), chunks=None)
+    told = data.attrs
+    assert told["Conventions"] == "CF-1.11, ACDD-1.3"
+    assert told["title"] == "Robot base poses labelled by heuristic, in ProcTHOR houses with YCB objects"
+    assert told["license"] == "ProcTHOR houses: Apache-2.0; YCB objects: CC-BY-4.0"
+    assert "arXiv:2206.06994" in told["references"] and "Calli" in told["acknowledgement"]
+    assert f"objects ycb sha256 {'2' * 64}" in told["source"]
+    assert (
+        told["history"].startswith("datagen submit heuristic --n 13, seed 0")
+        and spec.hash() in told["history"]
+    )
+    assert "datagen.candidates" in told["comment"]
+    coordinates = {"scene_index", "house_id", "sample_scene_index", "candidate_index", "robot_index"}
+    assert set(data.coords) == coordinates
+    assert data["label"].encoding["coordinates"] == "sample_scene_index candidate_index robot_index"
+
+
+def test_two_stores_of_one_specification_have_equal_metadata(tmp_path: Path):
+    roots = [Path(seal(make_run(tmp_path / name, n=13).storage)) / "zarr.json" for name in "ab"]
+    assert roots[0].read_bytes() == roots[1].read_bytes()
+
+
+def test_a_store_without_these_attributes_made_by_an_older_program_is_sound(tmp_path: Path):
+    run = make_run(tmp_path, n=13)
+    store = Path(seal(run.storage))
+    for path, data in sealed_metadata(read_contents(run.storage), for_readers=False).items():
+        (store / path).chmod(0o644)
+        (store / path).write_bytes(data)
+    assert list(check_place(run.storage, Checked())) == []
+    assert "Conventions" not in xarray.open_zarr(store, chunks=None).attrs
