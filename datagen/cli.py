@@ -36,15 +36,15 @@ EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
 # Verb -> (where it is defined, its line in --help). Verbs return an exit code, or None for 0.
 VERBS: dict[str, tuple[str, str]] = {
-    "verb": ("datagen.commands.verb:verb", "Make labels: start a run, or verb it."),
-    "verb": ("datagen.commands.verb:verb", "Make the missing labels of a run, or of merged runs."),
-    "verb": ("datagen.commands.verb:verb", "Raise the number of labels of a run and make them."),
+    "submit": ("datagen.commands.submit:verb", "Make labels: start a run, or resume it."),
+    "resume": ("datagen.commands.resume:verb", "Make the missing labels of a run, or of merged runs."),
+    "extend": ("datagen.commands.extend:verb", "Raise the number of labels of a run and make them."),
     "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop and wait until they have."),
     "logs": ("datagen.commands.logs:logs", "List what happened in a run, in order of time."),
     "status": ("datagen.commands.status:status", "Show the progress and the failures of a run."),
     "seal": ("datagen.commands.seal:seal", "Make one Zarr store of a run that any Zarr reader opens."),
     "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
-    "verb": ("datagen.commands.verb:verb", "Merge runs into one."),
+    "merge": ("datagen.commands.merge:verb", "Merge runs into one."),
     "verify": ("datagen.commands.verify:verify", "Check every record and every byte of a run."),
     "repair": ("datagen.commands.repair:repair", "Fix the damage that verify finds."),
     "replay": ("datagen.commands.replay:replay", "Make a stored scene again and compare the two."),
@@ -53,9 +53,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
     "gc": ("datagen.commands.gc:gc", "Remove leftover files of a run."),
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
-    "verb": ("datagen.commands.verb:verb", "Train a model on labels."),
-    "verb": ("datagen.commands.verb:verb", "Compare models with baselines and the paper."),
-    "verb": ("datagen.commands.verb:verb", "Find a base pose in a depth camera's frame."),
+    "train": ("datagen.commands.train:verb", "Train a model on labels."),
+    "evaluate": ("datagen.commands.evaluate:verb", "Compare models with baselines and the paper."),
+    "predict": ("datagen.commands.predict:verb", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
 }

@@ -40,7 +40,7 @@ def verb(
     return reported(lambda: _extend(run, n, given, job_options))
 
 
-def _extend(run: str, n: int, given: Sources, job_options: Placing) -> JobResult:
+def _extend(run: str, n: int, given: Sources, job_options: JobOptions) -> JobResult:
     job_options.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]

@@ -15,7 +15,7 @@ from datagen.console.printing import counted
 from datagen.jobs.detach import detach_job
 from datagen.jobs.job import JobResult
 from datagen.jobs.job_report import reported
-from datagen.jobs.options import HERE, JobOptions, Placing, Where, absolute_place, opening
+from datagen.jobs.options import HERE, JobKeywords, JobOptions, absolute_place, opening
 from datagen.jobs.start_job import open_job_run, source_words, start_job
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.merged_runs import open_runs
@@ -47,8 +47,8 @@ def resume(
     *,
     quarantined: bool = False,
     given: Sources = AS_FOUND,
-    job_options: Placing | None = None,
-    **where: Unpack[Where],
+    job_options: JobOptions | None = None,
+    **where: Unpack[JobKeywords],
 ) -> JobResult:
     """Make every missing shard of a run or of merged runs, seal it, and return what was done.
 
@@ -68,7 +68,7 @@ def resume(
         >>> result.complete, result.labels, result.remaining
         (True, 0, 0)
     """
-    run, job_options = str(run), job_options or Placing(**where)
+    run, job_options = str(run), job_options or JobOptions(**where)
     job_options.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += job_options.words()

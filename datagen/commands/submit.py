@@ -24,9 +24,8 @@ from datagen.jobs.job import JobResult, JobRun
 from datagen.jobs.job_report import reported
 from datagen.jobs.options import (
     HERE,
+    JobKeywords,
     JobOptions,
-    Placing,
-    Where,
     absolute_place,
     absolute_source,
     opening,
@@ -134,7 +133,7 @@ def verb(
             renderer=renderer,
             noise=noise,
             config=config,
-            placing=placing,
+            job_options=job_options,
         )
     )
 
@@ -158,8 +157,8 @@ def submit(
     renderer: str | None = None,
     noise: bool = False,
     config: str | Path | None = None,
-    placing: Placing | None = None,
-    **where: Unpack[Where],
+    job_options: JobOptions | None = None,
+    **where: Unpack[JobKeywords],
 ) -> JobResult:
     """Make labels and return what was done: start a run, or continue the one in the folder.
 
@@ -186,7 +185,7 @@ def submit(
         renderer: Renderer of the RGB-D frame: embree, sapien or pybullet [embree].
         noise: Add the sensor noise model to the frame.
         config: TOML file with any field of the specification.
-        placing: What the command line gives instead of `where`.
+        job_options: What the command line gives instead of `where`.
         where: `workers` (processes [one a core]; 0 works in this process), `address` (of a Ray cluster
             [local]), `max_quarantined` (share of shards that may fail [0.01]), `detach` (let Ray continue
             when this process ends) and `quiet` (report no progress).
@@ -202,7 +201,7 @@ def submit(
         >>> result.complete, result.labels, result.path == str(folder / "new")
         (True, 8, True)
     """
-    out, placing = str(out), placing or Placing(**where)
+    out, job_options = str(out), job_options or JobOptions(**where)
     scenes_from = None if scenes_from is None else str(scenes_from)
     config = None if config is None else Path(config)
     refuse_missing_packages(label_source)

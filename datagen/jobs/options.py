@@ -74,8 +74,8 @@ class JobOptions:
 HERE = JobOptions()
 
 
-class Where(TypedDict, total=False):
-    """The fields of Placing as keyword arguments of functions."""
+class JobKeywords(TypedDict, total=False):
+    """The fields of JobOptions as keyword arguments."""
 
     workers: int | None
     address: str

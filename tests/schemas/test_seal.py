@@ -315,5 +315,5 @@ def test_a_store_without_these_attributes_made_by_an_older_program_is_sound(tmp_
     for path, data in sealed_metadata(read_contents(run.storage), for_readers=False).items():
         (store / path).chmod(0o644)
         (store / path).write_bytes(data)
-    assert list(check_place(run.storage, Checked())) == []
+    assert list(check_runs(run.storage, Checked())) == []
     assert "Conventions" not in xarray.open_zarr(store, chunks=None).attrs
