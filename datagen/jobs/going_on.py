@@ -19,6 +19,7 @@ from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.specify import label_engines, scene_engines
+from datagen.workers.extras import missing_library
 from datagen.workers.labels import load_label_source
 from datagen.workers.robots import gripper_of
 
@@ -91,9 +92,9 @@ def _refuse_other_engines(run: Run) -> None:
         if spec.scenes_from is None:  # stored scenes are what they are, whatever drew them
             here |= scene_engines(spec)
     except PackageNotFoundError as error:
-        raise InputError(
-            run.storage.url, "engines", f"{error.name} is not installed here", "Install it"
-        ) from None
+        missing = missing_library(error)
+        mend = missing.mend if missing else "Install it"
+        raise InputError(run.storage.url, "engines", f"{error.name} is not installed here", mend) from None
     made = {name: version for name, version in spec.engines.items() if name in here}
     rows = [f"{name}: it has {a}, here is {b}" for name, a, b in different_fields(made, here)]
     if rows:

@@ -29,7 +29,7 @@ from datagen.cluster.watch import Watch
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.jobs.board import JobBoard
-from datagen.jobs.options import Placing
+from datagen.jobs.options import JOBS_API, SUBMISSION, Placing
 from datagen.schemas.errors import InputError, one_line
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
 from datagen.schemas.progress import Progress
@@ -39,7 +39,6 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
 
 # Set for the driver of a detached job: its name at the Jobs API, and where that listens.
-SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,11 @@ from datagen.console.command_lines import resumable, words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.progress import Progress
+from datagen.workers.extras import refuse_missing
 
 DEFAULT_SHARE = 0.01
+# Variables of a detached job: its name at Ray, and where Ray answers for it.
+SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 _DETACH = (
     "Hand the job to Ray and come back: it goes on when this shell ends. With --address, to that cluster "
     "(its dashboard, as http://HOST:8265, or itself); else to one that stays on this machine."
@@ -51,6 +54,8 @@ class Placing:
         if not 0 <= self.max_quarantined <= 1:
             given = str(self.max_quarantined)
             raise InputError("--max-quarantined", given, "is not a share", "Give 0.01 for one in a hundred")
+        if self.workers != 0 or self.detach:
+            refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
         if self.workers != 0 and not self.detach:
             refuse_unusable(self.address)
 

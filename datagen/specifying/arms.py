@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
-from datagen.workers.registry import SIM_MEND
+from datagen.workers.extras import how_to_get
 from datagen.workers.robots import ROBOTS, robot_limits
 
 # Label sources that move an arm, and the distributions whose version can move bits of their labels.
@@ -32,7 +32,7 @@ def refuse_missing_packages(label_source: str) -> None:
             version(name)
         except PackageNotFoundError:
             problem = f"needs {name}, which is not installed"
-            raise InputError("label source", label_source, problem, SIM_MEND) from None
+            raise InputError("label source", label_source, problem, how_to_get("sim")) from None
 
 
 def arm_versions(label_source: str) -> dict[str, str]:
