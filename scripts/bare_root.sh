@@ -52,7 +52,8 @@ while IFS= read -r -d '' variable; do
 done < /proc/self/environ
 
 echo "$suite: $command"
-# A namespace of its own: mounts and processes end with it.
+# A namespace of its own: mounts and processes end with it. Its variables are those of the inner shell.
+# shellcheck disable=SC2016
 ROOT=$root SHARE=${BARE_SHARE:-} unshare --mount --pid --fork bash -euc '
     mount --make-rprivate /
     mount -t proc proc "$ROOT/proc"
