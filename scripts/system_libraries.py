@@ -1,8 +1,8 @@
 """Checks the shared libraries that some Python wheels expect of the system; installs them if it may.
 
 Only the standard library is used, so that it runs before anything is installed. As root with apt-get
-the missing packages are installed; otherwise the exact command is printed. It always exits with 0: runs can be
-checked, read and learned from without these libraries.
+the missing packages are installed; otherwise the exact command is printed. It always exits with 0: runs can
+be checked, read and learned from without these libraries.
 """
 
 from __future__ import annotations
