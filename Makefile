@@ -8,7 +8,7 @@ BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
 DEMO := build/demo
 
-.PHONY: help demo paper-small paper test faults lint style types format docs site venv clean
+.PHONY: help demo paper-small paper test faults lint style types format docs site venv venv-labels clean
 .DEFAULT_GOAL := help
 
 help:
@@ -25,11 +25,19 @@ help:
 	@echo "make clean   remove everything that make made"
 
 # Does nothing when pyproject.toml, constraints.txt and the interpreter are those of the last call.
-venv:
+define environment
 	@command -v $(PYTHON) > /dev/null || { echo 'error: no $(PYTHON) here; name a Python 3.11 or newer: make PYTHON=...' >&2; exit 1; }
-	@$(PYTHON) scripts/environment.py
+	@$(PYTHON) scripts/environment.py $(1)
+endef
 
-demo: venv
+venv:
+	$(call environment,all dev)
+
+# Only what labels need: a quarter of the whole.
+venv-labels:
+	$(call environment,cluster labels)
+
+demo: venv-labels
 	@rm -rf $(DEMO)
 	@mkdir -p $(DEMO)
 	$(BIN)/datagen submit heuristic --n 600 --out $(DEMO)/run

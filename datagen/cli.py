@@ -25,7 +25,7 @@ from cyclopts.exceptions import (
 from datagen import __version__
 from datagen.cluster.environment import job_environment
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
-from datagen.workers.registry import missing_library
+from datagen.workers.extras import missing_library
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,6 +67,9 @@ _HEADINGS = {
     "Models": ("train", "evaluate", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
 }
+
+# The extra to name where a library that a verb lacks comes with several.
+_EXTRA_OF: dict[str, str] = dict.fromkeys(("train", "evaluate", "predict", "calibrate"), "train")
 
 
 def build_app(called: str = "") -> App:
@@ -129,7 +132,7 @@ def _validation_lines(error: ValidationError) -> list[str]:
     return lines
 
 
-def _lines_for(error: Exception) -> list[str] | None:
+def _lines_for(error: Exception, verb: str) -> list[str] | None:
     """Lines for the user, or None where the error is a defect of this program."""
     if isinstance(error, InputError):
         return [str(error)]
@@ -139,7 +142,7 @@ def _lines_for(error: Exception) -> list[str] | None:
         from datagen.schemas.storage.errors import machine_error
 
         return [str(known)] if (known := machine_error(error)) else None
-    if (missing := missing_library(error)) is not None:
+    if (missing := missing_library(error, _EXTRA_OF.get(verb, "labels"))) is not None:
         return [str(missing)]
     # pydantic takes 0.1 s to import; its errors exist only where it is imported already.
     if "pydantic" in sys.modules:
@@ -155,8 +158,9 @@ def run(arguments: Sequence[str]) -> int:
 
     Defects of this program are not caught: a bug report needs their traceback.
     """
+    verb = next(iter(arguments), "")
     try:
-        result = build_app(next(iter(arguments), ""))([refuse_not_utf8(word) for word in arguments])
+        result = build_app(verb)([refuse_not_utf8(word) for word in arguments])
         sys.stdout.flush()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -169,7 +173,7 @@ def run(arguments: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_CLOSED_PIPE
     except Exception as error:
-        lines = _lines_for(error)
+        lines = _lines_for(error, verb)
         if lines is None:
             raise
         for line in lines:

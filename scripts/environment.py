@@ -1,8 +1,11 @@
 """Makes the project's virtual environment, .venv, with the versions that constraints.txt pins.
 
-Only the standard library is used. A second call finds its stamp and returns at once. The stamp names
-what pyproject.toml asks for, constraints.txt, the interpreter and the folder: when one of them changes,
-the environment is made anew; settings of linters and tests change nothing in it.
+    python3 scripts/environment.py [EXTRA...]
+
+The extras are those of pyproject.toml; all of them where none is named. Only the standard library is used.
+A later call returns at once where the environment holds the extras, and adds those that it lacks. When what
+pyproject.toml asks for, constraints.txt, the interpreter or the folder change, it is made anew; settings of
+linters and tests change nothing in it.
 """
 
 from __future__ import annotations
@@ -10,19 +13,27 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import queue
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = ROOT / ".venv"
-STAMP = ENVIRONMENT / "installed.sha256"
+STAMP = ENVIRONMENT / "installed.json"
 OLDEST = (3, 11)
+EVERYTHING = ("all", "dev", "docs")
+# It pins a library that nothing imports and that has no wheels from this version on: see docs/development/decisions.md.
+ALONE, ALONE_FROM = "mani-skill", (3, 13)
+# Seconds between two lines of progress, on a terminal (where each replaces the last) and elsewhere.
+ON_TERMINAL_S, ELSEWHERE_S = 0.5, 15.0
 
 
 def fingerprint() -> str:
-    """sha256 over everything that decides what is installed."""
+    """sha256 over everything that decides what is installed, except the extras."""
     # Not at the top: an interpreter too old to have it shall reach the message about its age.
     import tomllib
 
@@ -34,47 +45,143 @@ def fingerprint() -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def create() -> list[str]:
-    """A bare environment, and the pip command that installs into it.
+def installed_extras(wanted: str) -> set[str]:
+    """The extras of the environment, where it has this fingerprint; else none."""
+    try:
+        stamp = json.loads(STAMP.read_text())
+        return set(stamp["extras"]) if stamp["fingerprint"] == wanted else set()
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
 
-    Debian's python3 can come without ensurepip; the pip that belongs to it then installs from outside.
-    """
+
+def create() -> None:
+    """Make a bare environment, with pip where this interpreter brings it (Debian's can come without)."""
     shutil.rmtree(ENVIRONMENT, ignore_errors=True)
-    python = str(ENVIRONMENT / "bin" / "python")
     if importlib.util.find_spec("ensurepip") is not None:
         made = subprocess.run([sys.executable, "-m", "venv", str(ENVIRONMENT)], check=False)
         if made.returncode == 0:
-            return [python, "-m", "pip"]
+            return
         shutil.rmtree(ENVIRONMENT, ignore_errors=True)
     if importlib.util.find_spec("pip") is None:
         sys.exit("error: this python has neither ensurepip nor pip: apt-get install python3-venv")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(ENVIRONMENT)], check=True)
+
+
+def pip_command() -> list[str]:
+    """The environment's own pip, or this interpreter's, which then installs from outside."""
+    python = str(ENVIRONMENT / "bin" / "python")
+    if any(ENVIRONMENT.glob("lib/python*/site-packages/pip")):
+        return [python, "-m", "pip"]
     return [sys.executable, "-m", "pip", "--python", python]
 
 
-def main() -> int:
+def install(arguments: list[str]) -> bool:
+    """Run `pip install` and report its progress; False where it failed, after pip's own message."""
+    command = [
+        *pip_command(),
+        "install",
+        "--disable-pip-version-check",
+        "--no-input",
+        "--progress-bar",
+        "off",
+    ]
+    started = time.monotonic()
+    process = subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True, errors="replace")
+    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def read() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    terminal = sys.stdout.isatty()
+    progress, pause_s = Progress(_count()), ON_TERMINAL_S if terminal else ELSEWHERE_S
+    due = started + pause_s
+    while True:
+        try:
+            line = lines.get(timeout=max(0.0, due - time.monotonic()))
+            if line is None:
+                break
+            progress.read(line)
+        except queue.Empty:
+            said = f"{time.monotonic() - started:4.0f} s: {progress.text(_count())}"
+            print(f"\r\x1b[K{said[:100]}" if terminal else said, end="" if terminal else "\n", flush=True)
+            due = time.monotonic() + pause_s
+    code = process.wait()
+    print("\r\x1b[K" if terminal else "", end="", flush=True)
+    return code == 0
+
+
+class Progress:
+    """How far pip is, from the lines that it prints and the packages that lie in the environment."""
+
+    def __init__(self, before: int) -> None:
+        self.before = before  # packages in the environment at the start
+        self.found: set[str] = set()
+        self.latest = ""
+        self.to_install = 0
+
+    def read(self, line: str) -> None:
+        """Take in one line of pip's output."""
+        first, _, rest = line.strip().partition(" ")
+        if first == "Collecting" and rest:
+            self.latest = rest.split(" ")[0]
+            self.found.add(self.latest.partition("=")[0])
+        elif first == "Downloading" and rest:
+            self.latest = rest.rpartition("/")[2]
+        elif line.startswith("Installing collected packages: "):
+            self.to_install = line.count(",") + 1
+
+    def text(self, count: int) -> str:
+        """One line, where the environment holds `count` packages now."""
+        if self.to_install:
+            return f"{max(0, count - self.before)} of {self.to_install} packages installed"
+        return f"{len(self.found)} packages found" + (f", downloading {self.latest}" if self.latest else "")
+
+
+def _count() -> int:
+    return sum(1 for _ in ENVIRONMENT.glob("lib/python*/site-packages/*.dist-info"))
+
+
+def _pin(package: str) -> str:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return next(line.partition(";")[0].strip() for line in lines if line.startswith(f"{package}=="))
+
+
+def main(arguments: list[str]) -> int:
     """Check the interpreter, create and fill the environment, stamp it, check the system's libraries."""
+    running = ".".join(str(part) for part in sys.version_info[:3])
     if sys.version_info < OLDEST:
-        running = ".".join(str(part) for part in sys.version_info[:3])
         wanted = ".".join(str(part) for part in OLDEST)
         sys.exit(
             f"error: python {wanted} or newer is needed, this is {running} ({sys.executable}); "
             f"name another: make PYTHON=python{wanted}"
         )
-    wanted_stamp = fingerprint()
-    if STAMP.is_file() and STAMP.read_text().strip() == wanted_stamp:
+    asked = set(arguments or EVERYTHING)
+    wanted = fingerprint()
+    present = installed_extras(wanted)
+    if asked <= present or set(EVERYTHING) <= present:
         return 0
-    print("making .venv with pinned libraries; the first time takes some minutes", flush=True)
-    pip = create()
-    install = ["install", "-qq", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
-    filled = subprocess.run([*pip, *install, "-e", f"{ROOT}[sim,train,detect,docs,dev]"], check=False)
-    if filled.returncode:
+    started = time.monotonic()
+    extras = ",".join(sorted(asked | present))
+    print(f"installing {extras} with pinned versions into .venv, for python {running}", flush=True)
+    if not present:
+        create()
+    STAMP.unlink(missing_ok=True)
+    pins = ["-c", str(ROOT / "constraints.txt")]
+    done = install([*pins, "-e", f"{ROOT}[{extras}]"])
+    if done and asked & {"all", "sim"} and sys.version_info >= ALONE_FROM:
+        done = install([*pins, "--no-deps", _pin(ALONE)])
+    if not done:
         print("error: pip could not install the pinned libraries; see its message above", file=sys.stderr)
         return 1
     subprocess.run([sys.executable, str(ROOT / "scripts" / "system_libraries.py")], check=True)
-    STAMP.write_text(wanted_stamp + "\n")
+    STAMP.write_text(json.dumps({"fingerprint": wanted, "extras": sorted(asked | present)}) + "\n")
+    print(f"{_count()} packages in .venv after {time.monotonic() - started:.0f} s", flush=True)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

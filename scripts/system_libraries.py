@@ -1,8 +1,8 @@
 """Checks the shared libraries that some Python wheels expect of the system; installs them if it may.
 
 Only the standard library is used, so that it runs before anything is installed. As root with apt-get
-the missing packages are installed; otherwise the exact command is printed. It always exits with 0: the
-pybullet and Embree path needs none of these libraries.
+the missing packages are installed; otherwise the exact command is printed. It always exits with 0: runs can
+be checked, read and learned from without these libraries.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def main() -> int:
         print("install them with: " + install_command(packages_for(missing)), file=sys.stderr)
     else:
         print("install them with this system's package manager", file=sys.stderr)
-    print("until then choose --settler pybullet --renderer embree", file=sys.stderr)
+    print("until then no labels can be made here, except with --settler pybullet (an extra)", file=sys.stderr)
     return 0
 
 

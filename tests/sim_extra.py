@@ -1,12 +1,13 @@
-"""Tests of plan and sim labels where the extra `sim` is installed; elsewhere a skip that says so."""
+"""Tests that need an extra, where it is installed; elsewhere a skip that says so."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import pytest
 
-from datagen.workers.registry import SIM_MODULES
+from datagen.workers.extras import EXTRAS
 
-SIM_INSTALLED = all(find_spec(name) is not None for name in (*SIM_MODULES, "sapien"))
+SIM_INSTALLED = not EXTRAS["sim"].missing()
 needs_sim = pytest.mark.skipif(not SIM_INSTALLED, reason="the extra `sim` is not installed")
+needs_pybullet = pytest.mark.skipif(
+    bool(EXTRAS["pybullet"].missing()), reason="pybullet is not installed: no wheels from Python 3.12 on"
+)

@@ -7,11 +7,16 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
+
+from datagen.workers.extras import DISTRIBUTION, EXTRAS
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
 
@@ -50,20 +55,64 @@ def test_the_stamp_follows_what_is_installed(tmp_path: Path) -> None:
     assert len({first, second, environment.fingerprint()}) == 3
 
 
-def test_every_dependency_is_pinned() -> None:
-    import tomllib
+def project() -> dict[str, Any]:
+    return tomllib.loads((SCRIPTS.parent / "pyproject.toml").read_text())["project"]
 
-    root = SCRIPTS.parent
-    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
-    lines = (root / "constraints.txt").read_text().splitlines()
+
+def names_of(requirements: list[str]) -> set[str]:
+    """The distributions of requirements, without those extras that name others of this package."""
+    return {Requirement(line).name for line in requirements} - {DISTRIBUTION}
+
+
+def test_every_dependency_is_pinned() -> None:
+    lines = (SCRIPTS.parent / "constraints.txt").read_text().splitlines()
     pinned = {line.partition("==")[0] for line in lines if line and not line.startswith("#")}
-    asked = [
-        *project["dependencies"],
-        *(d for extra in project["optional-dependencies"].values() for d in extra),
-    ]
-    names = {d.partition(">=")[0].partition("[")[0] for d in asked} - {"datagen"}
-    assert names <= pinned
+    asked = [*project()["dependencies"], *chain(*project()["optional-dependencies"].values())]
+    assert names_of(asked) <= pinned
     assert all(line.startswith("#") or "==" in line for line in lines if line)
+
+
+def test_errors_and_the_doctor_know_the_extras_of_the_package() -> None:
+    assert project()["name"] == DISTRIBUTION
+    extras = project()["optional-dependencies"]
+    assert extras.keys() - {"all", "dev"} == EXTRAS.keys()
+    for name, extra in EXTRAS.items():
+        asked = [line for line in extras[name] if ">= '3.13'" not in line]
+        assert names_of(asked) == set(extra.brings.values()), name
+
+
+def test_the_base_package_brings_no_simulator_and_no_learner() -> None:
+    heavy = {pip_name for extra in EXTRAS.values() for pip_name in extra.brings.values()}
+    assert not names_of(project()["dependencies"]) & heavy
+
+
+def test_progress_tells_what_pip_does() -> None:
+    progress = load("environment").Progress(1)
+    assert progress.text(1) == "0 packages found"
+    for line in (
+        "Obtaining file:///x",
+        "Collecting numpy==2.4.6 (from x)",
+        "  Downloading http://h/numpy-2.whl (9 MB)",
+    ):
+        progress.read(line + "\n")
+    assert progress.text(1) == "1 packages found, downloading numpy-2.whl (9 MB)"
+    progress.read("Installing collected packages: numpy, zarr\n")
+    assert progress.text(2) == "1 of 2 packages installed"
+
+
+def test_an_environment_that_has_the_extras_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = load("environment")
+    monkeypatch.setattr(environment, "STAMP", tmp_path / "stamp")
+    monkeypatch.setattr(environment, "create", lambda: pytest.fail("made anew"))
+    stamp = {"fingerprint": environment.fingerprint(), "extras": ["all", "dev"]}
+    (tmp_path / "stamp").write_text(json.dumps(stamp))
+    assert environment.main([]) == environment.main(["labels"]) == 0
+    assert environment.installed_extras(stamp["fingerprint"]) == {"all", "dev"}
+    for text in ("", "[]", '{"fingerprint": "other", "extras": ["all"]}'):
+        (tmp_path / "stamp").write_text(text)
+        assert environment.installed_extras(stamp["fingerprint"]) == set()
 
 
 def test_missing_libraries_are_found_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
-import sysconfig
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import REPOSITORY
+from tests.linked_environments import build_wheel, install_wheel, link_libraries
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
@@ -25,56 +24,14 @@ MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--mode
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy of the sources, because a build leaves files beside them."""
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
-    source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(REPOSITORY / name, source)
-    ignore = shutil.ignore_patterns("__pycache__")
-    for name in ("cluster", "datagen", "schemas", "train", "workers"):
-        shutil.copytree(REPOSITORY / name, source / name, symlinks=True, ignore=ignore)
-    build = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "-w",
-        str(folder),
-    ]
-    subprocess.run([*build, str(source)], check=True, env={**os.environ, "PIP_NO_INDEX": "1"})
-    (built,) = folder.glob("*.whl")
-    return built
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The `bin` folder of a fresh environment with the wheel; libraries are those of this environment."""
+    """The `bin` folder of a fresh environment with the wheel and all libraries of this environment."""
     folder = tmp_path_factory.mktemp("environment") / "venv"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
-    python = folder / "bin" / "python"
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        str(python),
-        "install",
-        "-q",
-        "--no-deps",
-        "--no-index",
-    ]
-    subprocess.run([*command, str(wheel)], check=True)
-    ask = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    site = subprocess.run([python, "-c", ask], check=True, capture_output=True, text=True).stdout.strip()
-    # Plain paths in a .pth file: the editable installation of this checkout that lies there is not followed.
-    libraries = Path(sysconfig.get_path("purelib"))
-    python_name = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    cmeel = libraries / "cmeel.prefix" / "lib" / python_name / "site-packages"  # of coal and pinocchio
-    (Path(site) / "libraries.pth").write_text(f"{libraries}\n{cmeel}\n")
+    link_libraries(install_wheel(wheel, folder), "all")
     return folder / "bin"
 
 

@@ -11,32 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from datagen.schemas.errors import InputError, choices
-
-# Optional libraries by extra: name of the import -> name for pip.
-SIM_MODULES = {"pinocchio": "pin", "coal": "coal", "mani_skill": "mani-skill"}
-_EXTRAS = {
-    "train": {"torch": "torch", "tensorboard": "tensorboard", "plotly": "plotly"},
-    "detect": {"transformers": "transformers"},
-    "sim": SIM_MODULES,
-}
-
-
-def install_line(*modules: str) -> str:
-    """How to install these modules of one extra, for the fix of an error."""
-    extra = next(name for name, brings in _EXTRAS.items() if modules[0] in brings)
-    packages = " ".join(_EXTRAS[extra][name] for name in modules)
-    source = "of the folder or URL that datagen was installed from"
-    return f"Install it: pip install {packages}, or the extra `{extra}` {source}"
-
-
-SIM_MEND = install_line(*SIM_MODULES)
-
-
-def missing_library(error: Exception) -> InputError | None:
-    """The InputError for a library of an extra that is not installed; None for any other error."""
-    name = (error.name or "").split(".")[0] if isinstance(error, ModuleNotFoundError) else ""
-    found = [module for brings in _EXTRAS.values() for module in brings]
-    return InputError(name, "", "is not installed", install_line(name)) if name in found else None
+from datagen.workers.extras import missing_library
 
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
@@ -51,9 +26,11 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
     try:
         return getattr(import_module(module), attribute)
     except ImportError as error:
-        mend = f"Run `datagen doctor`, or use another one: {', '.join(sorted(registry))}"
-        if missing_library(error) is not None:
-            mend = SIM_MEND
+        others = f"choose another one: {', '.join(sorted(set(registry) - {name}))}"
+        if missing := missing_library(error):
+            problem = f"needs {missing.place}, which is not installed"
+            raise InputError(option, name, problem, f"{missing.mend}. Or {others}") from error
+        mend = f"Run `datagen doctor`, or {others}"
         raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
 
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import ArmParams, CandidateParams, DisturbanceParams, Range, Specification
-from datagen.workers.registry import SIM_MEND
+from datagen.workers.extras import how_to_get
 from datagen.workers.robots import ROBOTS, robot_limits
 
 # Label sources that move an arm, and the distributions whose version can change bits of their labels.
@@ -31,7 +31,9 @@ def refuse_missing_packages(label_source: str) -> None:
         try:
             version(name)
         except PackageNotFoundError:
-            raise InputError("label source", label_source, f"needs {name}, not installed", SIM_MEND) from None
+            raise InputError(
+                "label source", label_source, f"needs {name}, not installed", how_to_get("sim")
+            ) from None
 
 
 def arm_versions(label_source: str) -> dict[str, str]:

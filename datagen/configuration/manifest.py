@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import platform
-from importlib.metadata import version
 
 from datagen import __version__
+from datagen.cluster.preflight import versions_of
 from datagen.configuration.arms import arm_versions
 from datagen.schemas.fields import SCHEMAS
 from datagen.schemas.record_files import utc_now
@@ -32,7 +32,8 @@ def manifest_of(
         schema_version=newest if schema_version is None else min(schema_version, newest),
         layout=layout,
         code_version=__version__,
-        libraries={name: version(name) for name in _LIBRARIES} | arm_versions(spec.label_source),
+        libraries={name: found for name, found in versions_of(_LIBRARIES).items() if found}
+        | arm_versions(spec.label_source),
         platform=platform.platform(),
         created=utc_now(),
         sources=sources,

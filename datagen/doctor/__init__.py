@@ -16,10 +16,11 @@ from rich.text import Text
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
 from datagen.doctor.arm import arm_checks
-from datagen.doctor.check import Check
+from datagen.doctor.check import Check, Status
 from datagen.doctor.engines import engine_checks
 from datagen.doctor.host import host_checks
 from datagen.schemas.errors import InputError
+from datagen.workers.extras import EXTRAS, how_to_get
 
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
@@ -56,6 +57,22 @@ def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
     return [_count("houses", houses or "builtin", _houses), _count("objects", objects or "builtin", _objects)]
 
 
+def extra_checks() -> list[Check]:
+    """One finding an extra: what it gives, and how to get it where it is not installed.
+
+    Only labels are asked of a machine: without the first extra it fails, the others are a choice.
+    """
+    checks: list[Check] = []
+    for name, extra in EXTRAS.items():
+        if missing := extra.missing():
+            status: Status = "fail" if name == "labels" else "ok"
+            problem = f"not installed ({', '.join(missing)}); would give {extra.gives}"
+            checks.append(Check(f"extra {name}", status, problem, how_to_get(name)))
+        else:
+            checks.append(Check(f"extra {name}", "ok", extra.gives))
+    return checks
+
+
 def as_json(checks: list[Check]) -> dict[str, Any]:
     """`{"ok": bool, "checks": [{"name", "status", "detail", "mend"}, ...]}`, in the order of the table."""
     good = all(check.status != "fail" for check in checks)
@@ -89,7 +106,9 @@ def doctor(
 
     Exit code 0 when labels can be made here, else 1.
     """
-    checks = [*host_checks(), *engine_checks(), *arm_checks(), *asset_checks(houses, objects)]
+    checks = [*host_checks(), *extra_checks(), *engine_checks(), *arm_checks()]
+    if not EXTRAS["labels"].missing():
+        checks += asset_checks(houses, objects)
     failures = sum(check.status == "fail" for check in checks)
     if json:
         print_json(as_json(checks))

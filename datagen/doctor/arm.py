@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datagen.doctor.check import Check, probe
-from datagen.workers.registry import SIM_MEND
+from datagen.workers.extras import EXTRAS
 from datagen.workers.robots import ROBOTS, robot_limits
 
 _LIBRARIES = """
@@ -44,20 +44,21 @@ _HEIGHT_M = 0.5
 def arm_checks() -> list[Check]:
     """Check the arm libraries, every robot of the registry, and a grasp trial.
 
-    No check fails, because heuristic labels need none of this. Without the libraries the rest is skipped.
+    No check fails, because heuristic labels need none of this. Nothing is checked where the extra is not
+    installed, and no robot where its libraries do not work.
     """
+    if EXTRAS["sim"].missing():
+        return []
     libraries = probe(_LIBRARIES, _DEADLINE_S)
     if not libraries.succeeded:
-        mend = SIM_MEND if "ModuleNotFoundError" in libraries.text else _AGAIN
-        return [Check("arm libraries", "warn", f"no plan and sim labels: {libraries.text}", mend)]
+        return [Check("arm libraries", "warn", f"no plan and sim labels: {libraries.text}", _AGAIN)]
     checks = [Check("arm libraries", "ok", libraries.text)]
     for name in ROBOTS:
         limits = robot_limits(name)
         height_m = limits.base_height_m[0] if limits.base_height_m else _HEIGHT_M
         code = _ROBOT.format(name=name, reach_m=limits.reach_m[1], height_m=height_m)
         opened = probe(code, _DEADLINE_S)
-        mend = SIM_MEND if "not installed" in opened.text else f"Use another --robot, or: {_AGAIN}"
-        checks.append(opened.check(f"robot {name}", "warn", mend))
+        checks.append(opened.check(f"robot {name}", "warn", f"Use another --robot, or: {_AGAIN}"))
     trial = probe(_TRIAL, _DEADLINE_S)
     mend = "See `sapien physics` and the robots above; plan labels need no physics."
     checks.append(trial.check("grasp trial", "warn", mend))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from datagen.doctor.check import Check, Probe, probe
+from importlib.util import find_spec
+
+from datagen.doctor.check import Check, Probe, Status, probe
 
 _SAPIEN_PHYSICS = """
 import importlib, importlib.metadata
@@ -57,6 +59,7 @@ ray = importlib.import_module("ray")
 print("ray " + ray.__version__)
 """
 
+_AGAIN = "Install it again: pip install --force-reinstall"
 _MESA_MEND = (
     "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
     "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
@@ -64,18 +67,20 @@ _MESA_MEND = (
 
 
 def engine_checks() -> list[Check]:
-    """Check settlers, renderers, the ray caster and Ray. One working settler is enough."""
-    sapien, pybullet = probe(_SAPIEN_PHYSICS), probe(_PYBULLET)
+    """Check settlers, renderers, the ray caster and Ray, if installed. One working settler is enough."""
+    codes = {"sapien": _SAPIEN_PHYSICS, "pybullet": _PYBULLET, "embreex": _EMBREE, "ray": _RAY}
+    found = {name: probe(code) for name, code in codes.items() if find_spec(name) is not None}
+    settlers = [name for name in ("sapien", "pybullet") if name in found]
     # One broken settler is a warning; without any, scenes cannot be settled.
-    lost = "warn" if sapien.succeeded or pybullet.succeeded else "fail"
-    embree, ray = probe(_EMBREE), probe(_RAY)
-    checks = [
-        sapien.check("sapien physics", lost, "See the libraries above, or use --settler pybullet."),
-        pybullet.check("pybullet", lost, "Install again: make clean venv; or use --settler sapien."),
-        embree.check("embree", "fail", "Install again: make clean venv."),
-        ray.check("ray", "warn", "Install again: make clean venv; or use --workers 0."),
-    ]
-    if sapien.succeeded:
+    lost = "warn" if any(found[name].succeeded for name in settlers) else "fail"
+    findings: dict[str, tuple[str, Status, str]] = {
+        "sapien": ("sapien physics", lost, "Install the libraries named above, or use --settler pybullet."),
+        "pybullet": ("pybullet", lost, f"{_AGAIN} pybullet; or use --settler sapien."),
+        "embreex": ("embree", "fail", f"{_AGAIN} embreex"),
+        "ray": ("ray", "warn", f"{_AGAIN} ray; or use --workers 0."),
+    }
+    checks = [answer.check(*findings[name]) for name, answer in found.items()]
+    if "sapien" in found and found["sapien"].succeeded:
         checks.append(probe_render_device().check("sapien render device", "warn", _MESA_MEND))
     return checks
 

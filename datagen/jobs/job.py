@@ -29,7 +29,7 @@ from datagen.cluster.task import ShardTask
 from datagen.console.command_lines import command_line
 from datagen.console.printing import counted
 from datagen.jobs.job_recorder import JobRecorder
-from datagen.jobs.options import JobOptions
+from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
@@ -38,9 +38,6 @@ from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
-
-# Set for the driver of a detached job: its name at the Jobs API, and the address of that.
-SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 
 
 @dataclass(frozen=True, eq=False)

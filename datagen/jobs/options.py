@@ -18,8 +18,11 @@ from datagen.console.command_lines import resumable, words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.progress import Progress
+from datagen.workers.extras import refuse_missing
 
 DEFAULT_SHARE = 0.01
+# Variables of a detached job: its name at Ray, and where Ray answers for it.
+SUBMISSION, JOBS_API = "DATAGEN_SUBMISSION", "DATAGEN_JOBS_API"
 _DETACH = (
     "Run as a Ray job that continues after this shell ends: on the cluster of --address (its dashboard "
     "http://HOST:8265 or the cluster itself), else on a Ray head of this machine."
@@ -54,6 +57,8 @@ class JobOptions:
         if not 0 <= self.max_quarantined <= 1:
             given = str(self.max_quarantined)
             raise InputError("--max-quarantined", given, "is not a share", "Give 0.01 for one in a hundred")
+        if self.workers != 0 or self.detach:
+            refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
         if self.workers != 0 and not self.detach:
             refuse_unusable(self.address)
 

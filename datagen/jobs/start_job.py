@@ -19,6 +19,7 @@ from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage
+from datagen.workers.extras import missing_library
 from datagen.workers.labels import load_label_source
 from datagen.workers.robots import gripper_of
 
@@ -98,7 +99,9 @@ def _refuse_other_engines(run: Run) -> None:
         if spec.scenes_from is None:  # stored scenes need no scene engines
             here |= scene_engines(spec)
     except PackageNotFoundError as error:
-        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", "Install it") from None
+        missing = missing_library(error)
+        mend = missing.mend if missing else "Install it"
+        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", mend) from None
     made = {name: version for name, version in spec.engines.items() if name in here}
     rows = [f"{name}: the run has {a}, this machine {b}" for name, a, b in different_fields(made, here)]
     if rows:

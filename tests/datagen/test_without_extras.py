@@ -64,7 +64,7 @@ def test_heuristic_labels_are_made_shown_and_audited_without_it(tmp_path: Path) 
 @pytest.mark.parametrize("source", ["plan", "sim"])
 def test_other_labels_name_the_extra_in_one_line(tmp_path: Path, source: str) -> None:
     command = ["submit", source, "--n", "60", "--out", str(tmp_path / "run"), "--workers", "0"]
-    assert "pip install pin coal mani-skill" in refused_line(datagen_without(SIM, command))
+    assert "Install the extra sim: pip install" in refused_line(datagen_without(SIM, command))
     assert not (tmp_path / "run").exists()
 
 
@@ -79,11 +79,11 @@ def test_training_and_prediction_name_torch_in_one_line(finished: Path, tmp_path
         [*predict, "--json"],
     ):
         line = refused_line(datagen_without(["torch"], command))
-        assert "torch: is not installed. Install it: pip install torch, or the extra `train`" in line
-        assert "datagen[" not in line and not out.exists()
+        assert "torch: is not installed. Install the extra train: pip install" in line
+        assert " datagen[" not in line and not out.exists()
     page = [*predict, "--html", str(tmp_path / "page.html"), "--out", str(tmp_path / "a.png")]
     line = refused_line(datagen_without(["plotly"], page))
-    assert "plotly: is not installed. Install it: pip install plotly" in line
+    assert "plotly: is not installed. Install the extra train: pip install" in line
     assert not (tmp_path / "a.png").exists()
 
 
@@ -92,4 +92,4 @@ def test_evaluation_names_torch_in_one_line(sim_run: Path, tmp_path: Path) -> No
     write_untrained(tmp_path / "model.ckpt", {})
     command = ["evaluate", str(tmp_path / "model.ckpt"), str(sim_run), "--json"]
     line = refused_line(datagen_without(["torch"], command))
-    assert "torch: is not installed. Install it: pip install torch" in line
+    assert "torch: is not installed. Install the extra train: pip install" in line

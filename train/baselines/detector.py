@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.workers.registry import install_line
+from datagen.workers.extras import how_to_get
 
 U8 = npt.NDArray[np.uint8]
 
@@ -53,7 +53,7 @@ class ZeroShotDetector:
         try:
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
         except ImportError as error:
-            mend = install_line("transformers")
+            mend = how_to_get("detect")
             raise InputError("--detector", "transformers", f"not usable ({error})", mend) from None
         try:
             self._processor: Any = AutoProcessor.from_pretrained(where, local_files_only=True)

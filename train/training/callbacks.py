@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from datagen.schemas.errors import InputError
-from datagen.workers.registry import install_line
+from datagen.workers.extras import how_to_get
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TensorBoardCallback:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            mend = install_line("tensorboard")
+            mend = how_to_get("train")
             raise InputError("--tensorboard", "", "the package tensorboard is not installed", mend) from None
         self._writer = SummaryWriter(folder, purge_step=step + 1)
         self._step = step

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
-from datagen.workers.bases.candidates import SceneCandidates
-from datagen.workers.scenes.scene import SettledScene
+
+if TYPE_CHECKING:  # they load renderers, which a base installation lacks
+    from datagen.workers.bases.candidates import SceneCandidates
+    from datagen.workers.scenes.scene import SettledScene
 
 Columns = dict[str, np.ndarray[Any, Any]]
 

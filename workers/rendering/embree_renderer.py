@@ -6,13 +6,11 @@ only; the values are those of the whole frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64, U8
-from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
+from datagen.workers.rendering.frame import Camera, Frame, Pixels, SceneGeometry, pixel_directions
 from datagen.workers.rendering.rays import (
     MISS,
     Hits,
@@ -27,15 +25,6 @@ from datagen.workers.rendering.rays import (
 _BACKGROUND_RGB = (225, 232, 240)
 _AMBIENT, _LAMP, _HEAD = 0.50, 0.35, 0.30
 _LAMP_DIRECTION = np.array([0.35, 0.25, 0.90], np.float32) / np.float32(np.sqrt(0.35**2 + 0.25**2 + 0.9**2))
-
-
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """N pixels of a frame; fields as in Frame."""
-
-    rgb: U8  # (N, 3)
-    depth_m: F32  # (N,)
-    body: I16  # (N,)
 
 
 def ray_scene(scene: SceneGeometry) -> RayScene:
@@ -58,14 +47,6 @@ def render_rays(scene: RayScene, camera: Camera) -> Frame:
     h, w = camera.height_px, camera.width_px
     pixels = cast_pixels(scene, camera, np.arange(h * w))
     return Frame(camera, pixels.rgb.reshape(h, w, 3), pixels.depth_m.reshape(h, w), pixels.body.reshape(h, w))
-
-
-def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
-    """Directions (N, 3) in the camera frame, at depth 1, through the centres of flat pixel indices."""
-    v, u = np.divmod(pixels, camera.width_px)
-    x = (u + 0.5 - camera.cx_px) / camera.fx_px
-    y = (v + 0.5 - camera.cy_px) / camera.fy_px
-    return np.stack([x, y, np.ones(len(pixels))], axis=1).astype(np.float32)
 
 
 def cast_pixels(scene: RayScene, camera: Camera, pixels: npt.NDArray[np.int64]) -> Pixels:

@@ -54,6 +54,23 @@ class Frame:
     body: I16  # (H, W)
 
 
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """N pixels of a frame; fields as in Frame."""
+
+    rgb: U8  # (N, 3)
+    depth_m: F32  # (N,)
+    body: I16  # (N,)
+
+
+def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
+    """Directions (N, 3) in the camera frame, at depth 1, through the centres of flat pixel indices."""
+    v, u = np.divmod(pixels, camera.width_px)
+    x = (u + 0.5 - camera.cx_px) / camera.fx_px
+    y = (v + 0.5 - camera.cy_px) / camera.fy_px
+    return np.stack([x, y, np.ones(len(pixels))], axis=1).astype(np.float32)
+
+
 class Renderer(Protocol):
     """Renders one frame of a scene."""
 

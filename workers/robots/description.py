@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from datagen.schemas.errors import InputError
+from datagen.workers.extras import how_to_get
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.registry import SIM_MEND
 
 
 @dataclass(frozen=True)
@@ -88,5 +88,5 @@ def robots_folder() -> Path:
     spec = find_spec("mani_skill")
     folders = list(spec.submodule_search_locations or []) if spec else []
     if not folders:
-        raise InputError("--robot", "mani_skill", "is not installed", SIM_MEND)
+        raise InputError("--robot", "mani_skill", "is not installed", how_to_get("sim"))
     return Path(folders[0]) / "assets" / "robots"

@@ -12,6 +12,7 @@ from datagen import cli
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord
 from tests.refusals import refused
+from tests.sim_extra import needs_pybullet
 from tests.small_runs import CONFIG, PER_SCENE, arrays_of, files_of, json_of, make_small_run
 from tests.workers.objects.toy_set import write_bundle
 
@@ -118,8 +119,8 @@ def test_more_than_the_source_has_is_refused_with_how_many_there_are(
         ("--candidates", "clear"),
         ("--candidates-per-scene", "9"),
         ("--robots-per-scene", "2"),
-        ("--settler", "pybullet"),
-        ("--renderer", "pybullet"),
+        pytest.param(("--settler", "pybullet"), marks=needs_pybullet),
+        pytest.param(("--renderer", "pybullet"), marks=needs_pybullet),
         ("--noise",),
     ],
 )

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 import pytest
+
+pybullet = pytest.importorskip("pybullet", reason="pybullet has no wheels from Python 3.12 on")
+# ruff: noqa: E402
 
 from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.rendering.embree_renderer import ray_scene, render_embree

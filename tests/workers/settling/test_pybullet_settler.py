@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 
 import numpy as np
-import pybullet
 import pytest
+
+pybullet = pytest.importorskip("pybullet", reason="pybullet has no wheels from Python 3.12 on")
+# ruff: noqa: E402
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import SettleParams

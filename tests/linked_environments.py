@@ -1,0 +1,84 @@
+"""Environments with the wheel and just those libraries that it asks for, linked from where the tests run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from importlib.metadata import distribution
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+from datagen.workers.extras import DISTRIBUTION
+from tests.conftest import REPOSITORY
+
+PACKAGES = ("cluster", "datagen", "schemas", "train", "workers")
+
+
+def build_wheel(folder: Path) -> Path:
+    """The wheel of this checkout, built from a copy of the sources, because a build leaves files there."""
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, source)
+    ignore = shutil.ignore_patterns("__pycache__")
+    for name in PACKAGES:
+        shutil.copytree(REPOSITORY / name, source / name, symlinks=True, ignore=ignore)
+    options = ["-q", "--no-deps", "--no-build-isolation", "-w", str(folder)]
+    command = [sys.executable, "-m", "pip", "wheel", *options, str(source)]
+    subprocess.run(command, check=True, env={**os.environ, "PIP_NO_INDEX": "1"})
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def install_wheel(wheel: Path, folder: Path) -> Path:
+    """site-packages of a fresh environment in the folder that holds the wheel and no library."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    python = str(folder / "bin" / "python")
+    options = ["-q", "--no-deps", "--no-index", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "--python", python, "install", *options, str(wheel)]
+    subprocess.run(command, check=True)
+    (site,) = folder.glob("lib/python*/site-packages")
+    return site
+
+
+def link_libraries(site: Path, *extras: str) -> None:
+    """Link what the wheel asks for with these extras, and what that asks for in turn."""
+    libraries = Path(sysconfig.get_path("purelib"))
+    for name in _closure(DISTRIBUTION, extras, {}):
+        if name != DISTRIBUTION:
+            for file in distribution(name).files or ():
+                _link(libraries, site, Path(file).parts)
+
+
+def _link(libraries: Path, site: Path, parts: tuple[str, ...]) -> None:
+    """Link a file by its outermost folder that one distribution has alone: not a namespace as `google`."""
+    if parts[0] == ".." or "__pycache__" in parts:
+        return
+    for depth in range(1, len(parts) + 1):
+        source, target = libraries.joinpath(*parts[:depth]), site.joinpath(*parts[:depth])
+        if target.is_symlink() or not source.exists():
+            return
+        shared = source.is_dir() and not (source / "__init__.py").exists() and source.suffix != ".dist-info"
+        if not shared:
+            target.symlink_to(source)
+            return
+        target.mkdir(exist_ok=True)
+
+
+def _closure(name: str, extras: tuple[str, ...], seen: dict[str, set[str]]) -> Iterator[str]:
+    """Names of a distribution and of all that it needs here with these extras."""
+    known = seen.get(name)
+    if known is not None and known >= set(extras):
+        return
+    seen[name] = (known or set()) | set(extras)
+    if known is None:
+        yield name
+    for line in distribution(name).requires or ():
+        needed = Requirement(line)
+        if needed.marker is None or any(needed.marker.evaluate({"extra": e}) for e in (*extras, "")):
+            yield from _closure(needed.name, tuple(needed.extras), seen)

@@ -1,0 +1,106 @@
+"""What each extra of the package brings, and how to get one that is missing.
+
+The package's name on a public index may belong to others, so advice names where this copy was installed from,
+or else the libraries themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import dataclass
+from importlib.metadata import Distribution, PackageNotFoundError
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from datagen.schemas.errors import InputError
+
+DISTRIBUTION = "base-placement-datagen"
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra of pyproject.toml."""
+
+    gives: str
+    brings: dict[str, str]  # import name -> what pip calls it
+
+    def missing(self) -> list[str]:
+        """The import names that are not installed."""
+        return [name for name in self.brings if find_spec(name) is None]
+
+
+_PICTURES = {"matplotlib": "matplotlib", "PIL": "pillow", "scipy": "scipy"}
+
+EXTRAS: dict[str, Extra] = {
+    "labels": Extra(
+        "heuristic labels; show, replay, relabel, verify --deep",
+        {"embreex": "embreex", "sapien": "sapien", "trimesh": "trimesh", **_PICTURES},
+    ),
+    "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),
+    "train": Extra(
+        "train, evaluate, predict",
+        {"torch": "torch", "tensorboard": "tensorboard", "plotly": "plotly", **_PICTURES},
+    ),
+    "detect": Extra("the baseline with an object detector", {"transformers": "transformers"}),
+    "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),
+    "tables": Extra(
+        "open_dataset and candidates: xarray and pandas", {"pandas": "pandas", "xarray": "xarray"}
+    ),
+    "pybullet": Extra("a second settler and renderer", {"pybullet": "pybullet"}),
+}
+
+
+def how_to_get(extra: str) -> str:
+    """The sentence that says how to install what is missing of an extra."""
+    missing = EXTRAS[extra].missing()
+    # Robots' files of ManiSkill alone: on new versions of Python the extra comes without it.
+    if missing == ["mani_skill"]:
+        return "Install it: pip install --no-deps mani-skill"
+    command = _from_origin(extra)
+    if command is None:
+        command = "pip install " + " ".join(EXTRAS[extra].brings[name] for name in missing)
+    return f"Install the extra {extra}: {command}"
+
+
+def refuse_missing(extra: str, otherwise: str = "") -> None:
+    """Raise InputError where a library of the extra is not installed; `otherwise` is another way out."""
+    if missing := EXTRAS[extra].missing():
+        mend = ", ".join(filter(None, (how_to_get(extra), otherwise)))
+        raise InputError(", ".join(missing), "", "is not installed", mend)
+
+
+def missing_library(error: Exception, preferred: str = "") -> InputError | None:
+    """The one line for a library of an extra that is not installed; None for any other error.
+
+    `preferred` is the extra to name where several bring the library.
+    """
+    lacking = error.__cause__ if isinstance(error.__cause__, ModuleNotFoundError) else error
+    name = (lacking.name or "").partition(".")[0] if isinstance(lacking, ModuleNotFoundError) else ""
+    # A distribution whose version is asked for is missed by its own name.
+    found = [key for key, extra in EXTRAS.items() if name in extra.brings or name in extra.brings.values()]
+    if not found:
+        return None
+    extra = preferred if preferred in found else found[0]
+    return InputError(name, "", "is not installed", how_to_get(extra))
+
+
+def _from_origin(extra: str) -> str | None:
+    """The pip command that adds an extra to this installation, None where its origin is not known."""
+    try:
+        text = Distribution.from_name(DISTRIBUTION).read_text("direct_url.json")
+        origin: Any = json.loads(text or "{}")
+        url = str(origin["url"])
+    except (PackageNotFoundError, ValueError, KeyError, TypeError):
+        return None
+    parts = urlsplit(url)
+    if parts.scheme == "file":
+        path = unquote(parts.path)
+        editable = "-e " if origin.get("dir_info", {}).get("editable") else ""
+        return f"pip install {editable}{shlex.quote(f'{path}[{extra}]')}" if Path(path).exists() else None
+    if "vcs_info" in origin:
+        vcs = origin["vcs_info"]
+        url = f"{vcs.get('vcs', 'git')}+{url}@{vcs.get('commit_id', '')}".rstrip("@")
+    return "pip install " + shlex.quote(f"{DISTRIBUTION}[{extra}] @ {url}")
