@@ -243,7 +243,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     cases: list[tuple[list[str], list[str]]] = [
         ([file], ["RUN", "only checkpoints are named"]),
         ([file, str(tmp_path / "none")], ["none", "neither a checkpoint's file nor a run's folder"]),
-        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "no checkpoint"]),
+        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "not a checkpoint"]),
         ([file, heuristic], ["label_source", "heuristic labels", "datagen submit sim"]),
         ([run, "--baselines", "none"], ["CKPT", "there is nobody to evaluate"]),
         ([file, file, run], ["the same checkpoint as"]),

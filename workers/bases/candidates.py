@@ -10,7 +10,6 @@ import numpy.typing as npt
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.redraw import Redraw
 
 Bools = npt.NDArray[np.bool_]
 
@@ -57,13 +56,13 @@ def grid_offsets(params: CandidateParams) -> F64:
 
 def draw_candidates(
     target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
-) -> Candidates:
+) -> Candidates | None:
     """All cells of the grid, or `per_scene` positions jittered within their cells, with robots on them.
 
     Cells are drawn from all without repetition, or from those that `within` asks for. Robots:
     `robots_per_scene` of them with the candidates dealt out in turn, so that a model can encode a
-    scene once a robot; or one a candidate, as the paper has it. Raises Redraw("no_base") where
-    around this target there are too few places of the asked kind for these robots.
+    scene once a robot; or one a candidate, as the paper has it. None where around this target there
+    are too few places of the asked kind for these robots.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
@@ -74,6 +73,8 @@ def draw_candidates(
     else:
         robots = _draw_robots(params, n_robots, rng)
         base_xy_m = _places_within(target_center_m, obstacles, params, robots, robot_index, rng)
+        if base_xy_m is None:
+            return None
     return _stand(base_xy_m, robot_index, robots, obstacles, params)
 
 
@@ -127,8 +128,8 @@ def _places_within(
     robots: _Robots,
     robot_index: npt.NDArray[np.int16],
     rng: np.random.Generator,
-) -> F32:
-    """A place (N, 2), world, of the asked kind for the robot of each candidate.
+) -> F32 | None:
+    """A place (N, 2), world, of the asked kind for the robot of each candidate; None where there are too few.
 
     A round looks at every cell in a random order and gives each at most once; cells come a second
     time only where a whole round did not hold enough.
@@ -151,7 +152,7 @@ def _places_within(
             free[found] = False
         if not open_.any():
             return base_xy_m
-    raise Redraw("no_base")
+    return None
 
 
 def _is_within(candidates: Candidates, target_center_m: F64, params: CandidateParams) -> Bools:

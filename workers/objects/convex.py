@@ -23,6 +23,8 @@ from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
 
+# Part of a cache key: raise it when `fits_gripper` changes its answers.
+GRIPPER_VERSION = 1
 GRIPPER_STROKE_M = 0.08
 # Half a millimetre of air on each side while the hand comes down.
 MAX_GRASP_WIDTH_M = GRIPPER_STROKE_M - 0.001
