@@ -29,6 +29,8 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
+import psutil
+
 from datagen.cluster.task import AttemptReport, JobCannotGoOn, Product, Task
 from datagen.schemas.cost import StageClock
 from datagen.schemas.private_folders import is_private
@@ -268,7 +270,7 @@ def this_host() -> Host:
             if line.startswith("model name")
         )
         cpu = next(names, cpu).strip()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = psutil.virtual_memory().total
     return Host(
         name=platform.node(), cpu=cpu, cores=os.cpu_count() or 1, memory_bytes=memory, pid=os.getpid()
     )
@@ -293,9 +295,5 @@ def _peak_memory_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds now; 0 where the system does not tell."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
+    """Memory that this process holds now."""
+    return psutil.Process().memory_info().rss

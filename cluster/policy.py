@@ -125,8 +125,8 @@ def window(policy: Policy, slots: int) -> int:
 class Durations:
     """The wall seconds of the latest committed attempts: bounded memory, cheap to ask."""
 
-    def __init__(self, kept: int = 256) -> None:
-        self._latest: deque[float] = deque(maxlen=kept)
+    def __init__(self) -> None:
+        self._latest: deque[float] = deque(maxlen=256)
         self._seen = 0
         self._p95_s = 0.0
 

@@ -65,7 +65,7 @@ def token_environment(token: str) -> dict[str, str]:
     return {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_AUTH_TOKEN_PATH": ""}
 
 
-def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
+def head_arguments(workers: int) -> list[str]:
     """Arguments of `ray` that start the head of a cluster of this machine, with dashboard and jobs.
 
     Port 0 takes a free one; Ray says which on its standard output. Use with `head_environment`,
@@ -78,7 +78,7 @@ def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
         "--port=0",
         "--include-dashboard=true",
         "--dashboard-host=127.0.0.1",
-        f"--dashboard-port={dashboard_port}",
+        "--dashboard-port=0",
         "--dashboard-agent-listen-port=0",
         # Fixed by default: two heads on one machine would share the port, and each other's clients.
         f"--ray-client-server-port={free_port()}",

@@ -10,14 +10,12 @@ from cyclopts import Parameter
 
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place, opening, refuse_odd_n
+from datagen.jobs.going_on import continue_job, source_words
+from datagen.jobs.job import Work
+from datagen.jobs.options import HERE, Placing, absolute_place, refuse_odd_n
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged import open_runs
 from datagen.schemas.run import Run
-from datagen.schemas.storage import open_storage
 from datagen.specifying.stored_scenes import StoredScenes, refuse_too_few
 
 
@@ -35,22 +33,17 @@ def extend(
     placing.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *placing.words()]
-    if placing.detach and placing.address != "local":
-        return detach_job(words, run, placing)
-    with opening(words, placing) as began_s:
-        place = open_storage(run, create=False)
-        runs = open_runs(place)
-        works = [open_work(part, given, placing.address) for part in runs]
-        wanted = longer(runs, n, run)
-        for part, work, more in zip(runs, works, wanted, strict=True):
+
+    def grow(works: Sequence[Work]) -> None:
+        wanted = longer([work.run for work in works], n, run)
+        for work, more in zip(works, wanted, strict=True):
             if work.scenes_from:
                 stored = StoredScenes(Run.open(work.scenes_from), work.houses, work.objects)
-                refuse_too_few(stored, part.layout, more)
-        for part, more in zip(runs, wanted, strict=True):
-            part.grow(more)
-    if placing.detach:
-        return detach_job(words, run, placing)
-    return go_on(place, run, works, placing, began_s, given)
+                refuse_too_few(stored, work.run.layout, more)
+        for work, more in zip(works, wanted, strict=True):
+            work.run.grow(more)
+
+    return continue_job(words, run, given, placing, grow)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

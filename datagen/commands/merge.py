@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import resumable, words_of
+from datagen.console.command_lines import command_line, resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
@@ -95,7 +94,7 @@ def _print(report: dict[str, Any]) -> None:
         ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
     ]
     if missing:
-        rows.append(("go on with", f"datagen resume {shlex.quote(out)}"))
+        rows.append(("continue with", command_line(["resume", out])))
     print_rows(f"merged: {out}", rows)
     for part in report["runs"]:
         shards = part["shards"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -10,13 +11,11 @@ from cyclopts import Parameter
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
-from datagen.jobs.detach import detach_job
-from datagen.jobs.going_on import go_on, open_work, source_words
-from datagen.jobs.options import HERE, Placing, absolute_place, opening
+from datagen.jobs.going_on import continue_job, source_words
+from datagen.jobs.job import Work
+from datagen.jobs.options import HERE, Placing, absolute_place
 from datagen.remaking.sources import AS_FOUND, Sources
-from datagen.schemas.merged import open_runs
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.storage import open_storage
 
 
 def resume(
@@ -36,15 +35,10 @@ def resume(
     placing.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += placing.words()
-    if placing.detach and placing.address != "local":
-        return detach_job(words, run, placing)
-    with opening(words, placing) as began_s:
-        place = open_storage(run, create=False)
-        runs = open_runs(place)
-        works = [open_work(part, given, placing.address) for part in runs]
-        if placing.detach:
-            return detach_job(words, run, placing)
-        if quarantined:
-            lifted = sum(len(lift_quarantine(part)) for part in runs)
+
+    def lift(works: Sequence[Work]) -> None:
+        if quarantined and not placing.detach:
+            lifted = sum(len(lift_quarantine(work.run)) for work in works)
             sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return go_on(place, run, works, placing, began_s, given)
+
+    return continue_job(words, run, given, placing, lift)

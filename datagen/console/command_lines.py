@@ -24,9 +24,14 @@ def command_line(words: Sequence[str]) -> str:
     return shlex.join(["datagen", *words])
 
 
+def continue_with(words: Sequence[str]) -> str:
+    """The last line of a command that another one continues, and that command."""
+    return f"Continue with:\n  {command_line(words)}"
+
+
 def say_interrupted(how: str, words: Sequence[str]) -> None:
     """Say that the command was interrupted, and with which words it goes on."""
-    sys.stderr.write(f"interrupted{how}. Go on with:\n  {command_line(words)}\n")
+    sys.stderr.write(f"interrupted{how}. {continue_with(words)}\n")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -143,12 +144,8 @@ def _write_numbers(axes: Axes, recalled: RecalledScene, record: Columns, samples
 
 def wrapped(head: str, text: str, width: int = 62) -> list[str]:
     """Text in lines of about `width` characters behind a head."""
-    words, lines = text.split(" "), [head]
-    for word in words:
-        if len(lines[-1]) + len(word) > width:
-            lines.append(" " * len(head))
-        lines[-1] += word + " "
-    return lines
+    indent = " " * len(head)
+    return textwrap.wrap(text, width, initial_indent=head, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _robots(samples: Columns) -> list[str]:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError
 
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
-from datagen.jobs.detach import detached_words
+from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.job import JobPlan, Work, carry_out
-from datagen.jobs.options import Placing, absolute_place, absolute_source
+from datagen.jobs.options import Placing, absolute_place, absolute_source, opening
 from datagen.remaking.shards import open_origin
 from datagen.remaking.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
+from datagen.schemas.merged import open_runs
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
-from datagen.schemas.storage import Storage
+from datagen.schemas.storage import Storage, open_storage
 from datagen.specifying.arms import refuse_missing_packages
 from datagen.specifying.specify import label_engines, scene_engines
 from datagen.workers.labels import load_label_source
@@ -56,6 +57,28 @@ def open_work(run: Run, given: Sources, address: str) -> Work:
         absolute_source(given.objects or known.get("objects", "builtin")),
         "" if spec.scenes_from is None else absolute_place(given.scenes_from or known["scenes_from"]),
     )
+
+
+def continue_job(
+    words: Sequence[str],
+    name: str,
+    given: Sources,
+    placing: Placing,
+    prepare: Callable[[Sequence[Work]], None],
+) -> int:
+    """Open what is at `name`, let `prepare` change it, and make what is missing; the exit code.
+
+    `words` are those of the command itself: a detached job is given them, and repeats `prepare`.
+    """
+    if placing.detach and placing.address != "local":
+        return detach_job(words, name, placing)
+    with opening(words, placing) as began_s:
+        place = open_storage(name, create=False)
+        works = [open_work(run, given, placing.address) for run in open_runs(place)]
+        prepare(works)
+    if placing.detach:
+        return detach_job(words, name, placing)
+    return go_on(place, name, works, placing, began_s, given)
 
 
 def go_on(

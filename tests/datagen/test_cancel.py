@@ -121,7 +121,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         told = capsys.readouterr()
         (line,) = [line for line in told.err.splitlines() if "has not ended" in line]
         assert job.id in line and "heard 5 min" in line and f"kill -9 {work.process.pid} on" in line
-        assert f"datagen resume {run}" in line and "go on with" not in told.out
+        assert f"datagen resume {run}" in line and "Continue with" not in told.out
     finally:
         work.process.send_signal(signal.SIGCONT)
     assert work.process.wait(300) == 130  # the request stands

@@ -156,7 +156,7 @@ def test_an_interrupted_merge_says_how_to_go_on(apart: Path, tmp_path: Path):
         [sys.executable, "-c", program, *command], capture_output=True, text=True, check=False
     )
     assert run.returncode == 130, run.stderr
-    said = "interrupted early; what is committed stays. Go on with:"
+    said = "interrupted early; what is committed stays. Continue with:"
     assert run.stderr == f"{said}\n  datagen {' '.join(command)}\ninterrupted\n"
     assert len(Run.open(out).committed()) == 1
     assert cli.run(command) == 0

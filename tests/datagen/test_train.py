@@ -146,7 +146,7 @@ def test_ctrl_c_loses_nothing(heuristic_run: Path, tiny: str, tmp_path: Path):
     process.send_signal(signal.SIGINT)
     told = process.communicate()[1]
     if process.returncode == 130:  # unless it had come to its end just then
-        assert f"Go on with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
+        assert f"Continue with:\n  datagen train stage1 {heuristic_run} --out {tmp_path / 'c.ckpt'}" in told
         assert not read_checkpoint(tmp_path / "c.ckpt").head.finished
     else:
         assert process.returncode == 0

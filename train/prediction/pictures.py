@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import IO, Any
 
 import numpy as np
@@ -159,16 +160,7 @@ def _write_numbers(axes: Axes, prediction: Prediction) -> None:
     axes.set_axis_off()
     lines: list[str] = []
     for head, text in told(prediction):
-        lines += _wrapped(f"{head:<11}", text)
+        lines += textwrap.wrap(text, 76, initial_indent=f"{head:<11}", subsequent_indent=" " * 11)
     axes.text(
         0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=8.5, transform=axes.transAxes
     )
-
-
-def _wrapped(head: str, text: str, width: int = 76) -> list[str]:
-    lines = [head]
-    for word in text.split(" "):
-        if len(lines[-1]) + len(word) > width:
-            lines.append(" " * len(head))
-        lines[-1] += word + " "
-    return lines
