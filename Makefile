@@ -68,9 +68,9 @@ format: venv
 
 docs: venv
 	@mkdir -p build
-	$(BIN)/python -m scripts.data_format > build/data-format.md
+	$(BIN)/python -m datagen.schemas.data_format > build/data-format.md
 	mv build/data-format.md docs/data-format.md
-	$(BIN)/python -m scripts.specification_page > build/specification.md
+	$(BIN)/python -m datagen.schemas.specification_page > build/specification.md
 	mv build/specification.md docs/specification.md
 
 clean:

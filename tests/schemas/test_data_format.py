@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from datagen.schemas.data_format import page
 from datagen.schemas.fields import SCHEMAS
-from scripts.data_format import page
 
 PAGE = Path(__file__).parents[2] / "docs" / "data-format.md"
 
 
 def test_the_page_is_up_to_date():
-    assert PAGE.read_text() == page(), "run: python -m scripts.data_format > docs/data-format.md"
+    assert PAGE.read_text() == page(), "run: python -m schemas.data_format > docs/data-format.md"
 
 
 def test_every_field_has_a_unit_or_is_a_name_and_says_what_it_means():

@@ -13,7 +13,7 @@ from datagen.schemas.specification import (
     Specification,
     TrialParams,
 )
-from scripts.specification_page import page
+from datagen.schemas.specification_page import page
 from tests.conftest import REPOSITORY
 
 SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}

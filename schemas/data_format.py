@@ -1,4 +1,4 @@
-"""The data-format page, written from the schemas: `python -m scripts.data_format`."""
+"""The data-format page, written from the schemas: `python -m schemas.data_format`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from datagen.schemas.shard_files import MAX_CHUNK_BYTES, ZSTD_LEVEL, fill_value
 
 _HEAD = f"""# Data format
 
-This page is generated: `python -m scripts.data_format > docs/data-format.md`.
+This page is generated: `python -m schemas.data_format > docs/data-format.md`.
 
 ## A run
 

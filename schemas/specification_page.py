@@ -14,7 +14,7 @@ from datagen.schemas.specification import Interval, Range, Specification
 
 _HEAD = """# Specification
 
-This page is generated: `python -m scripts.specification_page > docs/specification.md`.
+This page is generated: `python -m schemas.specification_page > docs/specification.md`.
 
 A run's specification is everything that decides what its samples are. `datagen submit --config FILE.toml`
 sets any field below; an option of the command line wins over the file, the file over the default.
