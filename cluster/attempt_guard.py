@@ -22,6 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
+import psutil
+
 from datagen.cluster.post_mortem import STACK_LIMIT, note_path, short_line, stack_path
 from datagen.cluster.task import AttemptReport, AttemptResult, JobCannotContinue, Task
 from datagen.schemas.cost import StageClock
@@ -147,7 +149,7 @@ def this_host() -> Host:
             if line.startswith("model name")
         )
         cpu = next(names, cpu).strip()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = psutil.virtual_memory().total
     return Host(
         name=platform.node(), cpu=cpu, cores=os.cpu_count() or 1, memory_bytes=memory, pid=os.getpid()
     )
@@ -172,9 +174,5 @@ def _peak_memory_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process (bytes); 0 where unknown."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
+    """Resident memory of this process (bytes)."""
+    return psutil.Process().memory_info().rss

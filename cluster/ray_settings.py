@@ -65,7 +65,7 @@ def token_environment(token: str) -> dict[str, str]:
     return {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token, "RAY_AUTH_TOKEN_PATH": ""}
 
 
-def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
+def head_arguments(workers: int) -> list[str]:
     """Arguments of `ray` to start the head of a local cluster, with dashboard and jobs.
 
     Port 0 selects a free one, which Ray prints. Use with `head_environment`, without which Ray would listen
@@ -78,7 +78,7 @@ def head_arguments(workers: int, dashboard_port: int = 0) -> list[str]:
         "--port=0",
         "--include-dashboard=true",
         "--dashboard-host=127.0.0.1",
-        f"--dashboard-port={dashboard_port}",
+        "--dashboard-port=0",
         "--dashboard-agent-listen-port=0",
         # Fixed by default: two heads on one machine would share the port and each other's clients.
         f"--ray-client-server-port={free_port()}",

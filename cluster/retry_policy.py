@@ -137,8 +137,8 @@ def window(policy: RetryPolicy, slots: int) -> int:
 class Durations:
     """The wall seconds of the latest committed attempts, in bounded memory."""
 
-    def __init__(self, kept: int = 256) -> None:
-        self._latest: deque[float] = deque(maxlen=kept)
+    def __init__(self) -> None:
+        self._latest: deque[float] = deque(maxlen=256)
         self._seen = 0
         self._p95_s = 0.0
 

@@ -12,10 +12,12 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.clearance import Obstacles, obstacles_of
+from datagen.workers.content_cache import Shelf
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import ids_of_split, open_houses
 from datagen.workers.houses.house import House, HouseSource
 from datagen.workers.objects import open_objects
+from datagen.workers.objects.convex import GRIPPER_VERSION
 from datagen.workers.objects.model import ObjectModel, ObjectSource
 from datagen.workers.rendering.rays import RayMesh, RayScene, house_rays, object_rays
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 # Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
 _HOUSES_KEPT = 16
+_TARGETS = Shelf("targets", {"names": (np.str_, ("objects",))}, most_files=64, most_bytes=2**20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +127,17 @@ class World:
         return RayScene(house.rays, [p.rays for p in prepared], radii_m, T_world_object)
 
 
+def _target_names(objects: ObjectSource) -> list[str]:
+    """The objects that fit a gripper, cached by the source's content: asking loads every object."""
+    key = f"{objects.kind}-{objects.digest}-{GRIPPER_VERSION}"
+    stored = _TARGETS.load(key)
+    if stored is None:
+        names = [name for name in objects.names() if objects.load(name).can_be_target]
+        stored = {"names": np.array(names, np.str_)}
+        _TARGETS.store(key, stored)
+    return stored["names"].tolist()
+
+
 def open_world(spec: Specification, houses: str, objects: str) -> World:
     """Open the sources that `houses` and `objects` name, and check that they are the specified ones.
 
@@ -156,7 +170,7 @@ def assemble_world(
             "--houses", houses_ref, f"has no house in split {spec.split}", "Add houses, or use --split all"
         )
     names = objects.names()
-    targets = [n for n in names if objects.load(n).can_be_target]
+    targets = _target_names(objects)
     if not targets:
         raise InputError(
             "--objects", objects_ref, "has no object that a gripper can grasp", "Add smaller objects"

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from datagen.cluster.ray_head import running_head, stop_head
 from datagen.cluster.ray_jobs import open_ray_jobs
-from datagen.console.command_lines import command_line
+from datagen.console.command_lines import command_line, resume_with
 from datagen.console.options import AsJson
 from datagen.console.printing import counted, print_json, print_rows, seconds
 from datagen.jobs.detach import jobs_api_of
@@ -71,7 +71,7 @@ def cancel(
     else:
         print_rows(f"cancel {run}", [(job.id, health_line(job)) for job in ended])
         if not living:
-            sys.stdout.write(f"Resume with: {command_line(['resume', run])}\n")
+            sys.stdout.write(f"{resume_with(['resume', run])}\n")
     for job in living:
         _say(
             f"{run}: job {job.id} was asked to stop and has not ended; its last sign was "

@@ -11,16 +11,13 @@ from cyclopts import Parameter
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.jobs.detach import detach_job
-from datagen.jobs.job import JobResult
+from datagen.jobs.job import JobResult, JobRun
 from datagen.jobs.job_report import reported
-from datagen.jobs.options import HERE, JobOptions, absolute_place, opening, refuse_odd_n
-from datagen.jobs.start_job import open_job_run, source_words, start_job
+from datagen.jobs.options import HERE, JobOptions, absolute_place, refuse_odd_n
+from datagen.jobs.start_job import continue_job, source_words
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
-from datagen.schemas.storage import open_storage
 
 
 def verb(
@@ -44,24 +41,17 @@ def _extend(run: str, n: int, given: Sources, job_options: JobOptions) -> JobRes
     job_options.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]
-    if job_options.detach and job_options.address != "local":
-        return detach_job(words, run, job_options)
-    with opening(words, job_options) as began_s:
-        place = open_storage(run, create=False)
-        runs = open_runs(place)
-        job_runs = [open_job_run(part, given, job_options.address) for part in runs]
-        wanted = longer(runs, n, run)
-        for part, job_run, more in zip(runs, job_runs, wanted, strict=True):
+
+    def grow(job_runs: Sequence[JobRun]) -> None:
+        wanted = longer([job_run.run for job_run in job_runs], n, run)
+        for job_run, more in zip(job_runs, wanted, strict=True):
             if job_run.scenes_from:
                 stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
-                refuse_too_few(stored, part.layout, more)
-        for part, more in zip(runs, wanted, strict=True):
-            part.grow(more)
-    if job_options.detach:
-        return detach_job(words, run, job_options)
-    return start_job(
-        place, run, job_runs, job_options, began_s, [*words, *job_options.address_words()], given
-    )
+                refuse_too_few(stored, job_run.run.layout, more)
+        for job_run, more in zip(job_runs, wanted, strict=True):
+            job_run.run.grow(more)
+
+    return continue_job(words, run, given, job_options, grow)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

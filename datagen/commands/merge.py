@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import resumable, words_of
+from datagen.console.command_lines import command_line, resumable, words_of
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
@@ -126,7 +125,7 @@ def _print(report: dict[str, Any]) -> None:
         ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
     ]
     if missing:
-        rows.append(("resume with", f"datagen resume {shlex.quote(out)}"))
+        rows.append(("resume with", command_line(["resume", out])))
     print_rows(f"merged: {out}", rows)
     for part in report["runs"]:
         shards = part["shards"]

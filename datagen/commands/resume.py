@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,15 +13,12 @@ from typing_extensions import Unpack
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
-from datagen.jobs.detach import detach_job
-from datagen.jobs.job import JobResult
+from datagen.jobs.job import JobResult, JobRun
 from datagen.jobs.job_report import reported
-from datagen.jobs.options import HERE, JobKeywords, JobOptions, absolute_place, opening
-from datagen.jobs.start_job import open_job_run, source_words, start_job
+from datagen.jobs.options import HERE, JobKeywords, JobOptions, absolute_place
+from datagen.jobs.start_job import continue_job, source_words
 from datagen.regeneration.sources import AS_FOUND, Sources
-from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.quarantine import lift_quarantine
-from datagen.schemas.storage import open_storage
 
 
 def verb(
@@ -72,18 +70,11 @@ def resume(
     job_options.refuse_bad()
     words = ["resume", absolute_place(run), *words_of({"--quarantined": quarantined}), *source_words(given)]
     words += job_options.words()
-    if job_options.detach and job_options.address != "local":
-        return detach_job(words, run, job_options)
-    with opening(words, job_options) as began_s:
-        place = open_storage(run, create=False)
-        runs = open_runs(place)
-        job_runs = [open_job_run(part, given, job_options.address) for part in runs]
-        if job_options.detach:
-            return detach_job(words, run, job_options)
-        if quarantined:
-            lifted = sum(len(lift_quarantine(part)) for part in runs)
+
+    def lift(job_runs: Sequence[JobRun]) -> None:
+        if quarantined and not job_options.detach:
+            lifted = sum(len(lift_quarantine(job_run.run)) for job_run in job_runs)
             if not job_options.quiet:
                 sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
-    return start_job(
-        place, run, job_runs, job_options, began_s, [*words, *job_options.address_words()], given
-    )
+
+    return continue_job(words, run, given, job_options, lift)

@@ -24,9 +24,14 @@ def command_line(words: Sequence[str]) -> str:
     return shlex.join(["datagen", *words])
 
 
+def resume_with(words: Sequence[str]) -> str:
+    """The sentence that names the command that resumes."""
+    return f"Resume with:\n  {command_line(words)}"
+
+
 def say_interrupted(how: str, words: Sequence[str]) -> None:
     """Print that the command was interrupted, and the command that resumes it."""
-    sys.stderr.write(f"interrupted{how}. Resume with:\n  {command_line(words)}\n")
+    sys.stderr.write(f"interrupted{how}. {resume_with(words)}\n")
 
 
 @contextmanager

@@ -78,7 +78,7 @@ class JobInterrupted(KeyboardInterrupt):
     def __init__(self, result: JobResult) -> None:
         self.result = result
         left = counted(result.remaining, "shard")
-        super().__init__(f"{left} left. Continue with: {command_line(result.resume)}")
+        super().__init__(f"{left} left. Resume with: {command_line(result.resume)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError
 
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
-from datagen.jobs.detach import detached_words
+from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.job import JobInterrupted, JobPlan, JobResult, JobRun, run_job
-from datagen.jobs.options import JobOptions, absolute_place, absolute_source
+from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
 from datagen.regeneration.shards import open_sources
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
-from datagen.schemas.storage import Storage
+from datagen.schemas.storage import Storage, open_storage
 from datagen.workers.extras import missing_library
 from datagen.workers.labels import load_label_source
 from datagen.workers.robots import gripper_of
@@ -57,6 +58,29 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
         absolute_source(given.objects or known.get("objects", "builtin")),
         "" if spec.scenes_from is None else absolute_place(given.scenes_from or known["scenes_from"]),
     )
+
+
+def continue_job(
+    words: Sequence[str],
+    path: str,
+    given: Sources,
+    job_options: JobOptions,
+    prepare: Callable[[Sequence[JobRun]], None],
+) -> JobResult:
+    """Open the run, or merged runs, at `path`, let `prepare` change them, and make the missing shards.
+
+    `words` are those of the command itself: a detached job is given them, and repeats `prepare`.
+    """
+    if job_options.detach and job_options.address != "local":
+        return detach_job(words, path, job_options)
+    with opening(words, job_options) as began_s:
+        storage = open_storage(path, create=False)
+        job_runs = [open_job_run(run, given, job_options.address) for run in open_runs(storage)]
+        prepare(job_runs)
+    if job_options.detach:
+        return detach_job(words, path, job_options)
+    command = [*words, *job_options.address_words()]
+    return start_job(storage, path, job_runs, job_options, began_s, command, given)
 
 
 def start_job(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import errno
 import os
 import secrets
 import shutil
@@ -18,12 +17,10 @@ from datagen.schemas.sealing.contents import Contents
 from datagen.schemas.sealing.metadata import SEALED
 from datagen.schemas.shard_files import TABLES
 from datagen.schemas.storage import storage_error
+from datagen.schemas.storage.errors import CANNOT_EXCHANGE, TAKEN
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
-_TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
-# Error codes of kernels and file systems that cannot exchange two names.
-_CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes]) -> None:
@@ -122,7 +119,7 @@ def _take_the_name(draft: Path, sealed: Path) -> Path:
             draft.rename(sealed)  # onto nothing, or onto an empty folder
             return draft
         except OSError as e:
-            if e.errno not in _TAKEN:
+            if e.errno not in TAKEN:
                 raise
         with suppress(FileNotFoundError):
             if _exchange(draft, sealed):
@@ -133,7 +130,7 @@ def _take_the_name(draft: Path, sealed: Path) -> Path:
                 draft.rename(sealed)
                 return old
             except OSError as e:
-                if e.errno not in _TAKEN:
+                if e.errno not in TAKEN:
                     old.rename(sealed)
                     raise
                 remove_tree(old)
@@ -147,6 +144,6 @@ def _exchange(one: Path, other: Path) -> bool:
     if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True
     code = ctypes.get_errno()
-    if code in _CANNOT_EXCHANGE:
+    if code in CANNOT_EXCHANGE:
         return False
     raise OSError(code, os.strerror(code), str(one), None, str(other))

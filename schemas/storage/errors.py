@@ -14,6 +14,11 @@ from datagen.schemas.errors import InputError
 # Errors of the machine that any write can cause, whatever the shard.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+# A name that is taken, or whose folder is a file; a file system without hard links from there, or without
+# the exchange of two names.
+TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
+NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
+CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 MACHINE = (*FULL, *FORBIDDEN, errno.EMFILE, errno.ENAMETOOLONG)
 
 _MENDS = {

@@ -15,7 +15,13 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from datagen.schemas.storage.errors import NotARegularFile, storage_error, too_large
+from datagen.schemas.storage.errors import (
+    NOT_LINKED,
+    TAKEN,
+    NotARegularFile,
+    storage_error,
+    too_large,
+)
 from datagen.schemas.storage.stored_file import StoredFile
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -24,7 +30,6 @@ _STEP = getattr(os, "O_PATH", os.O_RDONLY) | os.O_DIRECTORY | os.O_NOFOLLOW | os
 # Without O_NONBLOCK, opening a pipe waits for a writer.
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _DRAFT = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
 _COPIED_AT_ONCE = 2**20
 _MAX_DEPTH = 32
 _KINDS = {
@@ -172,7 +177,7 @@ class LocalFiles:
                     try:
                         os.link(from_name, draft, src_dir_fd=there, dst_dir_fd=here, follow_symlinks=False)
                     except OSError as e:
-                        if e.errno not in _NOT_LINKED:
+                        if e.errno not in NOT_LINKED:
                             raise
                         source._copy(source_key, draft, here)
                     os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
@@ -299,7 +304,7 @@ def _remove_folder(name: str, here: int) -> None:
     try:
         os.rmdir(name, dir_fd=here)
     except OSError as e:
-        if e.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT, errno.ENOTDIR):
+        if e.errno not in (*TAKEN, errno.ENOENT):
             raise
 
 

@@ -157,7 +157,7 @@ def test_an_interrupt_leaves_a_run_that_the_same_call_finishes(
 
     with monkeypatch.context() as patched:
         patched.setattr(job, "run_attempt", interrupted)
-        with pytest.raises(KeyboardInterrupt, match=r"shards? to go\. Continue with: datagen resume"):
+        with pytest.raises(KeyboardInterrupt, match=r"shards? left\. Resume with: datagen resume"):
             submit()
     made = len(datagen.candidates(tmp_path / "run", allow_incomplete=True))
     assert made == 8 * len(began) < 32  # shards that were in flight are finished

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from PIL import Image
 
 from datagen import cli
 from tests.refusals import refused
 from tests.small_runs import files_of, json_of
-from tests.train.prediction.checkpoints import write_untrained
+from tests.train.prediction.checkpoints import stored_with, write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
 
 HEIGHT_M = 0.8197  # of the scene's camera
@@ -348,9 +349,9 @@ def test_a_floor_out_of_sight_is_asked_for(
 def test_a_model_without_finite_scores_gives_no_answer(
     made: Path, tmp_path: Path, value: float, words: str, json_too: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = torch.load(made / "model.ckpt", weights_only=True)
-    filled = {k: torch.full_like(v, value) if k.startswith("weights/") else v for k, v in whole.items()}
-    torch.save(filled, tmp_path / "bad.ckpt")
+    whole = safetensors.torch.load_file(made / "model.ckpt")
+    filled = {name: torch.full_like(tensor, value) for name, tensor in whole.items()}
+    stored_with(tmp_path / "bad.ckpt", made / "model.ckpt", filled)
     given = arguments(made)
     given[1] = str(tmp_path / "bad.ckpt")
     assert cli.run([*given, *(["--json"] if json_too else [])]) == 2

@@ -113,12 +113,12 @@ class Reliability:
         return float(np.average(np.abs(self.said - self.true), weights=self.count))
 
 
-def reliability(true: Bools, probability: F64, bins: int = N_BINS) -> Reliability:
+def reliability(true: Bools, probability: F64) -> Reliability:
     """Non-empty bins of [0, 1] of equal width; the last includes 1."""
-    row = np.minimum((probability * bins).astype(np.int64), bins - 1)
-    count = np.bincount(row, minlength=bins)
+    row = np.minimum((probability * N_BINS).astype(np.int64), N_BINS - 1)
+    count = np.bincount(row, minlength=N_BINS)
     held = count > 0
-    said, positives = (np.bincount(row, values, bins)[held] / count[held] for values in (probability, true))
+    said, positives = (np.bincount(row, values, N_BINS)[held] / count[held] for values in (probability, true))
     return Reliability(count[held], said, positives)
 
 

@@ -33,7 +33,7 @@ class SeenPoints:
         return len(self.points_m)
 
 
-def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64], voxel_m: float = VOXEL_M) -> SeenPoints:
+def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
     """Frames by their `T_world_camera` in one cloud.
 
     Of several frames one point a voxel stays, a target's before another's, then the nearest to its
@@ -53,7 +53,7 @@ def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64], voxel_m: float = V
         return SeenPoints(points, rgb, on_target, eyes_m)
     gap_m = np.concatenate([np.linalg.norm(w - T[:3, 3], axis=1) for w, T in zip(worlds, poses, strict=True)])
     order = np.lexsort([gap_m, ~on_target])
-    cells = np.floor(points[order] / voxel_m).astype(np.int64)
+    cells = np.floor(points[order] / VOXEL_M).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     rows = np.sort(order[first])
     return SeenPoints(points[rows], rgb[rows], on_target[rows], eyes_m)

@@ -139,12 +139,12 @@ class Prediction:
 _CROP = ObservationParams()
 
 
-def load_scorer(checkpoint: str | Path, device: str = "cpu") -> ModelScorer:
+def load_scorer(checkpoint: str | Path) -> ModelScorer:
     """A checkpoint's model, ready to predict. InputError for what is no checkpoint."""
     # Imported here: frames are read and refused without torch.
     from datagen.train.training.checkpoints import load_model
 
-    model, head = load_model(checkpoint, device)
+    model, head = load_model(checkpoint)
     return ModelScorer(model, f"{head.model} ({head.stage})")
 
 

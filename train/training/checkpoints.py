@@ -1,25 +1,28 @@
 """A checkpoint: one file with a model's weights, their origin, and the state to resume training.
 
-On disk it is a file of `torch.save` with one flat dictionary: `head`, a JSON text, and tensors under
-`weights/` (the best epoch's) and `resume/` (the last step's model and optimiser). Numbers that are no
-tensors lie in the JSON, which holds a float to its last bit.
+On disk it is a safetensors file: tensors under `weights/` (the best epoch's) and `resume/` (the last step's
+model and optimiser), and in the header's metadata one JSON text, `head`. Numbers that are no tensors lie in
+the JSON, which holds a float to its last bit, as does the file's own checksum. Files of format 1, which
+`torch.save` wrote, are read by `pickled_checkpoints`.
 """
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
-import io
 import json
 import os
+import re
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from safetensors import SafetensorError
 from torch import Tensor
 
 from datagen.schemas.errors import InputError
@@ -27,10 +30,17 @@ from datagen.schemas.untrusted_files import read_regular
 from datagen.schemas.whole_files import whole_file
 from datagen.train.dataset import DataOrigin
 from datagen.train.models import Model, build_model
-from datagen.train.training.torch_file_check import MAX_BYTES, refuse_foreign, refuse_odd_values
+from datagen.train.training.pickled_checkpoints import NOT_PICKLED, read_pickled
 from datagen.train.training.validation import ValidationMetrics
 
-FORMAT, FORMAT_VERSION = "datagen checkpoint", 1
+FORMAT, FORMAT_VERSION = "datagen checkpoint", 2
+MAX_BYTES = 2 << 30
+_MAX_HEADER_BYTES = 32 << 20
+_MAX_TENSORS, _MAX_AXES = 100_000, 64
+_DTYPES = {"F32", "I64", "U8", "BOOL"}
+_UNSIGNED = b"0" * 64  # in place of the checksum where the checksum is taken
+_NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+_MAX_TEXT = 4096
 _MEND = "Name a checkpoint of `datagen train`, or train it again"
 
 
@@ -112,12 +122,11 @@ def put_weights(model: Model, weights: Mapping[str, Tensor], place: str) -> None
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load a complete checkpoint on the CPU. InputError as `load_model`; memory is bounded by its size."""
     place, data = str(path), read_regular(Path(path), MAX_BYTES, _MEND)
-    refuse_foreign(place, data)
     try:
-        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except (RuntimeError, ValueError, KeyError, EOFError) as e:
-        raise InputError(place, "", f"torch cannot load it ({e})", _MEND) from None
-    text = stored.pop("head", None)
+        tensors, text = read_pickled(data) if data[:2] == b"PK" else _read(data)
+    except (SafetensorError, *NOT_PICKLED, AttributeError) as e:
+        problem = f"not a checkpoint of this program, or damaged ({e!s:.200})"
+        raise InputError(place, "", problem, _MEND) from None
     document = _document(place, text)
     try:
         head = replace(_HEAD.validate_python(document["head"]), digest=hashlib.sha256(data).hexdigest())
@@ -127,7 +136,6 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         where = ".".join(str(part) for part in first["loc"]) if first else "head"
         problem = first["msg"].lower() if first else f"incomplete ({e})"
         raise InputError(place, where, problem, _MEND) from None
-    tensors = {name: value for name, value in stored.items() if isinstance(value, Tensor)}
     _refuse_not_finite(place, tensors, _MEND)
     return Checkpoint(head, below("weights/", tensors), below("resume/", tensors), loop)
 
@@ -139,18 +147,20 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """
     path = Path(path)
     document = {
+        "sha256": _UNSIGNED.decode(),  # before any other text that could hold so many zeros
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "head": {k: v for k, v in asdict(checkpoint.head).items() if k != "digest"},
         "loop": checkpoint.loop,
     }
-    stored: dict[str, Any] = {"head": json.dumps(document, allow_nan=False)}
-    stored |= {f"weights/{k}": _own(v) for k, v in checkpoint.weights.items()}
+    stored = {f"weights/{k}": _own(v) for k, v in checkpoint.weights.items()}
     stored |= {f"resume/{k}": _own(v) for k, v in checkpoint.resume.items()}
     mend = "Nothing was overwritten. Train again with a smaller --lr and a new --out"
-    _refuse_not_finite(str(path), {k: v for k, v in stored.items() if k != "head"}, mend)
+    _refuse_not_finite(str(path), stored, mend)
+    data = safetensors.torch.save(stored, {"head": json.dumps(document, allow_nan=False)})
+    data = data.replace(_UNSIGNED, hashlib.sha256(data).hexdigest().encode(), 1)
     with whole_file(path, durable=True, alone=True) as file:
-        torch.save(stored, file)
+        file.write(data)
 
 
 @contextmanager
@@ -185,6 +195,27 @@ def _own(tensor: Tensor) -> Tensor:
     return tensor.detach().cpu().contiguous().clone()
 
 
+def _read(data: bytes) -> tuple[dict[str, Tensor], str]:
+    """The tensors of a safetensors file and its `head`. ValueError and others for one that is damaged."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    if not 8 < end <= min(len(data), _MAX_HEADER_BYTES):
+        raise ValueError("no header of a safetensors file")
+    header: Any = json.loads(data[8:end])
+    text: str = header.pop("__metadata__")["head"]
+    if len(header) > _MAX_TENSORS:
+        raise ValueError("too many tensors")
+    for name, told in header.items():
+        if told["dtype"] not in _DTYPES or len(told["shape"]) > _MAX_AXES:
+            raise ValueError(f"tensor {name!r:.80} has a type or shape that no checkpoint has")
+    stated: str = json.loads(text)["sha256"]
+    unsigned = data[:end].replace(stated.encode(), _UNSIGNED, 1)
+    digest = hashlib.sha256(unsigned)
+    digest.update(memoryview(data)[end:])
+    if digest.hexdigest() != stated:
+        raise ValueError("its checksum is another one")
+    return safetensors.torch.load(data), text
+
+
 def _document(place: str, text: object) -> dict[str, Any]:
     try:
         document: Any = json.loads(text) if isinstance(text, str) else None
@@ -192,10 +223,10 @@ def _document(place: str, text: object) -> dict[str, Any]:
         document = None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(place, "head", "is not that of a datagen checkpoint", _MEND)
-    refuse_odd_values(place, document)
+    _refuse_odd_values(place, document)
     version = document.get("format_version")
-    if version != FORMAT_VERSION:
-        problem = f"is {version!r:.20}, but this program reads {FORMAT_VERSION}"
+    if version not in (1, FORMAT_VERSION):
+        problem = f"is {version!r:.20}, but this program reads 1 and {FORMAT_VERSION}"
         raise InputError(place, "format_version", problem, "Use the version of datagen that wrote it")
     return document
 
@@ -203,3 +234,25 @@ def _document(place: str, text: object) -> dict[str, Any]:
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors whose names begin with a prefix, by the rest of their names."""
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def _refuse_odd_values(place: str, document: dict[str, Any]) -> None:
+    """InputError at a number that is not finite or beyond 64 bits, and at text that no terminal may print."""
+    left: list[tuple[str, Any]] = [("", document)]
+    while left:
+        where, value = left.pop()
+        match value:
+            case dict():
+                left += [(where, key) for key in value]
+                left += [(f"{where}.{key:.40}".lstrip("."), item) for key, item in value.items()]
+            case list():
+                left += [(where, item) for item in value]
+            case str() if len(value) > _MAX_TEXT or _NO_TEXT.search(value):
+                problem = (
+                    f"text with control characters or surrogates, or of more than {_MAX_TEXT} characters"
+                )
+                raise InputError(place, where, problem, _MEND)
+            case int() | float() if not -(2.0**63) < value < 2.0**63:
+                raise InputError(place, where, f"{value!s:.20} is not a usable number", _MEND)
+            case _:
+                pass

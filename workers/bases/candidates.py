@@ -10,7 +10,6 @@ import numpy.typing as npt
 from datagen.schemas.specification import CandidateParams, Range
 from datagen.workers.bases.clearance import Obstacles, base_clearance_m
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.scene_rejected import SceneRejected
 
 Bools = npt.NDArray[np.bool_]
 
@@ -57,12 +56,12 @@ def grid_offsets(params: CandidateParams) -> F64:
 
 def draw_candidates(
     target_center_m: F64, obstacles: Obstacles, params: CandidateParams, rng: np.random.Generator
-) -> SceneCandidates:
+) -> SceneCandidates | None:
     """Return all cells of the grid, or `per_scene` positions jittered within cells, with their robots.
 
     Cells are sampled from all without repetition, or from the set `within`. Candidates are assigned in turn
     to `robots_per_scene` robots, so that a model encodes a scene once per robot; or each has its own robot,
-    as in the paper. Raises SceneRejected("no_base") where too few cells are in the set for these robots.
+    as in the paper. None where too few cells are in the set for these robots.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
@@ -73,6 +72,8 @@ def draw_candidates(
     else:
         robots = _draw_robots(params, n_robots, rng)
         base_xy_m = _places_within(target_center_m, obstacles, params, robots, robot_index, rng)
+        if base_xy_m is None:
+            return None
     return _stand(base_xy_m, robot_index, robots, obstacles, params)
 
 
@@ -126,8 +127,8 @@ def _places_within(
     robots: _SceneRobots,
     robot_index: npt.NDArray[np.int16],
     rng: np.random.Generator,
-) -> F32:
-    """A position (N, 2), world, in the required set for the robot of each candidate.
+) -> F32 | None:
+    """A position (N, 2), world, in the required set for the robot in each candidate; None where there are too few.
 
     A round visits every cell in random order and uses each at most once; further rounds follow only where one
     does not give enough.
@@ -150,7 +151,7 @@ def _places_within(
             free[found] = False
         if not open_.any():
             return base_xy_m
-    raise SceneRejected("no_base")
+    return None
 
 
 def _is_within(candidates: SceneCandidates, target_center_m: F64, params: CandidateParams) -> Bools:

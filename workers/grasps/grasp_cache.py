@@ -69,11 +69,6 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> 
     return found
 
 
-def forget() -> None:
-    """Drop what this process keeps in memory; what lies on disk stays."""
-    _kept.clear()
-
-
 def content_digest(model: ObjectModel, gripper: Gripper, params: GraspParams) -> str:
     """sha256 over all that decides the grasps: it seeds their draws and names their file."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)

@@ -1,14 +1,18 @@
 """Whether a hand that comes in straight touches the object, or what the object stands on."""
 
+# coal fills itself at import time, which type checkers do not see.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import coal
 import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.robots.polyhedron import coal, polyhedron
+from datagen.workers.robots.hulls import polyhedron
 from datagen.workers.robots.robot import Gripper
 
 Bools = npt.NDArray[np.bool_]

@@ -23,10 +23,12 @@ _MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
 _PLAIN = (180, 178, 174)
 _MEND = "Download the asset again, or remove the scenes that use it."
-# Exceptions of the reader for damaged files.
+# What a damaged file makes trimesh raise, which checks little by itself: references to what is not there and
+# values of other types, short buffers, nodes that hold each other, textures that Pillow cannot read (OSError)
+# or refuses for their size, a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
 _DAMAGE = (
-    ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, struct.error, RecursionError,
-    NotImplementedError, ZeroDivisionError, OverflowError, Image.DecompressionBombError,
+    ValueError, LookupError, TypeError, AttributeError, OSError, struct.error, RecursionError,
+    NotImplementedError, ArithmeticError, Image.DecompressionBombError,
 )  # fmt: skip
 
 

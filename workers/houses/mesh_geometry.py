@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
+from trimesh.graph import connected_component_labels
 
 from datagen.workers.furniture.support_tops import Rectangle
 from datagen.workers.geometry.mesh import F32, F64, Mesh
@@ -31,10 +29,7 @@ def normals_and_areas(mesh: Mesh) -> tuple[F64, F64]:
 
 def face_components(faces: npt.NDArray[np.int32], vertex_count: int) -> npt.NDArray[np.int32]:
     """The connected component of each face (F,), by shared vertices."""
-    rows = np.concatenate([faces[:, 0], faces[:, 1]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    graph = coo_matrix((np.ones(len(rows), np.bool_), (rows, columns)), shape=(vertex_count, vertex_count))
-    _, labels = cast(Any, connected_components(graph, directed=False))
+    labels = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), vertex_count)
     return np.unique(labels[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
 
 

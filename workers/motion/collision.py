@@ -4,6 +4,9 @@ Poses are handled together: bounding boxes of all of them are compared as arrays
 overlap are given to GJK. Parts are solid, so a part inside another one is a contact too.
 """
 
+# coal fills itself at import time, which type checkers do not see.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -11,12 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import coal
 import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.polyhedron import coal, polyhedron
+from datagen.workers.robots.hulls import polyhedron
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]

@@ -132,11 +132,10 @@ def ball(diameter: float, height: float | None = None, rings: int = 14) -> Point
     ]
 
 
-def arc(radius: float, start_deg: float, end_deg: float, count: int, upright: bool = False) -> list[Vector]:
-    """Points on a circle about the origin, in the x-y plane or, upright, in the x-z plane."""
+def arc(radius: float, start_deg: float, end_deg: float, count: int) -> list[Vector]:
+    """Points on a circle about the origin, in the x-y plane."""
     angles = [math.radians(start_deg + (end_deg - start_deg) * i / (count - 1)) for i in range(count)]
-    flat = [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
-    return [(x, 0.0, y) if upright else (x, y, 0.0) for x, y in flat]
+    return [(radius * math.cos(a), radius * math.sin(a), 0.0) for a in angles]
 
 
 def cup(diameter: float, height: float, wall: float, paint: Piece) -> Piece:

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
@@ -23,6 +21,8 @@ from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
 
+# Part of a cache key: raise it when `fits_gripper` changes its answers.
+GRIPPER_VERSION = 1
 GRIPPER_STROKE_M = 0.08
 # Half a millimetre of air on each side while the hand comes down.
 MAX_GRASP_WIDTH_M = GRIPPER_STROKE_M - 0.001
@@ -106,9 +106,8 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
 
 
 def _components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
-    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n_vertices, n_vertices))
-    of_face = connected_components(graph, directed=False)[1][faces[:, 0]]
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    of_face = trimesh.graph.connected_component_labels(edges, n_vertices)[faces[:, 0]]
     order = np.argsort(of_face, kind="stable")
     cuts = np.flatnonzero(np.diff(of_face[order])) + 1
     # In order of first appearance in the file, as groups are.

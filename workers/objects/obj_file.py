@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,8 @@ MAX_FACES = 2_000_000
 MAX_VERTICES = 4_000_000
 MAX_LINES = 16_000_000  # faces, vertices, and their texture coordinates and normals
 MAX_NAMES = 100_000  # of groups, or of materials
-BLOCK_BYTES = 2**20
+MAX_LINE_BYTES = 2**20
 _INTEGER = re.compile(rb"-?\d+")
-_SPACES = re.compile(rb"[ \t]+")
 _CORNERS = re.compile(rb"(?:0 )*0|(?:0/0 )*0/0|(?:0//0 )*0//0|(?:0/0/0 )*0/0/0")
 
 
@@ -42,42 +42,51 @@ class ObjMesh:
     def group_faces(self) -> list[I64]:
         """The faces of each named group that has any; all faces as one group where none is named."""
         cuts = np.unique(np.concatenate([[0], self.group_starts, [len(self.faces)]]))
-        return [self.faces[a:b] for a, b in pairwise(cuts) if b > a]
-
-
-@dataclass
-class _Growing:
-    """What has been read so far."""
-
-    vertices: list[F64]
-    uv: list[F64]
-    faces: list[I64]
-    uv_faces: list[I64]
-    starts: dict[bytes, list[int]]
-    n_vertices: int = 0
-    n_uv: int = 0
-    n_faces: int = 0
+        return [self.faces[a:b] for a, b in itertools.pairwise(cuts) if b > a]
 
 
 def read_obj(path: Path) -> ObjMesh:
     """Reads vertices, texture coordinates, faces and groups; other statements are skipped.
 
-    Works block by block and stops at the first limit passed, so that memory stays near the size
+    Works line by line and stops at the first limit passed, so that memory stays near the size
     of the arrays. Raises InputError naming the file and the line or the index at fault: missing
     or oversized file, no faces, too many faces, unreadable numbers, NaN, index out of range.
     """
-    _refuse_at_a_glance(path)
-    grown = _Growing([], [], [], [], {b"o": [], b"g": []})
-    for first_line, lines in _blocks(path):
-        _read_block(path, first_line, lines, grown)
-    if grown.n_faces == 0:
+    vertices, uv, faces, uv_faces = array("d"), array("d"), array("q"), array("q")
+    starts: dict[bytes, list[int]] = {b"o": [], b"g": []}
+    for number, line in _lines(path):
+        keyword, _, rest = line.lstrip().partition(b" ")
+        try:
+            if keyword == b"v":
+                vertices.extend(_numbers(rest, 3))
+            elif keyword == b"vt":
+                uv.extend(_numbers(rest, 2))
+            elif keyword == b"f":
+                v, t = _corners(rest, len(vertices) // 3, len(uv) // 2)
+                for k in range(1, len(v) - 1):
+                    faces.extend((v[0], v[k], v[k + 1]))
+                    uv_faces.extend((t[0], t[k], t[k + 1]))
+            elif keyword in starts:
+                starts[keyword].append(len(faces) // 3)
+                if len(starts[keyword]) > MAX_NAMES:
+                    raise ValueError(f"more than {MAX_NAMES:,} groups")
+            elif b"\t" in keyword:
+                raise ValueError("a tab follows the keyword")
+        except ValueError as error:
+            shown = line[:60].decode("utf-8", "replace").strip()
+            mend = "Export the mesh again as text OBJ"
+            raise InputError(path, f"line {number}", f"{error}: {shown!r}", mend) from None
+        if len(faces) > 3 * MAX_FACES or len(vertices) > 3 * MAX_VERTICES or len(uv) > 2 * MAX_VERTICES:
+            problem = f"the mesh has more than {MAX_FACES:,} faces or {MAX_VERTICES:,} vertices"
+            raise InputError(path, "", problem, "Simplify the mesh")
+    if not faces:
         raise InputError(path, "", "the mesh has no faces", "Give an OBJ file with `v` and `f` lines")
     mesh = ObjMesh(
-        np.concatenate(grown.vertices) if grown.vertices else np.zeros((0, 3)),
-        np.concatenate(grown.uv) if grown.uv else np.zeros((0, 2)),
-        np.concatenate(grown.faces),
-        np.concatenate(grown.uv_faces),
-        np.array(grown.starts[b"o"] or grown.starts[b"g"], np.int64),
+        np.array(vertices).reshape(-1, 3),
+        np.array(uv).reshape(-1, 2),
+        np.array(faces).reshape(-1, 3) - 1,
+        np.array(uv_faces).reshape(-1, 3) - 1,
+        np.array(starts[b"o"] or starts[b"g"], np.int64),
     )
     _check_indices(path, mesh)
     return mesh
@@ -93,164 +102,64 @@ class ObjHeader:
 
 def read_obj_header(path: Path) -> ObjHeader:
     """The mtllib and usemtl names of a file, without parsing its numbers. Raises InputError."""
-    libraries: dict[str, None] = {}
-    materials: dict[str, None] = {}
-    for _, lines in _blocks(path):
-        for line in lines:
-            if line.startswith(b"mtllib "):
-                libraries[line[7:].strip().decode("utf-8", "replace")] = None
-            elif line.startswith(b"usemtl "):
-                materials[line[7:].strip().decode("utf-8", "replace")] = None
-        if max(len(libraries), len(materials)) > MAX_NAMES:
-            raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} materials", "Join them")
-    return ObjHeader(next(iter(libraries), ""), tuple(materials))
+    names: dict[bytes, dict[str, None]] = {b"mtllib": {}, b"usemtl": {}}
+    for _, line in _lines(path):
+        keyword, _, name = line.partition(b" ")
+        if keyword in names:
+            names[keyword][name.strip().decode("utf-8", "replace")] = None
+            if len(names[keyword]) > MAX_NAMES:
+                raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} materials", "Join them")
+    return ObjHeader(next(iter(names[b"mtllib"]), ""), tuple(names[b"usemtl"]))
 
 
-def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Yields (number of the first line, lines), each block about `BLOCK_BYTES` long."""
+def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yields (number, line), from 1."""
     with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
-        rest, line_number = b"", 1
-        while block := file.read(BLOCK_BYTES):
-            lines = (rest + block).split(b"\n")
-            rest = lines.pop()
-            if len(rest) > BLOCK_BYTES:
-                raise InputError(path, f"line {line_number}", "the line is too long", "Give a text OBJ file")
-            yield line_number, lines
-            line_number += len(lines)
-            if line_number > MAX_LINES:
+        for number in itertools.count(1):
+            line = file.readline(MAX_LINE_BYTES)
+            if not line:
+                return
+            if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
+                raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
+            if number > MAX_LINES:
                 raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
-        yield line_number, [rest]
+            yield number, line
 
 
-def _refuse_at_a_glance(path: Path) -> None:
-    """Counts lines that begin a face, hundreds of times faster than reading them."""
-    count = 0
-    with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
-        while count <= MAX_FACES and (block := file.read(BLOCK_BYTES)):
-            count += block.count(b"\nf ")
-    if count > MAX_FACES:
-        raise InputError(path, "", f"the mesh has more than {MAX_FACES:,} faces", "Simplify the mesh")
-
-
-def _read_block(path: Path, first_line: int, lines: list[bytes], grown: _Growing) -> None:
-    by_keyword: dict[bytes, list[int]] = {b"v": [], b"vt": [], b"f": []}
-    for index, line in enumerate(lines):
-        keyword, _, _ = line.lstrip().partition(b" ")
-        known = by_keyword.get(keyword)
-        if known is not None:
-            known.append(index)
-        elif keyword in grown.starts:
-            # Counted in face lines of this block; turned into face indices below.
-            grown.starts[keyword].append(-1 - len(by_keyword[b"f"]))
-        elif b"\t" in keyword:
-            raise InputError(
-                path, f"line {first_line + index}", "a tab follows the keyword", "Put a space there"
-            )
-
-    vertices = _numbers(path, first_line, lines, by_keyword[b"v"], 3)
-    uv = _numbers(path, first_line, lines, by_keyword[b"vt"], 2)
-    face_lines = by_keyword[b"f"]
-    # Negative indices count back from what precedes the face in the file.
-    seen_v = grown.n_vertices + np.searchsorted(by_keyword[b"v"], face_lines)
-    seen_t = grown.n_uv + np.searchsorted(by_keyword[b"vt"], face_lines)
-    faces, uv_faces, first_face = _triangles(path, first_line, lines, face_lines, seen_v, seen_t)
-    for starts in grown.starts.values():
-        starts[:] = [grown.n_faces + int(first_face[-1 - s]) if s < 0 else s for s in starts]
-
-    grown.vertices.append(vertices)
-    grown.uv.append(uv)
-    grown.faces.append(faces)
-    grown.uv_faces.append(uv_faces)
-    grown.n_vertices += len(vertices)
-    grown.n_uv += len(uv)
-    grown.n_faces += len(faces)
-    if max(map(len, grown.starts.values())) > MAX_NAMES:
-        raise InputError(path, "", f"the mesh has more than {MAX_NAMES:,} groups", "Join them")
-    if grown.n_faces > MAX_FACES or max(grown.n_vertices, grown.n_uv) > MAX_VERTICES:
-        raise InputError(
-            path,
-            "",
-            f"the mesh has more than {MAX_FACES:,} faces or {MAX_VERTICES:,} vertices",
-            "Simplify the mesh",
-        )
-
-
-def _numbers(path: Path, first_line: int, lines: list[bytes], rows: list[int], width: int) -> F64:
-    """The first `width` numbers of the given lines, (N, width)."""
-    if not rows:
-        return np.zeros((0, width))
-    values = _table([lines[r] for r in rows], np.float64, tuple(range(1, width + 1)))
-    if values is None:
-        bad = next(r for r in rows if _table([lines[r]], np.float64, tuple(range(1, width + 1))) is None)
-        raise _bad_line(path, first_line + bad, lines[bad], f"{width} numbers are needed")
-    finite = np.isfinite(values).all(axis=1)
-    if not finite.all():
-        bad = rows[int(np.argmin(finite))]
-        raise _bad_line(path, first_line + bad, lines[bad], "a number is not finite")
+def _numbers(text: bytes, width: int) -> list[float]:
+    """The first `width` numbers. ValueError where there are fewer, or one is not finite."""
+    words = text.split()[:width]
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) < width or b"_" in text:
+        raise ValueError(f"{width} numbers are needed")
+    if not all(map(math.isfinite, values)):
+        raise ValueError("a number is not finite")
     return values
 
 
-def _table(lines: list[bytes], dtype: Any, columns: tuple[int, ...] | None) -> npt.NDArray[Any] | None:
-    try:
-        text = [line.decode("ascii") for line in lines]
-        return np.loadtxt(text, dtype=dtype, comments=None, usecols=columns, ndmin=2)
-    except (ValueError, OverflowError):
-        return None
+def _corners(text: bytes, n_vertices: int, n_uv: int) -> tuple[list[int], list[int]]:
+    """Indices from 1 of a face's vertices, and of its texture coordinates (0: none). ValueError.
+
+    Negative ones count back from what precedes the face in the file, `n_vertices` and `n_uv`.
+    """
+    shape = _INTEGER.sub(b"0", b" ".join(text.split()))
+    if not _CORNERS.fullmatch(shape) or shape.count(b" ") < 2:
+        raise ValueError("a face needs 3 or more corners, all alike")
+    indices = list(map(int, text.replace(b"/", b" ").split()))
+    each = len(indices) // (shape.count(b" ") + 1)
+    v = _from_first(indices[::each], n_vertices)
+    return v, _from_first(indices[1::each], n_uv) if b"0/0" in shape else [0] * len(v)
 
 
-def _triangles(
-    path: Path, first_line: int, lines: list[bytes], rows: list[int], seen_v: I64, seen_t: I64
-) -> tuple[I64, I64, I64]:
-    """Faces (F, 3), texture faces (F, 3) and, for each face line and the end, its first triangle."""
-    if not rows:
-        return np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64), np.zeros(1, np.int64)
-    corners = [_SPACES.sub(b" ", lines[r].strip()[2:].strip()) for r in rows]
-    shapes = _INTEGER.sub(b"0", b"\n".join(corners)).split(b"\n")
-    first_seen: dict[bytes, int] = {}
-    kind = np.array([first_seen.setdefault(shape, len(first_seen)) for shape in shapes])
-    n_corners = np.empty(len(rows), np.int64)
-    for number, shape in enumerate(first_seen):
-        if not _CORNERS.fullmatch(shape) or shape.count(b" ") < 2:
-            bad = int(np.argmax(kind == number))
-            raise _bad_line(
-                path, first_line + rows[bad], lines[rows[bad]], "a face needs 3 or more corners, all alike"
-            )
-        n_corners[kind == number] = shape.count(b" ") + 1
-
-    first_face = np.concatenate([[0], np.cumsum(n_corners - 2)])
-    faces = np.empty((first_face[-1], 3), np.int64)
-    uv_faces = np.full((first_face[-1], 3), -1, np.int64)
-    for number, shape in enumerate(first_seen):
-        of_kind = np.flatnonzero(kind == number)
-        flat = [corners[k].replace(b"/", b" ") for k in of_kind]
-        table = _table(flat, np.int64, None)
-        if table is None:
-            bad = next(
-                int(k)
-                for k, line in zip(of_kind, flat, strict=True)
-                if _table([line], np.int64, None) is None
-            )
-            raise _bad_line(path, first_line + rows[bad], lines[rows[bad]], "an index is not a number")
-        count = int(n_corners[of_kind[0]])
-        table = table.reshape(len(of_kind), count, -1)
-        v = _absolute(table[:, :, 0], seen_v[of_kind])
-        has_uv = b"0/0" in shape
-        t = _absolute(table[:, :, 1], seen_t[of_kind]) if has_uv else np.full_like(v, -1)
-        low = v.min(axis=1) if not has_uv else np.minimum(v.min(axis=1), t.min(axis=1))
-        if low.min() < 0:
-            bad = rows[int(of_kind[np.argmin(low)])]
-            raise _bad_line(path, first_line + bad, lines[bad], "an index is out of range")
-        for fan in range(count - 2):
-            where = first_face[of_kind] + fan
-            faces[where] = v[:, [0, fan + 1, fan + 2]]
-            uv_faces[where] = t[:, [0, fan + 1, fan + 2]]
-    return faces, uv_faces, first_face
-
-
-def _absolute(index: I64, seen: I64) -> I64:
-    """OBJ indices (1 = first, -1 = last so far) as indices from 0; -1 where there is no such element."""
-    absolute = np.where(index > 0, index - 1, seen[:, None] + index)
-    return np.where((index == 0) | (absolute < 0), -1, absolute)
+def _from_first(indices: list[int], seen: int) -> list[int]:
+    if min(indices) < 0:
+        indices = [seen + 1 + index if index < 0 else index for index in indices]
+    if not 0 < min(indices) <= max(indices) <= MAX_LINES:
+        raise ValueError("an index is out of range")
+    return indices
 
 
 def _check_indices(path: Path, mesh: ObjMesh) -> None:
@@ -266,8 +175,3 @@ def _check_indices(path: Path, mesh: ObjMesh) -> None:
                 f"refers to {what} {int(high.max()) + 1} of {count}",
                 "Export the mesh again; it may be cut off",
             )
-
-
-def _bad_line(path: Path, number: int, line: bytes, problem: str) -> InputError:
-    shown = line[:60].decode("utf-8", "replace").strip()
-    return InputError(path, f"line {number}", f"{problem}: {shown!r}", "Export the mesh again as text OBJ")

@@ -12,16 +12,16 @@ from datagen.schemas.identity import digest_of
 from datagen.workers.objects.convex import fits_gripper
 from datagen.workers.objects.exclusions import reason_to_exclude
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.objects.scan import READER_VERSION, Scan, load_scan
+from datagen.workers.objects.scan import READER_VERSION, Scan, load_scan, volumes_m3
 from datagen.workers.objects.ycb_layouts import Entry, read_layout
 
 
 class YcbObjects:
     """The credible objects of one folder (see `ycb_layouts` for the layouts).
 
-    Opening it hashes and reads every object once, so that broken or unbelievable data shows before
-    a job starts; what was read is cached by content, and later openings take a fraction of a
-    second. Masses above 50 kg are refused by the index's schema.
+    Opening it hashes every object, and reads each content once, so that broken or unbelievable data
+    shows before a job starts; what was read is cached, and later openings take a fraction of a second.
+    Masses above 50 kg are refused by the index's schema.
     """
 
     kind = "ycb"
@@ -32,8 +32,8 @@ class YcbObjects:
         excluded: dict[str, str] = {}
         self._entries: dict[str, tuple[Entry, float]] = {}
         self._models: dict[str, ObjectModel] = {}
-        for entry in entries:
-            volume_m3 = load_scan(entry.files).parts.volume_m3
+        volumes = volumes_m3([entry.files for entry in entries])
+        for entry, volume_m3 in zip(entries, volumes, strict=True):
             measured = entry.mass_kg is not None
             mass_kg = entry.density_kg_m3 * volume_m3 if entry.mass_kg is None else entry.mass_kg
             reason = reason_to_exclude(entry.name, mass_kg, volume_m3, measured)

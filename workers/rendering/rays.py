@@ -71,13 +71,13 @@ def object_rays(model: ObjectModel) -> RayMesh:
     return ray_mesh(model.visual)
 
 
-def nearest(rays: RayMesh, origins_m: F32, directions: F32, limits: F32 | None = None) -> F32:
+def nearest(rays: RayMesh, origins_m: F32, directions: F32) -> F32:
     """Ray parameter (N,) of the first hit: hit = origin + parameter * direction; MISS where none.
 
     Directions need not be unit vectors, so a parameter means the same in every rigid frame.
     """
-    distances: F32 = rays.hierarchy.run(origins_m, directions, limits, query="DISTANCE")
-    return np.where(distances >= (MISS if limits is None else limits), MISS, distances)
+    distances: F32 = rays.hierarchy.run(origins_m, directions, query="DISTANCE")
+    return np.where(distances >= MISS, MISS, distances)
 
 
 def occluded(rays: RayMesh, origins_m: F32, directions: F32, limits: F32) -> npt.NDArray[np.bool_]:

@@ -1,12 +1,17 @@
 """Convex parts of links: hulls of collision meshes, reduced outwards to a few corners."""
 
+# coal fills itself at import time, which type checkers do not see.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import io
 import itertools
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+import coal
 import numpy as np
 import numpy.typing as npt
 import trimesh
@@ -128,6 +133,13 @@ def hull_faces(corners_m: F32) -> tuple[I32, F64]:
     inward = np.einsum("fi,fi->f", np.cross(b - a, c - a), normals) < 0
     faces[inward] = faces[inward][:, ::-1]
     return faces, normals
+
+
+def polyhedron(corners_m: F32 | F64) -> Any:
+    """The solid convex hull of corners (V, 3) that span a volume, as coal's shape."""
+    points = coal.StdVec_Vec3s()
+    points.extend(list(np.asarray(corners_m, np.float64)))
+    return coal.ConvexBase.convexHull(points, False, "")
 
 
 def _outside(points: F64, hull: ConvexHull) -> F64:

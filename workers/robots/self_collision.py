@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.robots.polyhedron import polyhedron
+from datagen.workers.robots.hulls import polyhedron
 from datagen.workers.robots.robot import Parts
 
 # Its binary modules have no types.

@@ -78,6 +78,8 @@ def _try_scene(
     with clock.stage("draw"):
         rng = generator(spec.seed, Stream.CANDIDATES, index, retry)
         candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng)
+        if candidates is None:
+            raise Redraw("no_base")
 
     with clock.stage("observe"):
         rays = world.ray_scene(house, names, settled.T_world_object)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import pickle
 import signal
-import zipfile
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors import safe_open
 
 from datagen.schemas.errors import InputError
 from datagen.train.dataset import DataOrigin
 from datagen.train.models import build_model
 from datagen.train.training.checkpoints import (
+    MAX_BYTES,
     Checkpoint,
     CheckpointHead,
     EpochRecord,
@@ -29,7 +32,7 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.torch_file_check import MAX_BYTES
+from tests.train.prediction.checkpoints import document_of, signed, stored_with
 from tests.train.training.small import TINY, equal
 
 ORIGIN: DataOrigin = {
@@ -82,10 +85,10 @@ def test_what_is_written_is_read(tmp_path: Path):
     assert len(head.digest) == 64
 
 
-def test_torch_alone_reads_it(written: Path):
-    stored = torch.load(written, weights_only=True)
-    assert json.loads(stored["head"])["format"] == "datagen checkpoint"
-    assert isinstance(stored["weights/token.0.weight"], torch.Tensor)
+def test_safetensors_alone_reads_it(written: Path):
+    with safe_open(written, "pt") as stored:
+        assert json.loads(stored.metadata()["head"])["format"] == "datagen checkpoint"
+        assert stored.get_tensor("weights/token.0.weight").dtype == torch.float32
 
 
 def test_loading_draws_nothing_from_the_global_generator(written: Path):
@@ -124,97 +127,70 @@ def test_a_changed_byte_is_noticed_or_changes_nothing(written: Path, data: st.Da
     assert equal(back.resume, whole.resume)
 
 
-class Attack:
-    """Unpickling it would leave a file."""
-
-    def __init__(self, canary: Path) -> None:
-        self._canary = canary
-
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        return os.mkdir, (str(self._canary),)
-
-
-def with_pickle(path: Path, source: Path, new: Callable[[bytes], bytes]) -> Path:
-    """The checkpoint with another pickle in it; every checksum is right."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(path, "w") as out:
-        for record in old.infolist():
-            data = old.read(record)
-            out.writestr(record.filename, new(data) if record.filename.endswith("data.pkl") else data)
+def with_header(path: Path, source: Path, changed: Callable[[dict[str, Any]], None]) -> Path:
+    """The checkpoint with another header, signed anew."""
+    data = source.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end])
+    stated = json.loads(header["__metadata__"]["head"])["sha256"]
+    changed(header)
+    text = json.dumps(header).replace(stated, "0" * 64).encode()
+    unsigned = struct.pack("<Q", len(text)) + text + data[end:]
+    path.write_bytes(unsigned.replace(b"0" * 64, hashlib.sha256(unsigned).hexdigest().encode(), 1))
     return path
 
 
-def test_foreign_pickles_are_never_run(written: Path, tmp_path: Path):
-    canary = tmp_path / "canary"
-    attack = pickle.dumps({"head": Attack(canary)}, protocol=2)
-    bare, inside, torch_made = tmp_path / "bare", tmp_path / "inside", tmp_path / "torch"
-    bare.write_bytes(attack)
-    with_pickle(inside, written, lambda _: attack)
-    torch.save({"head": Attack(canary)}, torch_made)
-    for path in (bare, inside, torch_made):
-        with pytest.raises(InputError, match="checkpoint") as error:
-            load_model(path)
-        assert "\n" not in str(error.value)
-    assert not canary.exists()
-    torch.load(torch_made, weights_only=False)  # the attack is one
-    assert canary.exists()
-
-
 def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path):
-    """Some releases of torch believe a pickle that a record is larger than it is, and read beyond it."""
-    (n,) = torch.load(written, weights_only=True)["weights/token.1.bias"].shape
-    assert n == TINY["width"]
+    """Also in a file whose checksum is right."""
+    name = "weights/token.1.bias"
+    assert read_checkpoint(with_header(tmp_path / "same", written, lambda _: None)).head
 
-    def larger(data: bytes) -> bytes:
-        # BININT1 n, as count of a storage and as shape; the first is that of a storage of n floats.
-        at = data.index(b"K\x04t")
-        return data[: at + 1] + b"\x40" + data[at + 2 :]
-
-    path = with_pickle(tmp_path / "larger.ckpt", written, larger)
-    with pytest.raises(InputError, match="of another size"):
-        read_checkpoint(path)
-    for word in (b"\x8c\x01a", b"c__builtin__\neval\n", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f"):
-        path = with_pickle(tmp_path / "odd.ckpt", written, lambda data, w=word: data[:2] + w + data[2:])
-        with pytest.raises(InputError, match="not a checkpoint"):
+    changes: list[dict[str, Any]] = [
+        {"shape": [2**62]}, {"shape": [2**62, 2**62]}, {"shape": [-1]}, {"shape": []}, {"shape": [4.0]},
+        {"shape": [1] * 1_000_000}, {"dtype": "F64"}, {"dtype": "I32"}, {"dtype": 3}, {"dtype": []},
+        {"data_offsets": [0, 2**60]}, {"data_offsets": [2**60, 2**60 + 16]}, {"data_offsets": [-16, 0]},
+        {"data_offsets": [0, 16]},  # those of another tensor
+    ]  # fmt: skip
+    for change in changes:
+        path = with_header(tmp_path / "odd", written, lambda header, c=change: header[name].update(c))
+        with pytest.raises(InputError, match="not a checkpoint of this program, or damaged") as error:
+            read_checkpoint(path)
+        assert "\n" not in str(error.value) and len(str(error.value)) < 600
+    for header in (b"[]", b"3", b'"x"', b"{}", b'{"__metadata__": 3}', b"[" * 100_000, b"\xff\xfe"):
+        path.write_bytes(struct.pack("<Q", len(header)) + header)
+        with pytest.raises(InputError, match="not a checkpoint of this program, or damaged"):
             read_checkpoint(path)
 
 
-def test_a_shape_without_end_is_refused(written: Path, tmp_path: Path):
-    """Its strides are products over the shape, so that a million axes would take hours."""
-    axes = b"K\x01" * 1_000_000
-
-    def longer(data: bytes) -> bytes:
-        at = data.index(b"K\x04\x85")  # BININT1 n, TUPLE1: the shape of a bias
-        return data[:at] + b"(" + axes + b"t" + data[at + 3 :]
-
-    with pytest.raises(InputError, match="a tensor of no shape"):
-        read_checkpoint(with_pickle(tmp_path / "long.ckpt", written, longer))
-
-
-def test_bombs_are_refused_by_their_sizes(written: Path, tmp_path: Path):
-    packed = tmp_path / "packed.ckpt"
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as out:
-        out.writestr("archive/data.pkl", b"\0" * 10_000_000)
-    with pytest.raises(InputError, match="is compressed"):
-        read_checkpoint(packed)
+def test_files_are_refused_by_their_sizes(written: Path, tmp_path: Path):
     sparse = tmp_path / "sparse.ckpt"
     with open(sparse, "wb") as file:
         file.truncate(MAX_BYTES + 1)
     with pytest.raises(InputError, match="more than the"):
         read_checkpoint(sparse)
+    for length in (2**40, 2**63, 2**25 + 1):
+        sparse.write_bytes(struct.pack("<Q", length) + written.read_bytes()[8:])
+        with pytest.raises(InputError, match="no header of a safetensors file"):
+            read_checkpoint(sparse)
 
 
 def test_what_is_no_checkpoint_is_named(tmp_path: Path):
     model = build_model("shared", TINY).state_dict()
     plain, listed, newer = tmp_path / "plain.pt", tmp_path / "list.pt", tmp_path / "newer.ckpt"
+    foreign, zeros = tmp_path / "foreign.safetensors", tmp_path / "zeros"
     torch.save(model, plain)
     torch.save([1, 2], listed)
-    torch.save({"head": json.dumps({"format": "datagen checkpoint", "format_version": 2})}, newer)
+    signed(newer, {}, {"format": "datagen checkpoint", "format_version": 3})
+    safetensors.torch.save_file(model, foreign)
+    zeros.write_bytes(bytes(100))
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     cases = [
         (plain, "not a datagen checkpoint"),
         (listed, "not a datagen checkpoint"),
-        (newer, "format_version: 2, and this program reads 1. Use the version"),
+        (foreign, "not a datagen checkpoint"),
+        (zeros, "not a datagen checkpoint"),
+        (newer, "format_version: is 3, but this program reads 1 and 2. Use the version"),
         (tmp_path, "not a file"),
         (fifo, "not a file"),
         (tmp_path / "none", "No such file"),
@@ -250,19 +226,13 @@ def test_weights_that_do_not_fit_are_named(tmp_path: Path):
             load_model(tmp_path / "c.ckpt")
 
 
-def stored_with(path: Path, source: Path, **changes: Any) -> Path:
-    """The checkpoint with other entries, as torch alone writes it."""
-    torch.save({**torch.load(source, weights_only=True), **changes}, path)
-    return path
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_numbers_that_are_not_finite_are_refused(written: Path, tmp_path: Path, value: float):
     name = "token.1.bias"
-    bias = torch.load(written, weights_only=True)[f"weights/{name}"]
+    bias = safetensors.torch.load_file(written)[f"weights/{name}"]
     bias[-1] = value
     for key in (f"weights/{name}", "weights/token.1.running_var", f"resume/{name}"):
-        path = stored_with(tmp_path / "bad.ckpt", written, **{key: bias})
+        path = stored_with(tmp_path / "bad.ckpt", written, {key: bias})
         with pytest.raises(InputError, match=f"{key}: holds NaN or infinite numbers"):
             load_model(path)
     whole = read_checkpoint(written)
@@ -277,7 +247,7 @@ def test_numbers_that_are_not_finite_are_refused(written: Path, tmp_path: Path, 
 
 
 def test_every_text_and_number_of_the_document_is_checked(written: Path, tmp_path: Path):
-    document = json.loads(torch.load(written, weights_only=True)["head"])
+    document = document_of(written)
     texts = ["\ud800", "a\0b", "a\nb", "\x1b[31m", "a" * 5000]
     numbers: list[Any] = [float("nan"), float("inf"), 10**400, -(10**20)]
     changes: list[tuple[str, str, Any]] = [("head", "stage", value) for value in texts]
@@ -287,11 +257,11 @@ def test_every_text_and_number_of_the_document_is_checked(written: Path, tmp_pat
     changes += [("head", "options", {"deep": [[{"lr": value}]]}) for value in numbers]
     changes += [("loop", "sums", [value, 0.0, 0.0, 0.0]) for value in numbers]
     for part, field, value in changes:
-        text = json.dumps({**document, part: {**document[part], field: value}})
+        changed = {part: {**document[part], field: value}}
         with pytest.raises(
             InputError, match=r"not a usable number|control characters or surrogates"
         ) as error:
-            read_checkpoint(stored_with(tmp_path / "odd.ckpt", written, head=text))
+            read_checkpoint(stored_with(tmp_path / "odd.ckpt", written, **changed))
         assert f"{part}.{field}" in error.value.field
         str(error.value).encode()
 

@@ -13,5 +13,5 @@ import datagen.workers.grasps.grasp_cache
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A fresh cache folder, and nothing in memory."""
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "cache"))
-    datagen.workers.grasps.grasp_cache.forget()
+    datagen.workers.grasps.grasp_cache._kept.clear()
     return tmp_path / "cache"

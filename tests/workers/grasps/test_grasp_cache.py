@@ -14,8 +14,9 @@ import pytest
 
 from datagen.schemas.specification import GraspParams
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.grasps import keep
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import content_digest, forget, grasps_of, scored_grasps
+from datagen.workers.grasps.grasp_cache import content_digest, grasps_of, scored_grasps
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
 from datagen.workers.grasps.search import TABLE_GAP_M
 from datagen.workers.objects.model import ObjectModel
@@ -169,7 +170,7 @@ def test_bit_equal_across_processes_and_order(tmp_path: Path) -> None:
 def test_what_is_kept_is_what_was_found(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = box_model("box", (0.05, 0.04, 0.1))
     first = grasps_of(box, GRIPPER, FEW)
-    forget()
+    grasp_cache._kept.clear()
     monkeypatch.setattr(
         "datagen.workers.grasps.grasp_cache.search_grasps", lambda *_: pytest.fail("searched again")
     )
@@ -205,7 +206,7 @@ def test_broken_and_foreign_files_are_worked_out_again(own_cache: Path) -> None:
         with_changed(counts=np.array(["x"])),
     ):
         file.write_bytes(bad)
-        forget()
+        keep._kept.clear()
         assert same(first, grasps_of(box, GRIPPER, SIX))
         assert file.read_bytes() == good or len(file.read_bytes()) == len(good)
 
@@ -217,5 +218,5 @@ def test_a_cache_that_cannot_be_written_changes_nothing(
     first = grasps_of(box, GRIPPER, SIX)
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file"))
-    forget()
+    keep._kept.clear()
     assert same(first, grasps_of(box, GRIPPER, SIX))

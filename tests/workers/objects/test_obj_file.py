@@ -17,7 +17,7 @@ from datagen.workers.objects.obj_file import read_obj
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    """Any mixture of corner styles, polygons, negative indices, groups, comments and block sizes."""
+    """Any mixture of corner styles, polygons, negative indices, groups and comments."""
     path = tmp_path_factory.mktemp("obj") / "mesh.obj"
     number = st.floats(-1, 1, allow_nan=False).map(lambda x: round(x, 6))
     vertices = data.draw(st.lists(st.tuples(number, number, number), min_size=3, max_size=12))
@@ -46,9 +46,7 @@ def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, data
             expected_uv.append((t[0], t[k], t[k + 1]) if "t" in style else (-1, -1, -1))
     end = data.draw(st.sampled_from(["\n", "\r\n"]))
     path.write_bytes((end.join(lines) + data.draw(st.sampled_from(["", end]))).encode())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(obj_file, "BLOCK_BYTES", data.draw(st.integers(70, 400)))
-        mesh = read_obj(path)
+    mesh = read_obj(path)
     np.testing.assert_array_equal(mesh.faces, expected)
     np.testing.assert_array_equal(mesh.uv_faces, expected_uv)
     np.testing.assert_allclose(mesh.vertices, vertices)
@@ -114,12 +112,11 @@ def test_bad_meshes_name_the_line(case: str, tmp_path: Path) -> None:
 def test_limits_stop_the_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "mesh.obj"
     path.write_text(HEAD + "f 1 2 3\n" * 1000)
-    monkeypatch.setattr(obj_file, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(obj_file, "MAX_LINE_BYTES", 100)
     assert len(read_obj(path).faces) == 1000
     monkeypatch.setattr(obj_file, "MAX_FACES", 999)
     with pytest.raises(InputError, match="more than 999 faces"):
         read_obj(path)
-    # Polygons are more faces than lines: the first glance lets them pass, the reading does not.
     fans = tmp_path / "fans.obj"
     fans.write_text(HEAD + "f 1 2 3 1 2 3\n" * 300)
     with pytest.raises(InputError, match="more than 999 faces"):
