@@ -26,7 +26,7 @@ ENVIRONMENT = ROOT / ".venv"
 STAMP = ENVIRONMENT / "installed.json"
 OLDEST = (3, 11)
 EVERYTHING = ("all", "dev", "docs")
-# It pins a library without wheels from this version on, which nothing imports (docs/development/decisions.md).
+# It pins a library without wheels from this version on that nothing imports (docs/development/decisions.md).
 ALONE, ALONE_FROM = "mani-skill", (3, 13)
 # Seconds between two lines of progress, on a terminal (where each replaces the last) and elsewhere.
 ON_TERMINAL_S, ELSEWHERE_S = 0.5, 15.0

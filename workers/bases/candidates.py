@@ -128,7 +128,7 @@ def _places_within(
     robot_index: npt.NDArray[np.int16],
     rng: np.random.Generator,
 ) -> F32 | None:
-    """A position (N, 2), world, in the required set for the robot in each candidate; None where there are too few.
+    """Positions (N, 2), world, in the required set for each candidate's robot; None where too few exist.
 
     A round visits every cell in random order and uses each at most once; further rounds follow only where one
     does not give enough.

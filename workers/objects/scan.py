@@ -39,7 +39,7 @@ _CACHE = CacheFolder(
     most_files=1024,
     most_bytes=512 * 2**20,
 )
-_VOLUMES = Shelf("volumes", {"volumes_m3": (np.float64, ("scans",))}, most_files=64, most_bytes=2**20)
+_VOLUMES = CacheFolder("volumes", {"volumes_m3": (np.float64, ("scans",))}, most_files=64, most_bytes=2**20)
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def _try_scene(
         rng = generator(spec.seed, Stream.CANDIDATES, index, retry)
         candidates = draw_candidates(target_m, house.obstacles, spec.candidates, rng)
         if candidates is None:
-            raise Redraw("no_base")
+            raise SceneRejected("no_base")
 
     with clock.stage("observe"):
         rays = world.ray_scene(house, names, settled.T_world_object)

@@ -14,7 +14,7 @@ import pytest
 
 from datagen.schemas.specification import GraspParams
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.grasps import keep
+from datagen.workers.grasps import grasp_cache
 from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.grasps.grasp_cache import content_digest, grasps_of, scored_grasps
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
