@@ -214,7 +214,7 @@ def test_what_is_no_checkpoint_is_named(tmp_path: Path):
     cases = [
         (plain, "not a datagen checkpoint"),
         (listed, "not a datagen checkpoint"),
-        (newer, "format_version: 2, and this program reads 1. Use the version"),
+        (newer, "format_version: is 2, but this program reads 1. Use the version"),
         (tmp_path, "not a file"),
         (fifo, "not a file"),
         (tmp_path / "none", "No such file"),
