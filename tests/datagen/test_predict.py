@@ -274,7 +274,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("--frame-dir", "{bad}/crowd", "more than 10,000 files"),
     ("--out", "{bad}/a.jpg", ".png"),
     ("--out", "{bad}/missing/a.png", "folder"),
-    ("--out", "{made}/frame/color.png", "read"),
+    ("--out", "{made}/frame/color.png", "input files"),
     ("--html", "{bad}/a.png", ".html"),
 ]  # fmt: skip
 
