@@ -247,7 +247,7 @@ def test_an_edited_specification_is_noticed(tmp_path: Path):
 def test_runs_of_other_formats_and_versions_are_refused(tmp_path: Path):
     make_run(tmp_path, shards=[])
     edit(tmp_path / "manifest.json", format_version=99)
-    with pytest.raises(InputError, match="format_version: 99, and this program reads 2"):
+    with pytest.raises(InputError, match="format_version: is 99, but this program reads 2"):
         Run.open(tmp_path)
     edit(tmp_path / "manifest.json", format_version=2, schema_version=99)
     with pytest.raises(InputError, match="schema_version"):

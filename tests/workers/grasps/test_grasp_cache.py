@@ -206,7 +206,7 @@ def test_broken_and_foreign_files_are_worked_out_again(own_cache: Path) -> None:
         with_changed(counts=np.array(["x"])),
     ):
         file.write_bytes(bad)
-        keep._kept.clear()
+        grasp_cache._kept.clear()
         assert same(first, grasps_of(box, GRIPPER, SIX))
         assert file.read_bytes() == good or len(file.read_bytes()) == len(good)
 
@@ -218,5 +218,5 @@ def test_a_cache_that_cannot_be_written_changes_nothing(
     first = grasps_of(box, GRIPPER, SIX)
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file"))
-    keep._kept.clear()
+    grasp_cache._kept.clear()
     assert same(first, grasps_of(box, GRIPPER, SIX))
