@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
@@ -68,7 +69,9 @@ class Progress:
     ) -> None:
         self._json, self.clock = as_json, clock
         self._console = console or Console(stderr=True, force_terminal=sys.stderr.isatty())
-        self._live = self._console.is_interactive and not as_json
+        # A notebook shows a bar through ipywidgets; without them it gets lines of text.
+        notebook = self._console.is_jupyter and find_spec("ipywidgets") is not None
+        self._live = (self._console.is_interactive or notebook) and not as_json
         self._every_s = _DRAW_EVERY_S if self._live else _LINE_EVERY_S
         self._next_s = clock() + (0.0 if self._live else self._every_s)
         self._state: tuple[str, int, int, Figures] | None = None  # not shown yet
