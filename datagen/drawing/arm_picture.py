@@ -157,6 +157,7 @@ def _candidates(samples: Columns) -> list[tuple[str, str]]:
             "H",
             f"calls {int(called.sum())} good, {int((called & label).sum())} are; misses {missed} of {good}",
         ),
+        *((head, _described(samples, row)) for head, (row, _) in zip(_PICKS, _picked(samples), strict=True)),
     ]
 
 
