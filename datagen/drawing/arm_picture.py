@@ -92,7 +92,7 @@ def _draw_maps(
     xy = np.asarray(samples["base_xy_m"], np.float64)
     half_m = float(np.abs(xy - centre[:2]).max()) + 0.12
     draw_plan(outcome_ax, recalled, half_m, faded=True)
-    draw_plan(score_ax, recalled, half_m)
+    seen = draw_plan(score_ax, recalled, half_m)
     handles = draw_outcomes(outcome_ax, xy, samples["outcome"], samples["base_is_clear"])
     scale = draw_scores(score_ax, xy, samples["heuristic_score"], tau)
     figure.colorbar(scale, ax=[outcome_ax, score_ax], shrink=0.8, label=f"H (good from {tau:.2g} on)")
@@ -107,7 +107,7 @@ def _draw_maps(
             draw_pick(axes, xy[row], style)
     outcome_ax.set_title("candidates by outcome")
     score_ax.set_title("candidates by score H")
-    return handles + circles, [style for _, style in marked]
+    return handles + circles, [style for _, style in marked] + seen
 
 
 def _draw_grasps(
@@ -157,6 +157,7 @@ def _candidates(samples: Columns) -> list[tuple[str, str]]:
             "H",
             f"calls {int(called.sum())} good, {int((called & label).sum())} are; misses {missed} of {good}",
         ),
+        *((head, _described(samples, row)) for head, (row, _) in zip(_PICKS, _picked(samples), strict=True)),
     ]
 
 

@@ -38,13 +38,12 @@ _DOT_PT2 = 26
 _SMALL_PT2 = {"out_of_reach": 9, "base_collision": 13}  # what fills most of a grid and says little
 _REACH_COLOUR, _REACH_DASHES = "#1b3a6b", ((5, 3), (1, 1.5), (7, 2, 1, 2), (3, 1))
 _LEGEND_CHARACTERS = 40
-_MARKS = (CAMERA, TARGET, CLUTTER)
 
 Handle = Line2D | Patch
 
 
-def draw_plan(axes: Axes, recalled: RecalledScene, half_m: float, faded: bool = False) -> None:
-    """Draw house, placed objects and camera, in metres, `half_m` to each side of the target.
+def draw_plan(axes: Axes, recalled: RecalledScene, half_m: float, faded: bool = False) -> list[Style]:
+    """Draw house, placed objects and camera, `half_m` to each side of the target; returns what is seen.
 
     `faded` makes the plan pale, so that the colours of candidates are read alone.
     """
@@ -71,6 +70,8 @@ def draw_plan(axes: Axes, recalled: RecalledScene, half_m: float, faded: bool = 
     _draw_camera(axes, recalled)
     axes.set(xlim=(x - half_m, x + half_m), ylim=(y - half_m, y + half_m), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
+    is_near = bool((np.abs(recalled.camera.T_world_camera[:2, 3] - (x, y)) < half_m).all())
+    return [*([CAMERA] if is_near else []), TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
 
 
 def half_width_m(recalled: RecalledScene) -> float:
@@ -159,10 +160,10 @@ def draw_reach(axes: Axes, target_xy_m: F64, radii_m: Sequence[tuple[str, float]
     return legend
 
 
-def draw_legend(axes: Axes, handles: Sequence[Handle], title: str, picks: Sequence[Style]) -> None:
-    """Draw a legend that fills a panel: these handles, the picks and what every plan shows."""
+def draw_legend(axes: Axes, handles: Sequence[Handle], title: str, marks: Sequence[Style]) -> None:
+    """Draw a legend that fills a panel: these handles, and the marks."""
     axes.set_axis_off()
-    handles = [*handles, *(_handle(style, style.words) for style in (*picks, *_MARKS))]
+    handles = [*handles, *(_handle(style, style.words) for style in marks)]
     for handle in handles:
         handle.set_label(textwrap.fill(str(handle.get_label()), _LEGEND_CHARACTERS))
     axes.legend(

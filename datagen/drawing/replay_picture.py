@@ -20,7 +20,7 @@ from datagen.drawing.floor_plan import (
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.identity import Stream, generator
 from datagen.schemas.specification import Specification
-from datagen.schemas.styles import LABEL_STYLES, SAMPLE
+from datagen.schemas.styles import LABEL_STYLES, SAMPLE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
 from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
@@ -36,15 +36,16 @@ def draw_replay(
     figure = new_sheet(f"Scene {report['scene']} of {report['run']} replayed: {verdict}", 8.2)
     panels = figure.subplots(2, 3, width_ratios=(1, 1, 1))
     handles: list[Handle] = []
+    marks: list[Style] = []
     for column, (name, side) in enumerate((("stored", stored), ("replayed", made))):
         recalled, rows = side
         rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
         frame = render_frame(spec.observation, recalled.geometry, recalled.camera, rng)
         draw_frame(panels[0, column], frame.rgb, frame.body == 1, f"{name}: RGB frame")
-        handles = _draw_candidates(panels[1, column], recalled, rows, row)
+        handles, marks = _draw_candidates(panels[1, column], recalled, rows, row)
         panels[1, column].set_title(f"{name}: candidates by label")
     _draw_over(panels[0, 2], stored[0], made[0])
-    draw_legend(panels[1, 2], handles, "base poses", [] if row is None else [SAMPLE])
+    draw_legend(panels[1, 2], handles, "base poses", marks)
     panels[1, 2].text(
         0, 0, "\n".join(_lines(report)), va="bottom", family="monospace", fontsize=9,
         transform=panels[1, 2].transAxes,
@@ -54,14 +55,15 @@ def draw_replay(
 
 def _draw_candidates(
     axes: Axes, recalled: ReconstructedScene, rows: SceneRows, row: int | None
-) -> list[Handle]:
+) -> tuple[list[Handle], list[Style]]:
     xy = np.asarray(rows.samples["base_xy_m"], np.float64)
-    draw_plan(axes, recalled, half_width_m(recalled))
+    marks = draw_plan(axes, recalled, half_width_m(recalled))
     label, clear = (np.asarray(rows.samples[key]) for key in ("label", "base_is_clear"))
     handles = draw_labels(axes, xy, label, clear)
     if row is not None:
         draw_pick(axes, xy[row], SAMPLE)
-    return handles
+        marks = [SAMPLE, *marks]
+    return handles, marks
 
 
 def _draw_over(axes: Axes, stored: ReconstructedScene, made: ReconstructedScene) -> None:

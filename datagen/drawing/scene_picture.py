@@ -44,8 +44,8 @@ def draw_scene_picture(
     _draw_depth(upper, panels[1, 0], frame)
 
     xy = np.asarray(samples["base_xy_m"], np.float64)
-    for axes in panels[0, 1:]:
-        draw_plan(axes, recalled, half_width_m(recalled))
+    marks = draw_plan(panels[0, 1], recalled, half_width_m(recalled))
+    draw_plan(panels[0, 2], recalled, half_width_m(recalled))
     score, clear = np.asarray(samples["heuristic_score"]), np.asarray(samples["base_is_clear"])
     legend = draw_labels(panels[0, 1], xy, np.asarray(samples["label"]), clear)
     panels[0, 1].set_title("candidates by label")
@@ -58,7 +58,7 @@ def draw_scene_picture(
 
     panels[1, 1].remove()
     _draw_cloud(upper.add_subplot(2, 3, 5, projection="3d"), record)
-    draw_legend(panels[1, 2], legend, "base poses", [BEST_BY_SCORE] if best is not None else [])
+    draw_legend(panels[1, 2], legend, "base poses", marks if best is None else [BEST_BY_SCORE, *marks])
     columns = lower.subplots(1, 2)
     write_facts(columns[0], _scene(recalled, record))
     write_facts(columns[1], _candidates(samples))

@@ -137,6 +137,11 @@ def _check_page(text: str, n_sets: int) -> None:
         ET.fromstring(picture)
     assert not {"script", "link", "iframe", "img"} & set(page.tags)
     assert page.addresses and all(a.startswith(("#", "data:")) for a in page.addresses)
+    assert '<html lang="en">' in text and 'name="viewport"' in text and "prefers-color-scheme: dark" in text
+    assert "<title>Evaluation of base placement</title>" in text
+    assert (
+        text.count("<table") == text.count('<div class="scroll" tabindex="0"><table') > 0
+    )  # scroll on phones
     for words in ("84.1", "94.7", "arXiv:2509.11594", "Table II:", "Table III:", "two-stage", "sha256"):
         assert words in text, words
 

@@ -70,6 +70,8 @@ def test_an_answer_as_json_picture_and_page(
         pixels = np.asarray(image.convert("RGB")).astype(np.int64)
     assert (np.abs(pixels - (255, 196, 0)).max(axis=2) < 8).sum() > 200  # the gold pose
     text = page.read_text()
+    for words in ('<html lang="en">', 'name="viewport"', "<title>Base poses scored by", "color-scheme: dark"):
+        assert words in text
     assert "Plotly.newPlot" in text and "score 0." in text and 'src="http' not in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
 

@@ -26,7 +26,7 @@ _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}
 _ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9}
 _SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3}  # of a cell's side
 _BASE_RADIUS_M = CandidateParams().base_radius_m
-_MOST_POINTS = 10_000
+_MOST_POINTS = 3_000
 
 
 def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:

@@ -1,0 +1,46 @@
+"""Write frames of test scenes as folders for `datagen predict --frame`, such as those of the documents.
+
+    python -m benchmarks.write_frames FOLDER --houses procthor:DIR --objects ycb:DIR [--scenes 3] [--seed 77]
+
+Each scene is drawn in a house of the test split and rendered with stereo noise. The camera's height, for
+`--camera-height`, is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from datagen.schemas.cost import StageClock
+from datagen.schemas.specification import Source, Specification
+from datagen.workers.houses import open_houses
+from datagen.workers.objects import open_objects
+from datagen.workers.rendering.embree_renderer import render_rays
+from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.world import assemble_world
+from tests.train.prediction.seen_scenes import Seen, write_frame
+
+
+def main() -> None:
+    """Draw the scenes and write their frames."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--houses", default="builtin")
+    parser.add_argument("--objects", default="builtin")
+    parser.add_argument("--scenes", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=77)
+    options = parser.parse_args()
+    opened = open_houses(options.houses), open_objects(options.objects)
+    house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
+    spec = Specification(seed=options.seed, split="test", houses=house, objects=thing)
+    world = assemble_world(spec, *opened, options.houses, options.objects)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    for index in range(options.scenes):
+        scene, _ = generate_scene(world, index, StageClock())
+        seen = Seen(scene, render_rays(scene.rays, scene.camera)).noisy()
+        place = write_frame(options.folder / f"frame{index}", seen, posed=False)
+        print(f"{place}  camera height {seen.height_m:.3f} m")
+
+
+if __name__ == "__main__":
+    main()
