@@ -1,6 +1,6 @@
 """Labelled robot base poses: make them, read them, train on them, and use the model on a robot.
 
-This is the Python front door; docs/python.md describes it, and the command line calls the same functions.
+This is the Python front door (docs/reference/python.md); the command line calls the same functions.
 Importing it is cheap: each name is loaded when it is first used.
 """
 
@@ -70,9 +70,21 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     for home, names in _HOMES.items():
         if name in names:
-            value = globals()[name] = getattr(import_module(home), name)
+            value = globals()[name] = getattr(_loaded(home), name)
             return value
     raise AttributeError(f"module 'datagen' has no attribute {name!r}. It offers: {', '.join(__all__)}")
+
+
+def _loaded(home: str) -> Any:
+    """The module; InputError names the extra of a library that is not installed."""
+    try:
+        return import_module(home)
+    except ModuleNotFoundError as error:
+        from datagen.workers.extras import missing_library
+
+        if (missing := missing_library(error)) is None:
+            raise
+        raise missing from None
 
 
 def __dir__() -> list[str]:

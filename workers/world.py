@@ -12,7 +12,7 @@ import numpy as np
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.clearance import Obstacles, obstacles_of
-from datagen.workers.content_cache import Shelf
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.houses import ids_of_split, open_houses
 from datagen.workers.houses.house import House, HouseSource
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Houses are drawn at random, so few are seen twice in a row; this bounds a worker's memory.
 _HOUSES_KEPT = 16
-_TARGETS = Shelf("targets", {"names": (np.str_, ("objects",))}, most_files=64, most_bytes=2**20)
+_TARGETS = CacheFolder("targets", {"names": (np.str_, ("objects",))}, most_files=64, most_bytes=2**20)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from datagen.schemas.styles import (
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import convex_hull
 from datagen.workers.houses.house import StaticBody
-from datagen.workers.scenes.recall import RecalledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _HEAD_ROOM_M = 1.9  # higher parts, such as the wall over a door, are not drawn
 _KIND_EDGE = {"wall": "#303030", "furniture": "#6b5b4a", "small": "#8a6fb0"}
@@ -42,7 +42,7 @@ _LEGEND_CHARACTERS = 40
 Handle = Line2D | Patch
 
 
-def draw_plan(axes: Axes, recalled: RecalledScene, half_m: float, faded: bool = False) -> list[Style]:
+def draw_plan(axes: Axes, recalled: ReconstructedScene, half_m: float, faded: bool = False) -> list[Style]:
     """Draw house, placed objects and camera, `half_m` to each side of the target; returns what is seen.
 
     `faded` makes the plan pale, so that the colours of candidates are read alone.
@@ -74,13 +74,13 @@ def draw_plan(axes: Axes, recalled: RecalledScene, half_m: float, faded: bool = 
     return [*([CAMERA] if is_near else []), TARGET, *([CLUTTER] if len(recalled.models) > 1 else [])]
 
 
-def half_width_m(recalled: RecalledScene) -> float:
+def half_width_m(recalled: ReconstructedScene) -> float:
     """Half the side of a plan that shows the camera, and candidates as far as they are usually drawn."""
     gap = np.abs(recalled.camera.T_world_camera[:2, 3] - recalled.target_center_m[:2]).max()
     return max(1.35, float(gap) + 0.3)
 
 
-def object_outlines(recalled: RecalledScene) -> list[F64]:
+def object_outlines(recalled: ReconstructedScene) -> list[F64]:
     """Outlines (K, 2) of the placed objects seen from above, world; the first is the target."""
     outlines = []
     for model, T in zip(recalled.models, recalled.T_world_object, strict=True):
@@ -172,7 +172,7 @@ def draw_legend(axes: Axes, handles: Sequence[Handle], title: str, marks: Sequen
     )  # fmt: skip
 
 
-def _draw_camera(axes: Axes, recalled: RecalledScene) -> None:
+def _draw_camera(axes: Axes, recalled: ReconstructedScene) -> None:
     """The observation camera and its horizontal field of view."""
     camera = recalled.camera
     eye = camera.T_world_camera[:2, 3]

@@ -43,7 +43,7 @@ def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: 
     fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
     for run in runs:
         if not allow_seen_houses and any(spec.hash() in fitted_to for spec in run.specs):
-            problem = f"was fitted on the labels of {run.run}"
+            problem = f"was fitted on the labels of {run.place}"
             raise InputError(path, "heuristic", problem, "Calibrate on runs of another split")
     try:
         return HeuristicParams.model_validate(section)

@@ -139,4 +139,4 @@ def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[Evaluat
                 problem = f"{shared[0]!r} and {len(shared) - 1} more: {who} was trained on them"
                 if len(shared) == 1:
                     problem = f"{shared[0]!r}: {who} was trained on it"
-                raise InputError(run.run, "house_id", problem, mend)
+                raise InputError(run.place, "house_id", problem, mend)

@@ -15,7 +15,7 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.tables.stored_fields import fields_of, refuse_no_path, refuse_unknown
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
-from datagen.train.run_parts import Part, open_parts, refuse_twins
+from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 from datagen.workers.houses.split import split_of
 
 Array = npt.NDArray[Any]
@@ -24,7 +24,9 @@ Array = npt.NDArray[Any]
 class _Rows:
     """One shard's columns by the names of the table, a row a candidate."""
 
-    def __init__(self, part: Part, shard: ShardPlace, columns: Columns, scene: npt.NDArray[np.int64]) -> None:
+    def __init__(
+        self, part: RunPart, shard: ShardPlace, columns: Columns, scene: npt.NDArray[np.int64]
+    ) -> None:
         self._part, self._shard, self._columns, self._scene = part, shard, columns, scene
 
     def __len__(self) -> int:
@@ -105,7 +107,7 @@ def candidates(
     Args:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
         columns: Columns to read: any of the default ones, `sample_id`, and every array of one number or
-            text a scene or candidate in docs/data-format.md. Fewer columns are faster.
+            text a scene or candidate in docs/reference/data-format.md. Fewer columns are faster.
         allow_incomplete: Read runs that lack a part of their labels, instead of failing.
 
     Raises:
@@ -127,7 +129,7 @@ def candidates(
     refuse_unknown(columns or (), valid, "candidates")
     names = list(columns) if columns is not None else [name for name in _DEFAULT if name in valid]
     gathered: dict[str, list[Array]] = {name: [] for name in names}
-    opened: list[Part] = []
+    opened: list[RunPart] = []
     for path, of_path in zip(paths, fields, strict=True):
         there = [name for name in names if name in _valid(of_path)]
         needed = [n for name in there for n in (_DERIVED[name][0] if name in _DERIVED else (name,))]

@@ -15,7 +15,7 @@ from datagen.schemas.description import cf_attributes, described
 from datagen.schemas.fields import Table
 from datagen.schemas.shard_reading import ShardPlace, StoredArray
 from datagen.tables.stored_fields import fields_of, refuse_no_path, refuse_unknown
-from datagen.train.run_parts import Part, open_parts, refuse_twins
+from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 
 _Shard = tuple[ShardPlace, StoredArray]
 # Scene and sample dimension of the stores; samples are candidates to those who use them.
@@ -75,7 +75,7 @@ def _variable(shards: Sequence[_Shard], table: Table, field: Any) -> xarray.Vari
     return xarray.Variable((_DIMS[table], *array.dims[1:]), lazy, attributes)
 
 
-def _rows(parts: Sequence[Part]) -> dict[str, xarray.Variable]:
+def _rows(parts: Sequence[RunPart]) -> dict[str, xarray.Variable]:
     """Which scene each candidate belongs to, and which path each scene; known without reading."""
     rows, runs, first = [np.zeros(0, np.int64)], list[str](), 0
     for part in parts:
