@@ -29,5 +29,6 @@ PHASES = {
 
 
 def without_phases(told: str) -> list[str]:
-    """The lines on standard error but for those that name a phase of the work when it begins."""
-    return [line for line in told.splitlines() if line not in PHASES]
+    """The lines on standard error, but for those that name a phase as it begins or the built-in houses."""
+    lines = [line for line in told.splitlines() if line not in PHASES]
+    return [line for line in lines if not line.startswith("Using built-in houses.")]

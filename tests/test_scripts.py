@@ -75,7 +75,7 @@ def test_every_dependency_is_pinned() -> None:
 def test_errors_and_the_doctor_know_the_extras_of_the_package() -> None:
     assert project()["name"] == DISTRIBUTION
     extras = project()["optional-dependencies"]
-    assert extras.keys() - {"all", "dev"} == EXTRAS.keys()
+    assert extras.keys() - {"all", "dev", "docs"} == EXTRAS.keys()
     for name, extra in EXTRAS.items():
         asked = [line for line in extras[name] if ">= '3.13'" not in line]
         assert names_of(asked) == set(extra.brings.values()), name
@@ -106,10 +106,10 @@ def test_an_environment_that_has_the_extras_is_left_alone(
     environment = load("environment")
     monkeypatch.setattr(environment, "STAMP", tmp_path / "stamp")
     monkeypatch.setattr(environment, "create", lambda: pytest.fail("made anew"))
-    stamp = {"fingerprint": environment.fingerprint(), "extras": ["all", "dev"]}
+    stamp = {"fingerprint": environment.fingerprint(), "extras": ["all", "dev", "docs"]}
     (tmp_path / "stamp").write_text(json.dumps(stamp))
     assert environment.main([]) == environment.main(["labels"]) == 0
-    assert environment.installed_extras(stamp["fingerprint"]) == {"all", "dev"}
+    assert environment.installed_extras(stamp["fingerprint"]) == {"all", "dev", "docs"}
     for text in ("", "[]", '{"fingerprint": "other", "extras": ["all"]}'):
         (tmp_path / "stamp").write_text(text)
         assert environment.installed_extras(stamp["fingerprint"]) == set()

@@ -11,8 +11,9 @@ from cyclopts import Parameter
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.options import RunPlace
 from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.jobs.job import JobResult, JobRun
+from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import reported
+from datagen.jobs.job_result import JobResult
 from datagen.jobs.options import HERE, JobOptions, absolute_place, refuse_odd_n
 from datagen.jobs.start_job import continue_job, source_words
 from datagen.regeneration.sources import AS_FOUND, Sources

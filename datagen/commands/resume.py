@@ -13,8 +13,9 @@ from typing_extensions import Unpack
 from datagen.console.command_lines import words_of
 from datagen.console.options import RunPlace
 from datagen.console.printing import counted
-from datagen.jobs.job import JobResult, JobRun
+from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import reported
+from datagen.jobs.job_result import JobResult
 from datagen.jobs.options import HERE, JobKeywords, JobOptions, absolute_place
 from datagen.jobs.start_job import continue_job, source_words
 from datagen.regeneration.sources import AS_FOUND, Sources

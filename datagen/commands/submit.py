@@ -20,8 +20,9 @@ from datagen.configuration.stored_scenes import (
 from datagen.console.command_lines import words_of
 from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import detach_job
-from datagen.jobs.job import JobResult, JobRun
+from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import reported
+from datagen.jobs.job_result import JobResult
 from datagen.jobs.options import (
     HERE,
     JobKeywords,

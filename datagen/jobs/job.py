@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.driver import AttemptOrder, drive
@@ -27,8 +26,8 @@ from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import ShardTask
 from datagen.console.command_lines import command_line
-from datagen.console.printing import counted
 from datagen.jobs.job_recorder import JobRecorder
+from datagen.jobs.job_result import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError
@@ -38,47 +37,6 @@ from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import Storage
-
-
-@dataclass(frozen=True, eq=False)
-class JobResult:
-    """What a job did, and what its run holds now. Quarantined shards are those that failed repeatedly."""
-
-    path: str  # the run, as the user wrote it
-    # detached: Ray makes the labels. failed: more shards are quarantined than allowed.
-    end: Literal["complete", "failed", "interrupted", "aborted", "detached"]
-    n: int = 0  # labels wanted
-    made_from: str = ""  # houses, objects and robot
-    labels: int = 0  # made by this job
-    positives: int = 0  # of those
-    shards: int = 0  # that were missing when the job began
-    remaining: int = 0  # of those, still missing
-    quarantined: tuple[int, ...] = ()
-    retries: int = 0
-    start_s: float = 0.0  # until the first shard began
-    elapsed_s: float = 0.0  # from then on
-    store: str = ""  # the sealed store, which zarr and xarray open
-    cause: str = ""  # of an aborted job, and the most frequent one of a failed job
-    resume: tuple[str, ...] = ()  # the words of the command that continues
-
-    @property
-    def complete(self) -> bool:
-        """Whether the run has all labels that were wanted, but for the allowed share in quarantine."""
-        return self.end == "complete"
-
-    @property
-    def exit_code(self) -> int:
-        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
-        return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
-
-
-class JobInterrupted(KeyboardInterrupt):
-    """A job ended because it was asked to; what is committed stays, and `result` says what that is."""
-
-    def __init__(self, result: JobResult) -> None:
-        self.result = result
-        left = counted(result.remaining, "shard")
-        super().__init__(f"{left} left. Resume with: {command_line(result.resume)}")
 
 
 @dataclass(frozen=True, eq=False)

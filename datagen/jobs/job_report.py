@@ -8,7 +8,7 @@ from typing import Any
 
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
-from datagen.jobs.job import JobInterrupted, JobResult
+from datagen.jobs.job_result import JobInterrupted, JobResult
 from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import Storage

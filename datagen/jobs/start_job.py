@@ -10,7 +10,8 @@ from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.command_lines import resumable, words_of
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detach_job, detached_words
-from datagen.jobs.job import JobInterrupted, JobPlan, JobResult, JobRun, run_job
+from datagen.jobs.job import JobPlan, JobRun, run_job
+from datagen.jobs.job_result import JobInterrupted, JobResult
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
 from datagen.regeneration.shards import open_sources
 from datagen.regeneration.sources import AS_FOUND, Sources

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 
 from datagen.cluster.driver import AttemptOrder
 from datagen.cluster.job_totals import JobTotals
-from datagen.cluster.policy import Policy
-from datagen.cluster.retry_policy import ShardFailures
+from datagen.cluster.retry_policy import RetryPolicy, ShardFailures
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Commit, Cost, LedgerEntry
 from datagen.schemas.shard_ranges import ShardRanges
@@ -18,7 +17,7 @@ from datagen.schemas.shard_ranges import ShardRanges
 # How an attempt ends, and the seconds it takes; None never ends by itself.
 Fate = tuple[str, float | None]
 # Gives no job up, however many of its shards are bad.
-LENIENT = Policy(max_quarantined_share=1.0)
+LENIENT = RetryPolicy(max_quarantined_share=1.0)
 
 
 class FakeClock:

@@ -130,7 +130,7 @@ def test_runs_are_calibrated_to_together_and_odd_splits_are_said(
     words = ["calibrate", str(trials), str(other), "--out", str(out), "--candidates", "grid", *QUICK]
     told = json_of(capsys, words)
     assert (told["samples"], told["scenes"]) == (N + 50, 70)
-    assert len(told["warnings"]) == 1 and "split test" in told["warnings"][0]
+    assert len(told["warnings"]) == 1 and "split is test" in told["warnings"][0]
     assert rule_in(out).model_dump() == told["after"]["heuristic"]  # whatever the run's name
     assert "split test" in out.read_text()
     more = ["--split-check", "--out", str(tmp_path / "new.toml")]

@@ -120,7 +120,7 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         assert cli.run(["cancel", str(run)]) == 1
         told = capsys.readouterr()
         (line,) = [line for line in told.err.splitlines() if "has not ended" in line]
-        assert job.id in line and "heard 5 min" in line and f"kill -9 {work.process.pid} on" in line
+        assert job.id in line and "last sign 5 min" in line and f"kill -9 {work.process.pid} on" in line
         assert f"datagen resume {run}" in line and "Resume with" not in told.out
     finally:
         work.process.send_signal(signal.SIGCONT)
@@ -137,7 +137,7 @@ def test_a_job_elsewhere_that_is_silent_is_asked_and_not_waited_for(
     record = record_of(datetime.now(UTC) - timedelta(hours=3), 17, "another-host")
     Jobs(place).begin(record)
     assert cli.run(["cancel", str(tmp_path / "run")]) == 1
-    assert "silent, heard 3 h 0 min ago" in capsys.readouterr().out
+    assert "silent, last sign 3 h 0 min ago" in capsys.readouterr().out
     assert Jobs(place).stop_order(record.id) is not None
 
 

@@ -19,7 +19,7 @@ import datagen
 from datagen import cli
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.attempt_guard import Meter
-from datagen.cluster.task import Product, ShardTask
+from datagen.cluster.task import AttemptResult, ShardTask
 from datagen.jobs import job
 from datagen.sources import Registry
 from tests.small_runs import CONFIG, make_small_run
@@ -149,7 +149,7 @@ def test_an_interrupt_leaves_a_run_that_the_same_call_finishes(
 
     began: list[int] = []
 
-    def interrupted(task: ShardTask, meter: Meter) -> Product:
+    def interrupted(task: ShardTask, meter: Meter) -> AttemptResult:
         began.append(task.shard)
         if len(began) == 1:
             os.kill(os.getpid(), signal.SIGINT)  # as Ctrl-C, or a notebook's stop button

@@ -90,7 +90,7 @@ def test_ids_that_name_nothing_or_more_are_refused(
     refused(["replay", str(source), "../../etc"], capsys, "hexadecimal digits")
     beyond = Run.open(source)
     last = id_of(make_small_run(tmp_path / "longer", N + 3), N)
-    with pytest.raises(InputError, match="no sample"):
+    with pytest.raises(InputError, match="is not a sample"):
         find_sample([beyond], last)
     monkeypatch.setattr("datagen.commands.replay._PREFIX_AT_LEAST", 1)
     with pytest.raises(InputError, match=r"matches several samples .*Give more digits"):
@@ -255,7 +255,7 @@ def test_a_batch_that_breaks_its_schema_keeps_its_traceback_too(
         return {**source.label(*given), "visibility": np.full(PER_SCENE, np.nan, np.float32)}
 
     monkeypatch.setattr(heuristic_source, "HEURISTIC", replace(source, label=broken))
-    with pytest.raises(ShardFailed, match="visibility: NaN") as caught:
+    with pytest.raises(ShardFailed, match="visibility: has NaN") as caught:
         cli.run(["replay", str(given_up), "--shard", "1"])
     assert isinstance(caught.value.__cause__, InputError)
 
@@ -263,7 +263,7 @@ def test_a_batch_that_breaks_its_schema_keeps_its_traceback_too(
 def test_the_command_ends_with_1_and_the_traceback(given_up: Path) -> None:
     code = (
         "import sys; from dataclasses import replace; from datagen import cli;"
-        "from datagen.workers.labels import distance_visibility as d\n"
+        "from datagen.workers.labels import heuristic_source as d\n"
         "def broken(*_): raise ZeroDivisionError('a defect')\n"
         "d.HEURISTIC = replace(d.HEURISTIC, label=broken)\n"
         "sys.exit(cli.run(sys.argv[1:]))"

@@ -190,7 +190,7 @@ def test_show_writes_a_picture_with_the_target_outlined(finished: Path, tmp_path
     picture = tmp_path / "scene.png"
     assert cli.run(["show", str(finished), "--scene", "3", "--out", str(picture)]) == 0
     with Image.open(picture) as image:
-        assert image.format == "PNG" and image.size == (1900, 1100)
+        assert image.format == "PNG" and image.size == (1320, 960)
         pixels = np.asarray(image.convert("RGB")).astype(int)
     frame = pixels[:550, :700]  # the RGB frame is at the top left
     outline = (np.abs(frame - [255, 45, 111]) < 30).all(axis=2)

@@ -89,11 +89,24 @@ def test_runs_that_do_not_fit_the_stage_are_refused(
     out = tmp_path / "c.ckpt"
     learns = "trains on"
     refused(
-        words("stage1", sim_run, out), capsys, str(sim_run), "sim labels", learns, "Train stage2 or sim-only"
+        words("stage1", sim_run, out),
+        capsys,
+        str(sim_run),
+        "label_source: is sim",
+        learns,
+        "Use it for stage2 or sim-only",
     )
-    refused(words("sim-only", heuristic_run, out), capsys, "heuristic labels", learns, "Train stage1")
+    refused(
+        words("sim-only", heuristic_run, out),
+        capsys,
+        "label_source: is heuristic",
+        learns,
+        "Use it for stage1",
+    )
     validation = ("--val", str(heuristic_run))
-    refused(words("sim-only", sim_run, out, *validation), capsys, "heuristic labels", str(heuristic_run))
+    refused(
+        words("sim-only", sim_run, out, *validation), capsys, "label_source: is heuristic", str(heuristic_run)
+    )
     assert not out.exists()
 
 

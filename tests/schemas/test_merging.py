@@ -271,7 +271,7 @@ def test_what_cannot_be_added_to_a_place_is_refused_before_anything_is_written(t
     with pytest.raises(InputError, match=r"thesis\.tex: holds other files"):
         merge(tmp_path, "ab", "foreign")
     for out in ("a/shards", "a/deeper"):
-        with pytest.raises(InputError, match=f"--out: lies in {tmp_path}/a"):
+        with pytest.raises(InputError, match=f"--out: is inside {tmp_path}/a"):
             merge(tmp_path, "ab", out)
     with pytest.raises(InputError, match="contains "):
         merge(tmp_path, ["a", "b"], "")
@@ -282,7 +282,7 @@ def test_a_source_that_lacks_a_committed_file_is_refused(tmp_path: Path):
     fill(tmp_path, [0], "a")
     fill(tmp_path, [1], "b")
     (tmp_path / "a" / "shards" / "000000" / "000000-a" / "label" / "c.0").unlink()
-    with pytest.raises(InputError, match=r"a/shards/000000/000000-a/label/c\.0: missing"):
+    with pytest.raises(InputError, match=r"a/shards/000000/000000-a/label/c\.0: is missing"):
         merge(tmp_path, "ab")
 
 

@@ -104,7 +104,7 @@ def test_nothing_committed_and_damaged_shards_are_refused_and_leave_the_old_stor
     run = make_run(tmp_path / "run", n=20)
     before = files_of(Path(seal(run.storage)))
     (tmp_path / "run/shards/000001/a-1/rgb/c.0.0.0").unlink()
-    with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: missing"):
+    with pytest.raises(InputError, match=r"rgb/c\.0\.0\.0: is missing"):
         seal(run.storage)
     assert files_of(tmp_path / "run" / SEALED) == before
 
@@ -122,7 +122,7 @@ def test_runs_of_more_shards_than_a_store_can_name_are_refused(tmp_path: Path):
     root.write_text(json.dumps(told))
     findings = list(check_runs(run.storage, Checked()))
     assert [(f.key, f.kind) for f in findings] == [(f"{SEALED}/zarr.json", "sealed")]
-    assert "holds 100000000000 shards" in findings[0].problem
+    assert "names 100000000000 shards" in findings[0].problem
 
 
 def test_a_commit_that_lists_other_files_is_refused(tmp_path: Path):

@@ -193,6 +193,6 @@ def test_a_missing_file_is_refused_before_anything_changes(place: Storage) -> No
     seal(place)
     before = {f.key: f.stamp for f in place.list(SEALED)}
     place.delete(["shards/000001/a-1/label/c.0"])
-    with pytest.raises(InputError, match=r"label/c\.0: missing"):
+    with pytest.raises(InputError, match=r"label/c\.0: is missing"):
         seal(place)
     assert {f.key: f.stamp for f in place.list(SEALED)} == before

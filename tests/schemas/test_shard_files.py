@@ -84,9 +84,9 @@ def test_large_rows_are_cut_into_equal_chunks_below_the_limit():
         ("label", lambda a: a + np.uint8(2), "above 1"),
         ("visibility", lambda a: a * np.float32("nan"), "NaN"),
         ("distance_m", lambda a: a - np.float32(1e4), "below"),
-        ("label_source", lambda a: np.array([1] * len(a), object), "not text"),
-        ("label_source", lambda a: np.array(["\ud800"] * len(a), object), "not text"),
-        ("label_source", lambda a: np.array(["x" * 5000] * len(a), object), "not text"),
+        ("label_source", lambda a: np.array([1] * len(a), object), "is not valid text"),
+        ("label_source", lambda a: np.array(["\ud800"] * len(a), object), "is not valid text"),
+        ("label_source", lambda a: np.array(["x" * 5000] * len(a), object), "is not valid text"),
     ],
 )
 def test_a_batch_that_breaks_the_schema_is_refused(name: str, change, problem: str):

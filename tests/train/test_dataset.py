@@ -257,7 +257,7 @@ def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tm
         ({"candidates_per_robot": 0}, "candidates_per_robot: 0 is below 1"),
         ({"seed": -1}, "seed: -1 is below 0"),
         ({"rank": 2, "world": 2}, "rank: 2 of 2"),
-        ({"world": 20}, "19 scenes for 20 ranks"),
+        ({"world": 20}, "19 scenes for 20 processes"),
         ({"extra": ("beauty",)}, "beauty: is not a field of the run"),
         ({"houses": lambda house: False}, "house_id: has no scene in the selected houses"),
     ],

@@ -125,7 +125,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     try:
         tensors, text = read_pickled(data) if data[:2] == b"PK" else _read(data)
     except (SafetensorError, *NOT_PICKLED, AttributeError) as e:
-        problem = f"not a checkpoint of this program, or damaged ({e!s:.200})"
+        problem = f"not a datagen checkpoint, or damaged ({e!s:.200})"
         raise InputError(place, "", problem, _MEND) from None
     document = _document(place, text)
     try:

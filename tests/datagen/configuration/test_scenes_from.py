@@ -101,13 +101,15 @@ def test_more_than_the_source_has_is_refused_with_how_many_there_are(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    refused(again_arguments(source, out, N + 1), capsys, "--n", str(N + 1), f"has {N} committed")
+    refused(
+        again_arguments(source, out, N + 1), capsys, "--n", str(N + 1), f"is more than the {N} candidates"
+    )
     assert not out.exists()
     # A gap ends what can be used.
     holey = tmp_path / "holey"
     shutil.copytree(source, holey)
     (holey / "commits/000002.json").unlink()
-    refused(again_arguments(holey, out, N), capsys, f"has {2 * PER_SCENE} committed")
+    refused(again_arguments(holey, out, N), capsys, f"is more than the {2 * PER_SCENE} candidates")
     assert cli.run(again_arguments(holey, out, 2 * PER_SCENE)) == 0
 
 
@@ -167,7 +169,7 @@ def test_objects_may_have_moved_but_not_changed(tmp_path: Path, capsys: pytest.C
     source = make_small_run(tmp_path / "source", PER_SCENE, "--objects", f"ycb:{first}")
     first.rename(moved)
     out = tmp_path / "run"
-    refused(again_arguments(source, out, PER_SCENE), capsys, str(first), "no such folder")
+    refused(again_arguments(source, out, PER_SCENE), capsys, str(first), "does not exist")
     arguments = again_arguments(source, out, PER_SCENE, "--objects", f"ycb:{other}")
     refused(arguments, capsys, "--objects", "the run was made with")
     assert not out.exists()

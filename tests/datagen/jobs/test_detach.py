@@ -64,7 +64,7 @@ def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
     assert running_head() == head
     while len(jobs.all()) < 2:
         time.sleep(0.1)
-    refused(["cancel", "--head"], capsys, "at work: 1 job", "extend")
+    refused(["cancel", "--head"], capsys, "1 job running", "extend")
     assert cli.run(["cancel", str(run), "--now"]) == 0
     told = capsys.readouterr().out
     assert "ended interrupted" in told

@@ -130,7 +130,7 @@ def test_runs_named_twice_incomplete_or_absent_are_refused(runs: tuple[Path, Pat
     for opened in (datagen.candidates, datagen.open_dataset):
         with pytest.raises(datagen.InputError, match="no run is given"):
             opened()
-        with pytest.raises(datagen.InputError, match="of one specification"):
+        with pytest.raises(datagen.InputError, match="has the specification of"):
             opened(runs[0], runs[0])
         with pytest.raises(datagen.InputError):
             opened(tmp_path)

@@ -153,12 +153,12 @@ def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path)
     ]  # fmt: skip
     for change in changes:
         path = with_header(tmp_path / "odd", written, lambda header, c=change: header[name].update(c))
-        with pytest.raises(InputError, match="not a checkpoint of this program, or damaged") as error:
+        with pytest.raises(InputError, match="not a datagen checkpoint, or damaged") as error:
             read_checkpoint(path)
         assert "\n" not in str(error.value) and len(str(error.value)) < 600
     for header in (b"[]", b"3", b'"x"', b"{}", b'{"__metadata__": 3}', b"[" * 100_000, b"\xff\xfe"):
         path.write_bytes(struct.pack("<Q", len(header)) + header)
-        with pytest.raises(InputError, match="not a checkpoint of this program, or damaged"):
+        with pytest.raises(InputError, match="not a datagen checkpoint, or damaged"):
             read_checkpoint(path)
 
 
@@ -233,7 +233,7 @@ def test_numbers_that_are_not_finite_are_refused(written: Path, tmp_path: Path, 
     bias[-1] = value
     for key in (f"weights/{name}", "weights/token.1.running_var", f"resume/{name}"):
         path = stored_with(tmp_path / "bad.ckpt", written, {key: bias})
-        with pytest.raises(InputError, match=f"{key}: holds NaN or infinite numbers"):
+        with pytest.raises(InputError, match=f"{key}: has NaN or infinite numbers"):
             load_model(path)
     whole = read_checkpoint(written)
     path = tmp_path / "kept.ckpt"

@@ -122,7 +122,7 @@ for k in range(7):
     if k % 3:  # more than an hour passes for this process's own
         os.utime(urdf, (1, 1))
         os.utime(urdf.with_suffix(".srdf"), (1, 1))
-print(written.RobotFiles._n_written)
+print(robot_files.RobotFiles._n_written)
 """
 
 

@@ -84,5 +84,5 @@ def test_tasks_of_different_robots_are_refused() -> None:
     tasks = [GraspTask(p, BASE, PLAN, Disturbance.none(0.6)) for p in (PREPARED, prepared)]
     with pytest.raises(InputError, match="differ in robot"):
         gym.make(ENV_ID, tasks=tasks)
-    with pytest.raises(InputError, match="there is none"):
+    with pytest.raises(InputError, match="are missing"):
         gym.make(ENV_ID, tasks=[])
