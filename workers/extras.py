@@ -42,7 +42,13 @@ EXTRAS: dict[str, Extra] = {
     "sim": Extra("plan and sim labels", {"coal": "coal", "pinocchio": "pin", "mani_skill": "mani-skill"}),
     "train": Extra(
         "train, evaluate, predict",
-        {"torch": "torch", "tensorboard": "tensorboard", "plotly": "plotly", **_PICTURES},
+        {
+            "torch": "torch",
+            "safetensors": "safetensors",
+            "tensorboard": "tensorboard",
+            "plotly": "plotly",
+            **_PICTURES,
+        },
     ),
     "detect": Extra("the baseline with an object detector", {"transformers": "transformers"}),
     "cluster": Extra("workers of Ray: several processes, several machines", {"ray": "ray"}),

@@ -60,7 +60,7 @@ def test_a_run_on_s3_is_the_run_on_a_disk(
     submit(again, 8, "--scenes-from", out)
     assert sealed_arrays(Run.open(again))["scene_index"].tolist() == [0]
     arguments = ["submit", "heuristic", "--n", "32", "--out", f"{bucket}/more", "--scenes-from", out]
-    refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"{out}is more than the 16 candidates of ")
+    refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"is more than the 16 candidates of {out}")
 
     other, merged = f"{bucket}/runs/b", f"{bucket}/merged"
     submit(other, 8, "--seed", "7", *config)

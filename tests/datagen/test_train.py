@@ -144,7 +144,7 @@ def test_another_training_is_not_overwritten(
     told = refused(words("stage1", heuristic_run, first, *more), capsys, str(first), "epochs (1, now 2)")
     assert "seed (0, now 5)" in told
     assert "patience" not in told
-    refused(words("stage1", heuristic_run, Path(more[1]), *more), capsys, "not a checkpoint")
+    refused(words("stage1", heuristic_run, Path(more[1]), *more), capsys, "not a datagen checkpoint")
     assert first.read_bytes() == before
 
 

@@ -101,7 +101,9 @@ FATES = {
     "SystemExit": Fate(("system_exit",), ["crashed", "committed"], DIED),
     # Fails and says so.
     "exception": Fate(("raise",), ["failed", "committed"], "ValueError: a scene of two lines", "misbehave"),
-    "NaN": Fate(("not_finite",), ["failed", "committed"], "InputError: .*visibility: NaN", "hand_over_bad"),
+    "NaN": Fate(
+        ("not_finite",), ["failed", "committed"], "InputError: .*visibility: has NaN", "hand_over_bad"
+    ),
     "shape": Fate(("one_row_less",), ["failed", "committed"], r"InputError: .*shape \(9,\)", "hand_over_bad"),
     # Memory.
     "MemoryError": Fate(("memory",), ["out_of_memory", "committed"], "MemoryError", "misbehave"),

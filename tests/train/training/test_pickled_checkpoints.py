@@ -137,7 +137,7 @@ def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path)
         read_checkpoint(path)
     for word in (b"\x8c\x01a", b"c__builtin__\neval\n", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f"):
         path = with_pickle(tmp_path / "odd.ckpt", written, lambda data, w=word: data[:2] + w + data[2:])
-        with pytest.raises(InputError, match="not a checkpoint"):
+        with pytest.raises(InputError, match="not a datagen checkpoint"):
             read_checkpoint(path)
 
 
@@ -172,5 +172,5 @@ def test_pickles_made_to_take_for_ever_are_refused(tmp_path: Path):
         b"\x80\x02}K\x01b.",  # BUILD
     ):
         path = with_pickle(tmp_path / "odd.ckpt", OLD, lambda _, odd=odd: odd)
-        with pytest.raises(InputError, match="not a checkpoint"):
+        with pytest.raises(InputError, match="not a datagen checkpoint"):
             read_checkpoint(path)
