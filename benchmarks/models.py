@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--train", nargs="+", required=True)
     parser.add_argument("--judge", nargs="+", required=True)
-    parser.add_argument("--samples", type=int, default=10**9, help="train on so many at most")
+    parser.add_argument("--samples", type=int, default=10**9, help="most samples to train on")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--scenes-per-batch", type=int, default=8)

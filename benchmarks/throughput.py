@@ -90,7 +90,7 @@ def run(
         summary = make_missing(plan, open_recorder(plan))
         ended_s = time.perf_counter()
         if summary.end != "complete":
-            raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Mend that first")
+            raise InputError(out, "", f"the job ended {summary.end}: {summary.cause}", "Fix that first")
         seal(made.storage)
         sealed_s = time.perf_counter()
         commits = sorted(made.commits(), key=lambda c: c.created)

@@ -97,6 +97,6 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
 def _open_scenes_run(place: str, scenes_hash: str) -> Run:
     scenes_run = Run.open(place)
     if scenes_run.manifest.spec.scenes_hash != scenes_hash:
-        mend = "Give --scenes-from with the run that this one was started with"
-        raise InputError(place, "spec_hash", "the run now has other scenes", mend)
+        fix = "Give --scenes-from with the run that this one was started with"
+        raise InputError(place, "spec_hash", "the run now has other scenes", fix)
     return scenes_run

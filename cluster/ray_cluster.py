@@ -19,7 +19,7 @@ from typing import Any
 
 from datagen.cluster.cluster_folders import RAY, private_folder
 from datagen.cluster.environment import changed_environment
-from datagen.cluster.ray_local import START_MEND, slim_node
+from datagen.cluster.ray_local import START_FIX, slim_node
 from datagen.cluster.ray_settings import (
     OBJECT_STORE_BYTES,
     head_environment,
@@ -31,10 +31,10 @@ from datagen.schemas.errors import InputError
 
 _PATIENCE_S = 10.0
 _SILENT_START_S = 5.0  # then a message is printed
-_TOKEN_MEND = (
+_TOKEN_FIX = (
     "Set RAY_AUTH_TOKEN to the token that the cluster was started with, or RAY_AUTH_TOKEN_PATH to its file"
 )
-_START_MEND = "Start Ray there and give HOST:PORT, or use --address local"
+_START_FIX = "Start Ray there and give HOST:PORT, or use --address local"
 
 
 @dataclass(frozen=True)
@@ -107,14 +107,14 @@ def _announced(line: str) -> Generator[None]:
 def _refusal(address: str, error: BaseException) -> BaseException:
     """The InputError for an error of Ray while it starts or joins a cluster."""
     if address == "local":
-        return InputError("ray", "", f"does not start: {first_line(error)}", START_MEND)
+        return InputError("ray", "", f"does not start: {first_line(error)}", START_FIX)
     if not isinstance(error, RuntimeError):
         return InputError("--address", address, first_line(error), "Start Ray there, or use --address local")
     if "No node info found" not in str(error):
         return error
     problem = "no node of that cluster runs on this machine"
-    mend = "Submit from one of its machines, or start a node here: ray start --address"
-    return InputError("--address", address, problem, mend)
+    fix = "Submit from one of its machines, or start a node here: ray start --address"
+    return InputError("--address", address, problem, fix)
 
 
 def refuse_unusable(address: str) -> None:
@@ -132,12 +132,12 @@ def refuse_unreachable(address: str) -> None:
     """Raise InputError where no server listens at a `[ray://]HOST:PORT`."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and len(port) < 6):
-        raise InputError("--address", address, "is not the address of a cluster", _START_MEND)
+        raise InputError("--address", address, "is not the address of a cluster", _START_FIX)
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE_S).close()
     # A name that cannot be encoded is a ValueError, a port above 65535 an OverflowError.
     except (OSError, ValueError, OverflowError) as error:
-        raise InputError("--address", address, f"cannot be reached ({error})", _START_MEND) from None
+        raise InputError("--address", address, f"cannot be reached ({error})", _START_FIX) from None
 
 
 def token_for(address: str) -> dict[str, str]:
@@ -153,10 +153,10 @@ def token_for(address: str) -> dict[str, str]:
         return {"RAY_AUTH_MODE": "disabled"}
     found = known_token()
     if found is None:
-        raise InputError("--address", address, "the cluster requires a token, but none is set", _TOKEN_MEND)
+        raise InputError("--address", address, "the cluster requires a token, but none is set", _TOKEN_FIX)
     token, place = found
     if _turns_away(address, token):
-        raise InputError("--address", address, f"the cluster refuses the token in {place}", _TOKEN_MEND)
+        raise InputError("--address", address, f"the cluster refuses the token in {place}", _TOKEN_FIX)
     return token_environment(token)
 
 
@@ -170,7 +170,7 @@ def known_token() -> tuple[str, str] | None:
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"the token cannot be read ({error})", _TOKEN_MEND) from None
+        raise InputError(path, "", f"the token cannot be read ({error})", _TOKEN_FIX) from None
     return (token, str(path)) if token else None
 
 
@@ -191,9 +191,9 @@ def _resolved(address: str) -> str:
         return str(canonicalize_bootstrap_address_or_die("auto"))
     except ConnectionError as error:
         problem = "no Ray cluster runs on this machine, and RAY_ADDRESS names none"
-        raise InputError("--address", address, problem, _START_MEND) from error
+        raise InputError("--address", address, problem, _START_FIX) from error
     except ValueError as error:
-        raise InputError("--address", address, first_line(error), _START_MEND) from error
+        raise InputError("--address", address, first_line(error), _START_FIX) from error
 
 
 def _turns_away(address: str, token: str | None) -> bool:
@@ -210,7 +210,7 @@ def _turns_away(address: str, token: str | None) -> bool:
             if code == grpc.StatusCode.UNAUTHENTICATED:
                 return True
             problem = f"responds, but not as a Ray cluster ({code.name.lower()})"
-            raise InputError("--address", address, problem, _START_MEND) from None
+            raise InputError("--address", address, problem, _START_FIX) from None
     return False
 
 

@@ -87,14 +87,14 @@ def head_token(jobs_api: str) -> str:
 @contextmanager
 def _locked() -> Generator[None]:
     folder = state_folder()
-    mend = "Set DATAGEN_STATE to a folder of your own, of mode 0700"
+    fix = "Set DATAGEN_STATE to a folder of your own, of mode 0700"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not is_private(folder.stat()):
-            raise InputError(folder, "", "belongs to another user, or other users can write to it", mend)
+            raise InputError(folder, "", "belongs to another user, or other users can write to it", fix)
         file = (folder / "head.lock").open("w")
     except OSError as error:
-        raise InputError(folder, "", f"cannot be written: {error.strerror}", mend) from error
+        raise InputError(folder, "", f"cannot be written: {error.strerror}", fix) from error
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)  # two shells must not start two heads
         yield
@@ -125,8 +125,8 @@ def _start(workers: int) -> Head:
         remove_folder(folder)
         # Ray's own timeouts of 15 to 30 s are too short for a busy machine.
         if time.monotonic() >= until_s:
-            mend = "Submit again when the machine is less busy, or without --detach"
-            raise InputError("ray", "", f"does not start: {head}", mend)
+            fix = "Submit again when the machine is less busy, or without --detach"
+            raise InputError("ray", "", f"does not start: {head}", fix)
         sys.stderr.write(f"Ray did not start; trying again: {head}\n")
 
 

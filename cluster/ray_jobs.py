@@ -12,9 +12,7 @@ from datagen.cluster.environment import JOB_ENVIRONMENT, changed_environment
 from datagen.cluster.ray_cluster import first_line, known_token, refuse_unreachable, token_for
 from datagen.schemas.errors import InputError
 
-_MEND = (
-    "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
-)
+_FIX = "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
 # A newly started head has no agent yet.
 _AGENT_WITHIN_S = 60.0
 _ANSWER_WITHIN_S = 5.0
@@ -58,7 +56,7 @@ class RayJobs:
         except RuntimeError as error:
             if "does not exist" in str(error):
                 return ""
-            raise InputError(self.url, submission, first_line(error), _MEND) from error
+            raise InputError(self.url, submission, first_line(error), _FIX) from error
 
     def message(self, submission: str) -> str:
         """Ray's message on the job."""
@@ -95,8 +93,8 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
     """
     changed: dict[str, str | None] = dict.fromkeys(_OVERRIDES)
     if "@" in address:
-        mend = "Remove it; set a token as RAY_AUTH_TOKEN"
-        raise InputError("--address", "", "has a password, which would appear in records and logs", mend)
+        fix = "Remove it; set a token as RAY_AUTH_TOKEN"
+        raise InputError("--address", "", "has a password, which would appear in records and logs", fix)
     if address.startswith(("http://", "https://")):
         url = address
     else:
@@ -115,7 +113,7 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
         try:
             client = JobSubmissionClient(url or address, headers=headers)
         except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
-            raise InputError("--address", address, first_line(error), _MEND) from error
+            raise InputError("--address", address, first_line(error), _FIX) from error
         return RayJobs(str(client.get_address()), client)
 
 

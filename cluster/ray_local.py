@@ -26,7 +26,7 @@ _AGENT_PORTS = (
 )
 # In place of an agent: it exits with the raylet, when its input ends.
 _NO_AGENT = "/bin/cat"
-START_MEND = (
+START_FIX = (
     "Start it again when the machine is less busy; use --workers 0, which needs no Ray, or the --address of "
     "a running cluster"
 )
@@ -73,7 +73,7 @@ def slim_node() -> Generator[None]:
                 time.sleep(_LOOK_S)
             code = raylet.poll()
             why = f"not within {_START_WITHIN_S:g} s" if code is None else f"it ended with {code}"
-            raise InputError("ray", "", f"does not start: {why}", START_MEND)
+            raise InputError("ray", "", f"does not start: {why}", START_FIX)
 
     before = node.Node
     node.Node = SlimNode

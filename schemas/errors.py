@@ -11,23 +11,23 @@ class InputError(ValueError):
     """Input that cannot be used. The command line prints it as one line and exits with 2.
 
     `place` is a file, a folder, a run or a command-line option; `field` is the part of it that is wrong (a
-    JSON path, a column, a line), or "" for the whole; `mend` says how to fix it.
+    JSON path, a column, a line), or "" for the whole; `fix` says how to fix it.
     """
 
-    def __init__(self, place: str | Path, field: str, problem: str, mend: str) -> None:
+    def __init__(self, place: str | Path, field: str, problem: str, fix: str) -> None:
         self.place = str(place)
         self.field = field
         self.problem = problem
-        self.mend = mend
+        self.fix = fix
         super().__init__(str(self))
 
     def __str__(self) -> str:
         where = f"{self.place}: {self.field}" if self.field else self.place
-        return one_line(f"{where}: {self.problem}. {self.mend}")
+        return one_line(f"{where}: {self.problem}. {self.fix}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
         # Exceptions are pickled between processes; the default would call __init__ with one argument.
-        return (type(self), (self.place, self.field, self.problem, self.mend))
+        return (type(self), (self.place, self.field, self.problem, self.fix))
 
 
 def refuse_not_utf8(text: str) -> str:
@@ -35,8 +35,8 @@ def refuse_not_utf8(text: str) -> str:
     try:
         text.encode()
     except UnicodeEncodeError:
-        mend = "Rename it, or reach it through a link in UTF-8"
-        raise InputError(repr(text)[:300], "", "the name is not UTF-8", mend) from None
+        fix = "Rename it, or reach it through a link in UTF-8"
+        raise InputError(repr(text)[:300], "", "the name is not UTF-8", fix) from None
     return text
 
 

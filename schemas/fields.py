@@ -87,24 +87,24 @@ class RecordSchema:
         """Raise InputError for a batch with missing or unknown fields, or a wrong dtype, shape or range."""
         fields = {f.name: f for f in self.table(table)}
         place = f"batch of {self.name} {table}s"
-        mend = "This is a defect of the label source: its output must follow its schema."
+        fix = "This is a defect of the label source: its output must follow its schema."
         if set(arrays) != set(fields):
             odd = sorted(set(arrays) ^ set(fields))
-            raise InputError(place, ", ".join(odd), "are missing or unknown fields", mend)
+            raise InputError(place, ", ".join(odd), "are missing or unknown fields", fix)
         for name, f in fields.items():
             a = arrays[name]
             if a.shape != self.shape(f, rows):
-                raise InputError(place, name, f"shape {a.shape}, not {self.shape(f, rows)}", mend)
+                raise InputError(place, name, f"shape {a.shape}, not {self.shape(f, rows)}", fix)
             if f.is_text:
                 continue
             if a.dtype != np.dtype(f.dtype):
-                raise InputError(place, name, f"dtype {a.dtype}, not {f.dtype}", mend)
+                raise InputError(place, name, f"dtype {a.dtype}, not {f.dtype}", fix)
             if a.dtype.kind == "f" and not np.isfinite(a).all():
-                raise InputError(place, name, "has NaN or infinite values", mend)
+                raise InputError(place, name, "has NaN or infinite values", fix)
             if a.size and f.low is not None and a.min() < f.low:
-                raise InputError(place, name, f"value {a.min()} below {f.low}", mend)
+                raise InputError(place, name, f"value {a.min()} below {f.low}", fix)
             if a.size and f.high is not None and a.max() > f.high:
-                raise InputError(place, name, f"value {a.max()} above {f.high}", mend)
+                raise InputError(place, name, f"value {a.max()} above {f.high}", fix)
 
 
 @dataclass(frozen=True, eq=False)

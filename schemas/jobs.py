@@ -139,8 +139,8 @@ class Jobs:
         try:
             record = read_record(self._place, f"jobs/{job}.json", JobRecord)
         except InputError as error:
-            mend = "Remove it: no data depends on it"
-            raise InputError(where, error.field, error.problem, mend) from error
+            fix = "Remove it: no data depends on it"
+            raise InputError(where, error.field, error.problem, fix) from error
         if record is None:
             return None
         if record.id != job:

@@ -15,7 +15,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.storage import Storage
 
 MAX_RECORD_BYTES = 16 * 2**20
-_MEND = "Repair it with `datagen repair`, or restore the file from a copy"
+_FIX = "Repair it with `datagen repair`, or restore the file from a copy"
 # The last line of a record: the sha256 of every byte before it. The rest is JSON without its closing brace.
 _TRAILER = re.compile(rb',\n "sha256": "([0-9a-f]{64})"\n}\n\Z')
 _TRAILER_BYTES = len(b',\n "sha256": ""\n}\n') + 64
@@ -51,10 +51,10 @@ def decode_record(place: str, data: bytes, model: type[Record]) -> Record:
     """
     trailer = _TRAILER.search(data, max(0, len(data) - _TRAILER_BYTES))
     if trailer is None:
-        raise InputError(place, "sha256", "is missing at the end: the record is incomplete", _MEND)
+        raise InputError(place, "sha256", "is missing at the end: the record is incomplete", _FIX)
     body = data[: trailer.start()]
     if sha256(body).hexdigest().encode() != trailer[1]:
-        raise InputError(place, "sha256", "does not match: the file is damaged or was edited", _MEND)
+        raise InputError(place, "sha256", "does not match: the file is damaged or was edited", _FIX)
     try:
         return model.model_validate_json(body + b"\n}")
     except ValidationError as e:
@@ -62,7 +62,7 @@ def decode_record(place: str, data: bytes, model: type[Record]) -> Record:
         where = ".".join(str(part) for part in first["loc"])
         given = repr(first.get("input"))[:60]
         problem = f"{first['msg']} (it is {given})" if where else first["msg"]
-        raise InputError(place, where, problem, _MEND) from e
+        raise InputError(place, where, problem, _FIX) from e
 
 
 def read_record(storage: Storage, key: str, model: type[Record]) -> Record | None:

@@ -27,13 +27,13 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
 def refuse_foreign(storage: Storage, *also: str) -> None:
     """Raise InputError for a folder with other files than a run's; `also` are further allowed prefixes."""
     ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
-    problem, mend = "holds other files than those of a run", "Choose a new --out"
+    problem, fix = "holds other files than those of a run", "Choose a new --out"
     try:
         for file in storage.list(""):
             if not file.key.startswith(ours):
-                raise InputError(storage.url, file.key, problem, mend)
+                raise InputError(storage.url, file.key, problem, fix)
     except NotARegularFile as e:
-        raise InputError(e.place, "", problem, mend) from e
+        raise InputError(e.place, "", problem, fix) from e
 
 
 def refuse_other(place: str, there: Manifest, asked: Manifest) -> None:

@@ -122,7 +122,7 @@ class Run:
         try:
             return sized_schema(manifest.schema_name, manifest.spec, manifest.schema_version)
         except InputError as e:
-            raise InputError(f"{self.storage.url}/manifest.json", e.field, e.problem, e.mend) from e
+            raise InputError(f"{self.storage.url}/manifest.json", e.field, e.problem, e.fix) from e
 
     # Plans: the number of samples wanted.
 
@@ -305,11 +305,11 @@ class Run:
 
     def _lack(self, commit: Commit, committing: bool = False) -> InputError | None:
         folder = shard_folder(commit.shard, commit.attempt)
-        mend = AGAIN if committing else "Restore the file from a copy, or run `datagen repair`"
+        fix = AGAIN if committing else "Restore the file from a copy, or run `datagen repair`"
         sizes = {f.key: f.size for f in self.storage.list(folder)}
         if committing and (mark := f"{folder}/{REMOVING}") in sizes:
             place, problem = f"{self.storage.url}/{mark}", "the attempt is being removed as garbage"
-            return InputError(place, "", problem, mend)
+            return InputError(place, "", problem, fix)
         for entry in commit.files:
             size = sizes.get(f"{folder}/{entry.path}")
             if size != entry.size:
@@ -317,7 +317,7 @@ class Run:
                     f"{self.storage.url}/{folder}/{entry.path}",
                     "",
                     "is missing" if size is None else f"has {size} bytes, but {entry.size} were committed",
-                    mend,
+                    fix,
                 )
         return None
 

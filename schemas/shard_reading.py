@@ -33,7 +33,7 @@ Array = npt.NDArray[Any]
 MAX_META_BYTES = 2**20
 MAX_DECODED_BYTES = 2**30  # far above any real chunk
 _CHECKED = b""
-_MEND = "Restore the file from a copy, or repair the run with `datagen repair`"
+_FIX = "Restore the file from a copy, or repair the run with `datagen repair`"
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,14 @@ def parse_metadata(place: str, name: str, data: bytes) -> StoredArray:
         return StoredArray(name, dtype, shape, chunk[0], dims, dict(meta.get("attributes") or {}))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as e:
         problem = f"is not the metadata of a run's array ({type(e).__name__}: {e})"
-        raise InputError(place, "", problem, _MEND) from e
+        raise InputError(place, "", problem, _FIX) from e
 
 
 def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
     """Decode a chunk's values, (chunk_rows, ...). InputError naming `place` for damaged bytes."""
     packed = data[:-4]
     if len(data) < 5 or google_crc32c.value(packed) != int.from_bytes(data[-4:], "little"):
-        raise InputError(place, array.name, "the crc32c does not match: the file is damaged", _MEND)
+        raise InputError(place, array.name, "the crc32c does not match: the file is damaged", _FIX)
     shape = (array.chunk_rows, *array.shape[1:])
     count = math.prod(shape)
     try:
@@ -103,7 +103,7 @@ def decode_chunk(place: str, array: StoredArray, data: bytes) -> Array:
         Zstd().decode(packed, out)
         return out
     except (ValueError, RuntimeError) as e:
-        raise InputError(place, array.name, f"does not hold {shape} of {array.dtype} ({e})", _MEND) from e
+        raise InputError(place, array.name, f"does not hold {shape} of {array.dtype} ({e})", _FIX) from e
 
 
 @dataclass(frozen=True)
@@ -150,11 +150,11 @@ class ShardPlace:
         for path, (key, data) in zip(paths, self.storage.get_many(keys, most), strict=True):
             place, name = f"{self.storage.url}/{key}", path.partition("/")[0]
             if data is None:
-                raise InputError(place, name, "no such file", _MEND)
+                raise InputError(place, name, "no such file", _FIX)
             if self.digests is not None and (digest := self.digests.get(path)) != _CHECKED:
                 if sha256(data).digest() != digest:
                     problem = f"has {len(data)} bytes with another sha256 than the commit"
-                    raise InputError(place, name, problem, _MEND)
+                    raise InputError(place, name, problem, _FIX)
                 self.digests[path] = _CHECKED
             yield path, place, data
 
@@ -172,7 +172,7 @@ class ShardPlace:
         # Half floats are point clouds, slow to check; an error in them shows in a loss or a score.
         if whole.dtype.kind == "f" and whole.itemsize > 2 and not np.isfinite(whole).all():
             place = f"{self.storage.url}/{self.folder}"
-            raise InputError(place, array.name, "holds NaN or infinite numbers", _MEND)
+            raise InputError(place, array.name, "holds NaN or infinite numbers", _FIX)
         return whole[: self.scenes if array.dims[0] == "scene" else self.samples]
 
 

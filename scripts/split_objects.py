@@ -19,7 +19,7 @@ _MOST_BYTES = 16 * 2**20
 
 
 class Refused(Exception):
-    """Input that cannot be used, in one line: `place: field: problem. Mend`."""
+    """Input that cannot be used, in one line: `place: field: problem. Fix`."""
 
 
 def main(arguments: list[str]) -> int:
@@ -52,21 +52,21 @@ def _read(source: Path) -> list[dict[str, Any]]:
         entries = json.loads(index.read_bytes())
     except (ValueError, RecursionError) as error:
         raise Refused(f"{index}: not JSON ({error}). Fetch the index again") from None
-    mend = "Correct it or fetch the index again"
+    fix = "Correct it or fetch the index again"
     if not isinstance(entries, list) or len(entries) < EVERY:
-        raise Refused(f"{index}: not a list of {EVERY} objects or more. {mend}")
+        raise Refused(f"{index}: not a list of {EVERY} objects or more. {fix}")
     keys: set[str] = set()
     for number, entry in enumerate(entries):
         key, files = (entry.get(name) if isinstance(entry, dict) else None for name in ("key", "files"))
         if not isinstance(key, str) or key in keys:
-            raise Refused(f"{index}: [{number}].key: not a name of its own. {mend}")
+            raise Refused(f"{index}: [{number}].key: not a name of its own. {fix}")
         keys.add(key)
         if not isinstance(files, dict) or not files:
-            raise Refused(f"{index}: [{number}].files: no files. {mend}")
+            raise Refused(f"{index}: [{number}].files: no files. {fix}")
         for path in files.values():
             if not isinstance(path, str) or not _is_inside(source, path):
                 problem = f"{str(path)[:80]!r} is no file inside {source}"
-                raise Refused(f"{index}: [{number}].files: {problem}. {mend}")
+                raise Refused(f"{index}: [{number}].files: {problem}. {fix}")
     return entries
 
 

@@ -76,7 +76,7 @@ def _install() -> bool:
 
 
 def main() -> int:
-    """Check, mend where possible, say what is left."""
+    """Check, fix where possible, say what is left."""
     if sys.platform != "linux":
         return 0
     missing = missing_libraries()

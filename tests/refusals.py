@@ -16,7 +16,7 @@ def refused(arguments: list[str], capture: pytest.CaptureFixture[str], *words: s
     (told,) = without_phases(capture.readouterr().err)
     assert told.startswith("error: "), told
     assert "Traceback" not in told and len(told) < 2000
-    assert re.search(r"[.!] (See: datagen|[A-Z`]\S* \S)|Choose from: ", told), f"no mend in: {told}"
+    assert re.search(r"[.!] (See: datagen|[A-Z`]\S* \S)|Choose from: ", told), f"no fix in: {told}"
     for word in words:
         assert word in told, f"{word!r} not in: {told}"
     return told

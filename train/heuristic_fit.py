@@ -149,7 +149,7 @@ def fit_leaving_houses_out(
 
 def refuse_too_little(trials: Trials, place: str) -> None:
     """Raise InputError for labels of one class, few scenes or one house."""
-    mend = "Name more runs, or make more labels with `datagen extend`"
+    fix = "Name more runs, or make more labels with `datagen extend`"
     if not len(trials):
         raise InputError(place, "--candidates", "selects no candidate", "Choose another set")
     if trials.label.all() or not trials.label.any():
@@ -157,10 +157,10 @@ def refuse_too_little(trials: Trials, place: str) -> None:
         raise InputError(place, "label", problem, "Choose other --candidates, or name more runs")
     if trials.n_scenes < MIN_SCENES:
         problem = f"{trials.n_scenes} scenes, but intervals need {MIN_SCENES}; 100 or more are sensible"
-        raise InputError(place, "scenes", problem, mend)
+        raise InputError(place, "scenes", problem, fix)
     if len(set(trials.house)) < 2:
         problem = "all scenes are in one house, so none is left for validation"
-        raise InputError(place, "house_id", problem, mend)
+        raise InputError(place, "house_id", problem, fix)
 
 
 @dataclass(frozen=True, eq=False)

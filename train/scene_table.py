@@ -85,11 +85,11 @@ def read_scene_table(
                     continue
                 label = columns["label"][first:past]
                 if label.max() > 1:
-                    where, mend = (
+                    where, fix = (
                         f"{place.storage.url}/{place.folder}",
                         "Repair the run with `datagen repair`",
                     )
-                    raise InputError(where, "label", f"a label of {label.max()}", mend)
+                    raise InputError(where, "label", f"a label of {label.max()}", fix)
                 digest.update(columns["sample_id"][first:past].tobytes())
                 digest.update(label.tobytes())
                 counts += np.bincount(label, minlength=2)

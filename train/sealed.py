@@ -15,7 +15,7 @@ from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArra
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
 
-_MEND = "Seal the run again, and copy the whole data.zarr"
+_FIX = "Seal the run again, and copy the whole data.zarr"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
         spec_hashes = tuple(str(part["spec_hash"]) for part in told)
         specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in told)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
-        raise InputError(where, "", f"is not the root of a sealed store ({e})", _MEND) from e
+        raise InputError(where, "", f"is not the root of a sealed store ({e})", _FIX) from e
     if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
         known = ", ".join(f"{s.name} {OLDEST_SCHEMA_VERSION} to {s.version}" for s in SCHEMAS.values())
         problem = f"is {schema!r} {version}, but this program reads {known}"
@@ -71,14 +71,14 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> SealedStore:
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}
     if len(scenes) != 1 or len(samples) != 1 or per_shard < 1 or per_scene < 1:
-        raise InputError(where, "shape", "differs between arrays of one table", _MEND)
+        raise InputError(where, "shape", "differs between arrays of one table", _FIX)
     n_scenes, n_samples = scenes.pop(), samples.pop()
     full = per_shard * per_scene
     if (shards := -(-n_scenes // per_shard)) != -(-n_samples // full):
-        raise InputError(where, "shape", f"{n_scenes} scenes do not match {n_samples} samples", _MEND)
+        raise InputError(where, "shape", f"{n_scenes} scenes do not match {n_samples} samples", _FIX)
     for array in arrays.values():
         if (per_shard if array.dims[0] == "scene" else full) % array.chunk_rows:
-            raise InputError(where, array.name, "chunks that do not divide a shard", _MEND)
+            raise InputError(where, array.name, "chunks that do not divide a shard", _FIX)
     slices = [
         ShardPlace(
             storage,

@@ -59,9 +59,9 @@ def split_by_house(
     except InputError as error:
         if error.field != "house_id":
             raise
-        mend = "Name a run of other houses with --val, or train on runs of more houses"
+        fix = "Name a run of other houses with --val, or train on runs of more houses"
         problem = "has too few houses to hold out a tenth for validation"
-        raise InputError(error.place, "house_id", problem, mend) from error
+        raise InputError(error.place, "house_id", problem, fix) from error
     refuse_shared_houses(train, validation)
     return train, validation
 
@@ -87,5 +87,5 @@ def refuse_one_class(stream: SampleStream) -> None:
         return
     places = ", ".join(dict.fromkeys(part.part.place for part in stream.parts))
     problem = f"all {sum(counts)} labels are {0 if counts[0] else 1}"
-    mend = "Name more runs, or a run with another choice of candidates (`submit --candidates`)"
-    raise InputError(places, "label", problem, mend)
+    fix = "Name more runs, or a run with another choice of candidates (`submit --candidates`)"
+    raise InputError(places, "label", problem, fix)

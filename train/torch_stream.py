@@ -37,7 +37,7 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
 
     Its items are whole batches, so the loader is made with `batch_size=None`. With any `num_workers` the
     loader gives the same batches in the same order, each sample once. `set_epoch` chooses the epoch, and
-    where in it to begin: a training that stopped after so many batches continues with the next.
+    where in it to begin: a training that stopped after `skip_batches` batches continues with the next.
     """
 
     def __init__(self, places: Sequence[str | Path], **options: Unpack[StreamOptions]) -> None:

@@ -74,8 +74,8 @@ def how_to_get(extra: str) -> str:
 def refuse_missing(extra: str, otherwise: str = "") -> None:
     """Raise InputError where a library of the extra is not installed; `otherwise` is another way out."""
     if missing := EXTRAS[extra].missing():
-        mend = ", ".join(filter(None, (how_to_get(extra), otherwise)))
-        raise InputError(", ".join(missing), "", "is not installed", mend)
+        fix = ", ".join(filter(None, (how_to_get(extra), otherwise)))
+        raise InputError(", ".join(missing), "", "is not installed", fix)
 
 
 def missing_library(error: Exception, preferred: str = "") -> InputError | None:

@@ -25,9 +25,9 @@ class JsonNode:
     path: str
     value: Any
 
-    def error(self, problem: str, mend: str = "Correct or remove this entry.") -> InputError:
+    def error(self, problem: str, fix: str = "Correct or remove this entry.") -> InputError:
         """The error that names this value."""
-        return InputError(self.place, self.path, problem, mend)
+        return InputError(self.place, self.path, problem, fix)
 
     def get(self, key: str) -> JsonNode:
         """The member of an object; it must be there."""
@@ -88,19 +88,19 @@ class JsonNode:
 
 def parse_json(text: bytes, place: str) -> JsonNode:
     """The document, or an InputError for text that is not JSON or is nested too deeply."""
-    mend = "Restore the file from its source."
+    fix = "Restore the file from its source."
     if text.count(b"{") + text.count(b"[") > _MOST_PARTS:
-        raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", mend)
+        raise InputError(place, "$", f"more than {_MOST_PARTS:,} lists and objects", fix)
     try:
         return JsonNode(place, "$", json.loads(text))
     except RecursionError:
-        raise InputError(place, "$", "lists or objects nested too deeply", mend) from None
+        raise InputError(place, "$", "lists or objects nested too deeply", fix) from None
     except UnicodeDecodeError as error:
-        raise InputError(place, "$", f"not UTF-8 at byte {error.start}", mend) from None
+        raise InputError(place, "$", f"not UTF-8 at byte {error.start}", fix) from None
     except json.JSONDecodeError as error:
-        raise InputError(place, f"character {error.pos}", f"not JSON ({error.msg})", mend) from None
+        raise InputError(place, f"character {error.pos}", f"not JSON ({error.msg})", fix) from None
     except ValueError:  # an integer of thousands of digits
-        raise InputError(place, "$", "a number with too many digits", mend) from None
+        raise InputError(place, "$", "a number with too many digits", fix) from None
 
 
 def _kind(value: object) -> str:

@@ -29,9 +29,9 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
         others = f"choose another one: {', '.join(sorted(set(registry) - {name}))}"
         if missing := missing_library(error):
             problem = f"needs {missing.place}, which is not installed"
-            raise InputError(option, name, problem, f"{missing.mend}. Or {others}") from error
-        mend = f"Run `datagen doctor`, or {others}"
-        raise InputError(option, name, f"cannot be imported here: {error}", mend) from error
+            raise InputError(option, name, problem, f"{missing.fix}. Or {others}") from error
+        fix = f"Run `datagen doctor`, or {others}"
+        raise InputError(option, name, f"cannot be imported here: {error}", fix) from error
 
 
 def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
@@ -41,8 +41,8 @@ def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
     """
     kind, _, text = ref.partition(":")
     if kind not in registry and "/" in kind:
-        mend = f"Write KIND:{ref}, where KIND is one of {', '.join(sorted(registry))}"
-        raise InputError(option, ref, "is a folder without the kind of its content", mend)
+        fix = f"Write KIND:{ref}, where KIND is one of {', '.join(sorted(registry))}"
+        raise InputError(option, ref, "is a folder without the kind of its content", fix)
     return entry(registry, kind, option)(text)
 
 

@@ -78,7 +78,7 @@ class World:
             prepared = PreparedHouse(self.houses.load(house_id))
         except InputError as error:
             # A scene may draw it as often as it may retry.
-            self._bad_houses[house_id] = (error.place, error.field, error.problem, error.mend)
+            self._bad_houses[house_id] = (error.place, error.field, error.problem, error.fix)
             raise
         self._houses[house_id] = prepared
         if len(self._houses) > _HOUSES_KEPT:

@@ -4,7 +4,7 @@
 
 Points are: a kill before each call that changes a file, a kill after half the bytes of each write, an
 input/output error of each call, and a disk that is full from each call on. After each, a fresh process
-looks at the run, goes on as a user would, and looks again. `absent` and `there` are points after which
+looks at the run, continues as a user would, and looks again. `absent` and `there` are points after which
 every unit was as before or as after; `between`, those with some units of several there; `refused`, those
 that ended in an error of one line. Violations are points after which a unit was neither.
 """

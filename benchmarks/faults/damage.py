@@ -1,9 +1,9 @@
-"""A run damaged in every way: what checks miss, and what mending does not bring back.
+"""A run damaged in every way: what checks miss, and what repair does not bring back.
 
-    python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--mend-every 1]
+    python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--fix-every 1]
 
 Random single bit flips over every sort of file, and each file in turn removed, cut and grown; each damage is
-checked, mended and checked again, and the run is then compared with what it was, byte by byte.
+checked, repaired and checked again, and the run is then compared with what it was, byte by byte.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--flips", type=int, default=1000)
     options.add_argument("--cuts-every", type=int, default=1, help="take each so-manieth removal and cut")
-    options.add_argument("--mend-every", type=int, default=1, help="mend each so-manieth damage")
+    options.add_argument("--fix-every", type=int, default=1, help="repair every N-th damage only")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--folder", type=Path, help="where the run is made [the system's temporary folder]")
     chosen = options.parse_args()
@@ -44,11 +44,11 @@ def main() -> None:
         files, campaign, began_s = len(keys_of(clean)), Campaign(), time.perf_counter()
         rng = np.random.default_rng(chosen.seed)
         scratch = Path(folder) / "run"
-        try_all(clean, scratch, flips(clean, chosen.flips, rng), campaign, chosen.mend_every)
+        try_all(clean, scratch, flips(clean, chosen.flips, rng), campaign, chosen.repair_every)
         cut = [damage for i, damage in enumerate(cuts(clean)) if i % chosen.cuts_every == 0]
-        try_all(clean, scratch, cut, campaign, chosen.mend_every)
+        try_all(clean, scratch, cut, campaign, chosen.repair_every)
         elapsed_s = time.perf_counter() - began_s
-    heads = ("damage", "tried", "missed", "mended", "not restored", "not clean")
+    heads = ("damage", "tried", "missed", "repaired", "not restored", "not clean")
     rows = [heads, *((row[0], *map(str, row[1:])) for row in campaign.rows())]
     total = [sum(int(row[k]) for row in rows[1:]) for k in range(1, len(heads))]
     rows.append(("all", *map(str, total)))

@@ -65,7 +65,7 @@ def own_bytes(process: psutil.Process) -> int:
 
 
 def watched(command: Sequence[str], place: Path) -> dict[str, Samples]:
-    """Memory of the driver and of its largest worker while the command makes a run of so many shards."""
+    """Memory of the driver and of its largest worker while the command makes a run of N shards."""
     samples: dict[str, Samples] = {"driver": [], "worker": []}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as job:
         driver = psutil.Process(job.pid)

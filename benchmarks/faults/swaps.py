@@ -1,11 +1,11 @@
-"""Whole files that exchanged their places: what checks miss, and what mending gets wrong or loses.
+"""Whole files that exchanged their places: what checks miss, and what repair gets wrong or loses.
 
     python -m benchmarks.faults.swaps [--each 30]
 
 Two files of one sort exchange their names: records and their copies, and chunks of equal size; within a
 run, between the parts of a merged place, and between a sealed run, one that is not sealed and a merged
-place. After each swap the places are checked, mended and checked again. `restored`: every byte is as before.
-`left`: something is left to find, and nothing but the two files differs. Anything else is wrong.
+place. After each swap the places are checked, repaired and checked again. `restored`: every byte is as
+before. `left`: something is left to find, and nothing but the two files differs. Anything else is wrong.
 """
 
 from __future__ import annotations

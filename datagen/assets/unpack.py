@@ -76,8 +76,8 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> list[PurePosixPath]:
 
 
 def _damaged(archive: Path, error: Exception) -> InputError:
-    mend = "Remove it from the cache and fetch it again"
-    return InputError(archive, "", f"is damaged ({error})", mend)
+    fix = "Remove it from the cache and fetch it again"
+    return InputError(archive, "", f"is damaged ({error})", fix)
 
 
 def _members(archive: Path, limits: Limits) -> Iterator[_Member]:

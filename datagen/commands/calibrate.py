@@ -138,8 +138,8 @@ def _specifications(
     for place, spec in found:
         if spec.label_source == "heuristic":
             problem = "heuristic labels come from the rule itself and cannot calibrate it"
-            mend = "Name a run with trials of its scenes: datagen submit sim --scenes-from RUN"
-            raise InputError(place, "label_source", problem, mend)
+            fix = "Name a run with trials of its scenes: datagen submit sim --scenes-from RUN"
+            raise InputError(place, "label_source", problem, fix)
         if spec.label_source != first.label_source:
             problem = f"is {spec.label_source}, but {first_place} has {first.label_source} labels"
             raise InputError(place, "label_source", problem, "Name runs of one label source")
@@ -157,8 +157,8 @@ def _specifications(
         if spec.split != "val":
             problem = f"is {spec.split}, but parameters are chosen on val"
             if split_check:
-                mend = "Make a run with `datagen submit --split val`, or omit --split-check"
-                raise InputError(place, "split", problem, mend)
+                fix = "Make a run with `datagen submit --split val`, or omit --split-check"
+                raise InputError(place, "split", problem, fix)
             warnings.append(f"{place}: split {problem}: evaluate on other houses")
     return [spec for _, spec in found], warnings
 
@@ -206,8 +206,8 @@ def _calibrate(
     after = refit(trials)
     if len(set(trials.said(after).tolist())) == 1:
         problem = f"the best parameters give all {len(trials):,} candidates one label"
-        mend = "Choose --objective balanced, another --distance, or other --candidates"
-        raise InputError("datagen calibrate", "--objective", problem, mend)
+        fix = "Choose --objective balanced, another --distance, or other --candidates"
+        raise InputError("datagen calibrate", "--objective", problem, fix)
     step()
     left_out = fit_leaving_houses_out(trials, refit, seed, step)
     said = {"before": trials.said(before), "after": left_out.said, "fitted": trials.said(after)}
@@ -306,5 +306,5 @@ def _write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        mend = "Choose another name, or remove it first"
-        raise InputError(path, "--out", "already exists", mend) from None
+        fix = "Choose another name, or remove it first"
+        raise InputError(path, "--out", "already exists", fix) from None

@@ -122,9 +122,9 @@ def _cancel_head(now: bool) -> int:
     if head is not None and not now:
         working = open_ray_jobs(head.jobs_api, head.token).at_work()
         if working:
-            mend = "Cancel them first, or give --now to kill them"
+            fix = "Cancel them first, or give --now to kill them"
             raise InputError(
-                "--head", "", f"{counted(len(working), 'job')} running, first {working[0][:200]}", mend
+                "--head", "", f"{counted(len(working), 'job')} running, first {working[0][:200]}", fix
             )
     began_s = time.monotonic()
     ended = stop_head()

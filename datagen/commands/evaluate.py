@@ -177,8 +177,8 @@ def evaluate(
     )
     evaluated = [*baseline_set.baselines, *models]
     if not evaluated:
-        mend = "Name a checkpoint, or omit --baselines"
-        raise InputError("datagen evaluate", "PATH", "no model or baseline given", mend)
+        fix = "Name a checkpoint, or omit --baselines"
+        raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
     with counting("scenes", json) as seen:
         total, done = sum(place.stream.n_scenes for place in opened), 0
 

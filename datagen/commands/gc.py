@@ -110,6 +110,6 @@ def _print(place: str, report: dict[str, Any]) -> None:
     if report["committed_meanwhile"]:
         print_rows("committed meanwhile and kept", [("attempts", str(report["committed_meanwhile"]))])
     if report["damaged"]:
-        mend = f"datagen repair {shlex.quote(place)}"
-        rows = [(key, mend) for key in report["damaged"][:_SHOWN]]
+        fix = f"datagen repair {shlex.quote(place)}"
+        rows = [(key, fix) for key in report["damaged"][:_SHOWN]]
         print_rows("committed while their files were removed", rows, ("commit", "fix"))

@@ -181,8 +181,8 @@ def predict(
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
         _refuse_length(name, value)
     if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
-        mend = "Give metres per step: 0.001 for millimetres"
-        raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", mend)
+        fix = "Give metres per step: 0.001 for millimetres"
+        raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", fix)
     falls = None if gravity is None else _direction(gravity)
     rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html = (
         None if path is None else Path(path)
@@ -196,8 +196,8 @@ def predict(
     if own_height is None:
         own_height = float(frames[0].T_world_camera[2, 3]) if frames[0].T_world_camera is not None else None
     if own_height is None:
-        mend = "Give it in metres above the floor, or --camera-pose pose.json"
-        raise InputError("--camera-height", "", "missing", mend)
+        fix = "Give it in metres above the floor, or --camera-pose pose.json"
+        raise InputError("--camera-height", "", "missing", fix)
     _refuse_length("--robot-camera-height", own_height)
     answer = scored(
         load_scorer(checkpoint),
@@ -260,8 +260,8 @@ def _frames(
             read_frame(rgb, depth, intrinsics, mask=mask, pose=camera_pose, depth_scale_m=depth_scale_m)
         )
     elif camera_pose is not None and len(named) != 1:
-        mend = "Put pose.json into each frame's folder, or T_world_camera into its .npz"
-        raise InputError("--camera-pose", "", f"is one pose for {len(named)} frames", mend)
+        fix = "Put pose.json into each frame's folder, or T_world_camera into its .npz"
+        raise InputError("--camera-pose", "", f"is one pose for {len(named)} frames", fix)
     frames += [read_place(each, depth_scale_m) if isinstance(each, Path) else each for each in named]
     if not frames:
         raise InputError(
@@ -295,8 +295,8 @@ def _direction(given: Sequence[float]) -> F64:
     values = np.array(given, np.float64)
     sound = values.shape == (3,) and bool(np.isfinite(values).all())
     if not sound or not 1e-6 < float(np.abs(values).max()) < 1e6:
-        mend = "Give x,y,z in the camera frame: 0,1,0 for a level camera"
-        raise InputError("--gravity", ",".join(f"{value:g}" for value in given), "is not a direction", mend)
+        fix = "Give x,y,z in the camera frame: 0,1,0 for a level camera"
+        raise InputError("--gravity", ",".join(f"{value:g}" for value in given), "is not a direction", fix)
     return values
 
 

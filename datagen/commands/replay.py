@@ -114,8 +114,8 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
             if len(found) > _SHOWN:
                 break
     if not found:
-        mend = "Give the id of a committed sample of this run"
-        raise InputError("SAMPLE_ID", text, f"is not a sample of {place}", mend)
+        fix = "Give the id of a committed sample of this run"
+        raise InputError("SAMPLE_ID", text, f"is not a sample of {place}", fix)
     if len(found) > 1:
         shown = ", ".join(_ids(r, s, k + 1)[k].hex() for r, s, k in found[:_SHOWN])
         raise InputError(

@@ -50,8 +50,8 @@ def show(
     of_trial = trial is not None or moving
     if of_trial and spec.arm is None:
         problem = f"{spec.label_source} labels have no trials"
-        mend = "Name a run of plan or sim labels, or give only --out FILE.png"
-        raise InputError(run, "--trial" if trial is not None else "--out", problem, mend)
+        fix = "Name a run of plan or sim labels, or give only --out FILE.png"
+        raise InputError(run, "--trial" if trial is not None else "--out", problem, fix)
     refuse_missing_packages(spec.label_source)
     rows = read_scene(opened, of_run)
     houses = given.houses or sources.get("houses", "builtin")
@@ -73,6 +73,6 @@ def _candidate(trial: str | None) -> int | None:
     if trial is None or trial == _BEST:
         return None
     if not re.fullmatch(r"[+-]?[0-9]{1,30}", trial):
-        mend = f"Give a candidate's index, or {_BEST}"
-        raise InputError("--trial", trial[:40], "is not a whole number", mend)
+        fix = f"Give a candidate's index, or {_BEST}"
+        raise InputError("--trial", trial[:40], "is not a whole number", fix)
     return int(trial)

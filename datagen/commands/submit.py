@@ -283,8 +283,8 @@ def _layout_there(out: str) -> Layout | None:
     except InputError:
         return None  # nothing there, or an address that `open_storage` refuses
     if storage.exists(MERGED):
-        mend = "Extend it with `datagen extend`, or choose another --out"
-        raise InputError(out, "", "holds merged runs, each with its own specification", mend)
+        fix = "Extend it with `datagen extend`, or choose another --out"
+        raise InputError(out, "", "holds merged runs, each with its own specification", fix)
     return Run.open(storage).layout if storage.exists("manifest.json") else None
 
 
@@ -293,7 +293,7 @@ def _refuse_no_scene(world: World, houses: str) -> None:
     try:
         generate_scene(world, 0, StageClock())
     except InputError as error:
-        raise InputError("--houses", houses, f"no scene can be made: {error.problem}", error.mend) from error
+        raise InputError("--houses", houses, f"no scene can be made: {error.problem}", error.fix) from error
 
 
 def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[str, int | str | None]:
@@ -301,8 +301,8 @@ def _candidate_options(kind: str | None, per_scene: int | str | None) -> dict[st
     number = _per_scene(None if per_scene is None else str(per_scene))
     if kind == "grid":
         if number not in (None, "grid"):
-            mend = "Give --candidates clear or in-range to sample some, or omit the number"
-            raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", mend)
+            fix = "Give --candidates clear or in-range to sample some, or omit the number"
+            raise InputError("--candidates-per-scene", str(per_scene), "a grid has all its cells", fix)
         number = "grid"
     elif kind is not None and number == "grid":
         problem = f"a whole grid has other cells than {kind} ones"

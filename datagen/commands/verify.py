@@ -107,7 +107,7 @@ def finding_row(finding: Finding) -> dict[str, Any]:
         "file": finding.key,
         "kind": finding.kind,
         "problem": finding.problem,
-        "mend": finding.mend,
+        "fix": finding.fix,
         "shard": finding.shard,
         "repairable": finding.cure is not None,
     }
@@ -169,7 +169,7 @@ def print_findings(title: str, findings: list[Finding], total: int) -> None:
         return
     lines = [f"{title}: the file, the problem, the fix"]
     for finding in findings[:_SHOWN]:
-        lines += [f"  {printable(finding.key)}", f"      {printable(f'{finding.problem}. {finding.mend}')}"]
+        lines += [f"  {printable(finding.key)}", f"      {printable(f'{finding.problem}. {finding.fix}')}"]
     if total > _SHOWN:
         lines.append(f"  and {total - _SHOWN:,} more: --json lists them")
     print_lines("\n".join(lines))

@@ -50,8 +50,8 @@ def complete_arm(
     `place`. Raises InputError for what the label source does not support.
     """
     if repeats is not None and label_source != "sim":
-        mend = "Omit it, or submit sim"
-        raise InputError("--perturb", str(repeats), f"{label_source} runs no trials", mend)
+        fix = "Omit it, or submit sim"
+        raise InputError("--perturb", str(repeats), f"{label_source} runs no trials", fix)
     if repeats is not None:
         try:
             DisturbanceParams(repeats=repeats)
@@ -106,7 +106,7 @@ def narrow_candidates(fields: Fields, robot: str) -> None:
         candidates.setdefault("base_radius_m", limits.base_radius_m)
 
 
-def refuse_unsuited(spec: Specification, robot: str, place: str, mend: str) -> None:
+def refuse_unsuited(spec: Specification, robot: str, place: str, fix: str) -> None:
     """Raise InputError where candidates of this specification do not suit the robot."""
     limits, candidates = robot_limits(robot), spec.candidates
     for field, asked, limit in (
@@ -116,11 +116,11 @@ def refuse_unsuited(spec: Specification, robot: str, place: str, mend: str) -> N
         if limit is not None and not limit[0] - _STEP_M <= asked.low <= asked.high <= limit[1] + _STEP_M:
             has = f"{limit[0]:g} to {limit[1]:g} m" if limit[0] < limit[1] else f"{limit[0]:g} m"
             problem = f"{asked.low:g} to {asked.high:g} m, and robot {robot} has {has}"
-            raise InputError(place, f"candidates.{field}", problem, mend)
+            raise InputError(place, f"candidates.{field}", problem, fix)
     own_m = limits.base_radius_m
     if own_m is not None and candidates.base_radius_m < own_m - _STEP_M:
         problem = f"{candidates.base_radius_m:g} m, and the base of robot {robot} has {own_m:g} m"
-        raise InputError(place, "candidates.base_radius_m", problem, mend)
+        raise InputError(place, "candidates.base_radius_m", problem, fix)
 
 
 def _narrowed(default: Range, limit: tuple[float, float]) -> dict[str, float]:

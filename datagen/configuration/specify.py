@@ -119,12 +119,12 @@ def first_of(error: ValidationError, place: str, *section: str) -> InputError:
     """The first field that is wrong in a file, or in this section of it."""
     first = error.errors()[0]
     field = ".".join((*section, *map(str, first["loc"])))
-    mend = (
+    fix = (
         "Remove or correct the key: docs/reference/specification.md lists all"
         if (first["type"] == "extra_forbidden")
         else "Correct the value"
     )
-    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", mend)
+    return InputError(place, field, f"{first['msg']} (given: {str(first['input'])[:80]})", fix)
 
 
 def layout_of(spec: Specification, n: int) -> Layout:
@@ -162,14 +162,14 @@ def scene_engines(spec: Specification) -> dict[str, str]:
 
 
 def read_toml(
-    path: Path, mend: str = "Give a TOML file as in docs/reference/specification.md"
+    path: Path, fix: str = "Give a TOML file as in docs/reference/specification.md"
 ) -> dict[str, Any]:
-    """What a TOML file holds. InputError, with `mend`, where it is none, too large or cannot be read."""
-    data = read_regular(path, _MAX_CONFIG_BYTES, mend)
+    """What a TOML file holds. InputError, with `fix`, where it is none, too large or cannot be read."""
+    data = read_regular(path, _MAX_CONFIG_BYTES, fix)
     try:
         return parse_toml(data.decode())
     except ValueError as error:
-        raise InputError(path, "", f"is not TOML: {error}", mend) from None
+        raise InputError(path, "", f"is not TOML: {error}", fix) from None
 
 
 def parse_toml(text: str) -> dict[str, Any]:

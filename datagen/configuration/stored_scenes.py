@@ -104,8 +104,8 @@ def specify_again(
     }
     spec = validated(fields, place)
     if suited is not None:
-        mend = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or choose another robot"
-        refuse_unsuited(spec, suited, stored.run.storage.url, mend)
+        fix = f"Make the scenes with `datagen submit heuristic --robot {suited}`, or choose another robot"
+        refuse_unsuited(spec, suited, stored.run.storage.url, fix)
     return spec
 
 

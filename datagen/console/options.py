@@ -21,8 +21,8 @@ AsJson = Annotated[bool, Parameter(negative=(), help="Print one JSON document to
 def refuse_odd_draws(bootstrap: int, seed: int) -> None:
     """Raise InputError for a number of resamples or a seed that is out of range."""
     if not 1 <= bootstrap <= _MOST_RESAMPLES:
-        mend = "Give another number; 1000 is usual"
-        raise InputError("--bootstrap", str(bootstrap), f"is not between 1 and {_MOST_RESAMPLES}", mend)
+        fix = "Give another number; 1000 is usual"
+        raise InputError("--bootstrap", str(bootstrap), f"is not between 1 and {_MOST_RESAMPLES}", fix)
     if seed < 0:
         raise InputError("--seed", str(seed), "is below 0", "Give 0 or more")
 

@@ -29,7 +29,7 @@ def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
     try:
         n = count(ref)
     except InputError as error:
-        return Check(name, "fail", f"{error.place}: {error.problem}", error.mend)
+        return Check(name, "fail", f"{error.place}: {error.problem}", error.fix)
     if n == 0:
         return Check(name, "fail", f"{ref}: none", f"Name a folder with {name}.")
     return Check(name, "ok", f"{n} from {ref}")
@@ -74,7 +74,7 @@ def extra_checks() -> list[Check]:
 
 
 def as_json(checks: list[Check]) -> dict[str, Any]:
-    """`{"ok": bool, "checks": [{"name", "status", "detail", "mend"}, ...]}`, in the order of the table."""
+    """`{"ok": bool, "checks": [{"name", "status", "detail", "fix"}, ...]}`, in the order of the table."""
     good = all(check.status != "fail" for check in checks)
     return {"ok": good, "checks": [asdict(check) for check in checks]}
 
@@ -88,8 +88,8 @@ def as_table(checks: list[Check]) -> Table:
     for check in checks:
         # Text, because brackets in paths and messages are not markup.
         finding = Text(check.detail)
-        if check.mend:
-            finding.append(f"\n-> {check.mend}", style="cyan")
+        if check.fix:
+            finding.append(f"\n-> {check.fix}", style="cyan")
         table.add_row(Text(check.status, style=_COLOURS[check.status]), check.name, finding)
     return table
 

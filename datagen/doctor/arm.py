@@ -60,6 +60,6 @@ def arm_checks() -> list[Check]:
         opened = probe(code, _DEADLINE_S)
         checks.append(opened.check(f"robot {name}", "warn", f"Use another --robot, or: {_AGAIN}"))
     trial = probe(_TRIAL, _DEADLINE_S)
-    mend = "See `sapien physics` and the robots above; plan labels need no physics."
-    checks.append(trial.check("grasp trial", "warn", mend))
+    fix = "See `sapien physics` and the robots above; plan labels need no physics."
+    checks.append(trial.check("grasp trial", "warn", fix))
     return checks

@@ -15,13 +15,13 @@ Status = Literal["ok", "warn", "fail"]
 class Check:
     """One line of the report. `fail`: labels cannot be made; `warn`: a feature is missing.
 
-    `mend` is the fix, "" where none is needed.
+    `fix` says what to do, "" where nothing is to be done.
     """
 
     name: str
     status: Status
     detail: str
-    mend: str = ""
+    fix: str = ""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Probe:
     succeeded: bool
     text: str
 
-    def check(self, name: str, failed: Status, mend: str) -> Check:
+    def check(self, name: str, failed: Status, fix: str) -> Check:
         """The check of that name: ok, or `failed` with its fix."""
-        return Check(name, "ok", self.text) if self.succeeded else Check(name, failed, self.text, mend)
+        return Check(name, "ok", self.text) if self.succeeded else Check(name, failed, self.text, fix)
 
 
 def _last_line(text: str) -> str:

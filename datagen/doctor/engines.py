@@ -60,7 +60,7 @@ print("ray " + ray.__version__)
 """
 
 _AGAIN = "Install it again: pip install --force-reinstall"
-_MESA_MEND = (
+_MESA_FIX = (
     "Only --renderer sapien needs one; on a CPU it works with Mesa 25 or newer: "
     "on Debian 12 apt-get install -t bookworm-backports mesa-vulkan-drivers"
 )
@@ -81,7 +81,7 @@ def engine_checks() -> list[Check]:
     }
     checks = [answer.check(*findings[name]) for name, answer in found.items()]
     if "sapien" in found and found["sapien"].succeeded:
-        checks.append(probe_render_device().check("sapien render device", "warn", _MESA_MEND))
+        checks.append(probe_render_device().check("sapien render device", "warn", _MESA_FIX))
     return checks
 
 

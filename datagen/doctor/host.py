@@ -81,8 +81,8 @@ def check_cores(group: Path = CGROUP) -> Check:
     detail = f"{allowed} of {total} usable"
     quota = cgroup_cores(group)
     if quota is not None and quota < allowed:
-        mend = f"Use --workers {max(1, int(quota))}, or raise the container's limit."
-        return Check("cores", "warn", f"{detail}, limited to {quota:.1f} by the container", mend)
+        fix = f"Use --workers {max(1, int(quota))}, or raise the container's limit."
+        return Check("cores", "warn", f"{detail}, limited to {quota:.1f} by the container", fix)
     return Check("cores", "ok", detail)
 
 
@@ -113,10 +113,10 @@ def check_disk(name: str, folder: Path, enough: int = ENOUGH_DISK_BYTES) -> Chec
     if free < LEAST_DISK_BYTES and name == "disk":
         return Check(name, "fail", detail, "Free some space, or work on another disk.")
     if free < enough:
-        mend = "Free some space, or work on another disk."
+        fix = "Free some space, or work on another disk."
         if name == "shared memory":
-            mend = "Start the container with --shm-size=1g; without it Ray is slower."
-        return Check(name, "warn", detail, mend)
+            fix = "Start the container with --shm-size=1g; without it Ray is slower."
+        return Check(name, "warn", detail, fix)
     return Check(name, "ok", detail)
 
 
@@ -138,8 +138,8 @@ def check_cache() -> Check:
         with tempfile.TemporaryFile(dir=existing):
             return Check("cache", "ok", str(folder))
     except OSError as error:
-        mend = "Set DATAGEN_CACHE to a writable folder; without one every worker parses all files again."
-        return Check("cache", "warn", str(error), mend)
+        fix = "Set DATAGEN_CACHE to a writable folder; without one every worker parses all files again."
+        return Check("cache", "warn", str(error), fix)
 
 
 def check_libraries() -> list[Check]:
@@ -150,8 +150,8 @@ def check_libraries() -> list[Check]:
             ctypes.CDLL(library)
         except OSError:
             sudo = "" if os.geteuid() == 0 else "sudo "
-            mend = f"{sudo}apt-get install -y {package}"
-            checks.append(Check(library, "warn", f"missing; lost: {lost}", mend))
+            fix = f"{sudo}apt-get install -y {package}"
+            checks.append(Check(library, "warn", f"missing; lost: {lost}", fix))
         else:
             checks.append(Check(library, "ok", "found"))
     return checks

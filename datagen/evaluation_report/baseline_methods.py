@@ -36,10 +36,10 @@ def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: 
 
     InputError where it has none, or where they were fitted on one of `runs`.
     """
-    mend = "Give a file of `datagen calibrate`"
-    section = read_toml(path, mend).get("heuristic")
+    fix = "Give a file of `datagen calibrate`"
+    section = read_toml(path, fix).get("heuristic")
     if not isinstance(section, dict):
-        raise InputError(path, "heuristic", "is missing", mend)
+        raise InputError(path, "heuristic", "is missing", fix)
     fitted_to = set(re.findall(r"^# run ([0-9a-f]{64}):", path.read_text(encoding="utf-8"), re.MULTILINE))
     for run in runs:
         if not allow_seen_houses and any(spec.hash() in fitted_to for spec in run.specs):

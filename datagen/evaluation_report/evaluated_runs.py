@@ -64,8 +64,8 @@ def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
         elif Path(place).is_file():
             checkpoints.append(place)
         else:
-            mend = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
-            raise InputError(place, "", "is neither a checkpoint file nor a run folder", mend)
+            fix = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
+            raise InputError(place, "", "is neither a checkpoint file nor a run folder", fix)
     if not runs:
         raise InputError("datagen evaluate", "PATH", "no run is given", "Name one or more run folders")
     return checkpoints, runs
@@ -130,7 +130,7 @@ def candidate_sets_of(runs: Sequence[EvaluatedRun], asked: Sequence[str]) -> dic
 
 def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[EvaluatedMethod]) -> None:
     """InputError that names a house of these runs on which a method was trained."""
-    mend = "Evaluate a run of another split, or give --allow-seen-houses to report them separately"
+    fix = "Evaluate a run of another split, or give --allow-seen-houses to report them separately"
     by = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
     for run in runs:
         here = run.stream.house_ids()
@@ -139,4 +139,4 @@ def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[Evaluat
                 problem = f"{shared[0]!r} and {len(shared) - 1} more: {who} was trained on them"
                 if len(shared) == 1:
                     problem = f"{shared[0]!r}: {who} was trained on it"
-                raise InputError(run.place, "house_id", problem, mend)
+                raise InputError(run.place, "house_id", problem, fix)

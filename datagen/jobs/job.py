@@ -211,8 +211,8 @@ def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
     totals, runs = summary.totals, [job_run.run for job_run in plan.runs]
     causes = Counter(r.causes[-1] for run in runs for r in run.quarantine_records() if r.causes)
     if summary.end == "aborted":
-        mend = f"Then resume: {command_line(plan.resume)}"
-        raise _CannotContinue(plan.path, "", f"the job cannot continue: {summary.cause}", mend)
+        fix = f"Then resume: {command_line(plan.resume)}"
+        raise _CannotContinue(plan.path, "", f"the job cannot continue: {summary.cause}", fix)
     does_seal = summary.end != "interrupted" and any(run.committed() for run in runs)
     return JobResult(
         path=plan.path,

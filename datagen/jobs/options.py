@@ -52,8 +52,8 @@ class JobOptions:
     def refuse_bad(self) -> None:
         """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
         if self.workers is not None and not 0 <= self.workers <= 4096:
-            mend = "Omit it for one per core"
-            raise InputError("--workers", str(self.workers), "is not between 0 and 4096", mend)
+            fix = "Omit it for one per core"
+            raise InputError("--workers", str(self.workers), "is not between 0 and 4096", fix)
         if not 0 <= self.max_quarantined <= 1:
             given = str(self.max_quarantined)
             raise InputError("--max-quarantined", given, "is not a share", "Give 0.01 for one in a hundred")

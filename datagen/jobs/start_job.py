@@ -113,8 +113,8 @@ def refuse_unusable_engines(spec: Specification, address: str) -> None:
     if address == "local" and spec.scenes_from is None and spec.observation.renderer == "sapien":
         device = probe_render_device()
         if not device.succeeded:
-            problem, mend = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
-            raise InputError("--renderer", "sapien", problem, mend)
+            problem, fix = f"finds no render device ({device.text})", "Use embree, or see `datagen doctor`"
+            raise InputError("--renderer", "sapien", problem, fix)
 
 
 def _refuse_other_engines(run: Run) -> None:
@@ -125,10 +125,10 @@ def _refuse_other_engines(run: Run) -> None:
             here |= scene_engines(spec)
     except PackageNotFoundError as error:
         missing = missing_library(error)
-        mend = missing.mend if missing else "Install it"
-        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", mend) from None
+        fix = missing.fix if missing else "Install it"
+        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", fix) from None
     made = {name: version for name, version in spec.engines.items() if name in here}
     rows = [f"{name}: the run has {a}, this machine {b}" for name, a, b in different_fields(made, here)]
     if rows:
-        place, mend = f"{run.storage.url}/manifest.json", "Install the run's versions, or start a new run"
-        raise InputError(place, "engines", "; ".join(rows), mend)
+        place, fix = f"{run.storage.url}/manifest.json", "Install the run's versions, or start a new run"
+        raise InputError(place, "engines", "; ".join(rows), fix)

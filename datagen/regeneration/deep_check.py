@@ -26,7 +26,7 @@ from datagen.schemas.keys import shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
 
-_MEND = "Do not use this run; find the cause in its code version, libraries or machine"
+_FIX = "Do not use this run; find the cause in its code version, libraries or machine"
 # Candidates of a scene to label again where a label is a plan or a trial.
 _TRIED = 4
 
@@ -72,7 +72,7 @@ def _checked(run: Run, scene: int, findings: Iterator[Finding]) -> Iterator[Find
         yield from findings
     except InputError as error:
         key, problem = str(error.place).removeprefix(f"{run.storage.url}/"), f"scene {scene}: {error.problem}"
-        yield Finding(key, "deep", problem, _MEND, scene // run.layout.scenes_per_shard)
+        yield Finding(key, "deep", problem, _FIX, scene // run.layout.scenes_per_shard)
 
 
 def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
@@ -116,4 +116,4 @@ def _of_stages(
 
 def _finding(run: Run, shard: int, scene: int, problem: str, field: str = "label") -> Finding:
     folder = shard_folder(shard, run.commit_of(shard).attempt)
-    return Finding(f"{folder}/{field}", "deep", f"scene {scene}, {problem}", _MEND, shard)
+    return Finding(f"{folder}/{field}", "deep", f"scene {scene}, {problem}", _FIX, shard)

@@ -42,7 +42,7 @@ class Replayer:
         `rows` selects the candidates to label; by default all. Raises InputError where no scene can be made.
         """
         if self.drawing is None:
-            raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _MEND)
+            raise InputError(self.run.storage.url, "scenes_from", _NO_DRAWING, _FIX)
         drawn, candidates = generate_scene(self.drawing, scene, StageClock())
         plain = scene_row(drawn)
         fields = self.run.schema.scene_fields
@@ -71,7 +71,7 @@ class Replayer:
 
 
 _NO_DRAWING = "the run that made the scenes does not exist any more"
-_MEND = "Give that run with --scenes-from"
+_FIX = "Give that run with --scenes-from"
 
 
 def open_replayer(run: Run, origin: OpenedSources) -> Replayer:

@@ -45,12 +45,12 @@ def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True)
 def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
     """The run whose scenes this one labelled. InputError where it is missing or has other scenes."""
     place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
-    mend = "Give --scenes-from with the run that this one was started with"
+    fix = "Give --scenes-from with the run that this one was started with"
     if not place:
-        raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", mend)
+        raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
     source = Run.open(place)
     if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
-        raise InputError(place, "spec_hash", "has other scenes than this run", mend)
+        raise InputError(place, "spec_hash", "has other scenes than this run", fix)
     return source
 
 

@@ -29,8 +29,8 @@ def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: 
     """
     planned = run.planned()
     if shard not in planned:
-        mend = f"Give one from 0 to {len(planned) - 1}"
-        raise InputError(place, "--shard", f"{shard} is not in this run", mend)
+        fix = f"Give one from 0 to {len(planned) - 1}"
+        raise InputError(place, "--shard", f"{shard} is not in this run", fix)
     record = next((r for r in run.quarantine_records() if r.shard == shard), None)
     failed = _recorded(run, shard, record)
     if not json:
@@ -48,7 +48,7 @@ def replay_shard(place: str, run: Run, shard: int, origin: OpenedSources, json: 
         "committed": differing is not None,
         "differing_files": differing or [],
         "quarantined": record is not None,
-        "mend": None if record is None else f"datagen resume {shlex.quote(place)} --quarantined",
+        "fix": None if record is None else f"datagen resume {shlex.quote(place)} --quarantined",
     }
     if json:
         print_json(report)
@@ -106,6 +106,6 @@ def _print_made(place: str, report: dict[str, Any]) -> None:
         apart = report["differing_files"]
         same = "equal, bit for bit" if not apart else f"{len(apart)} differ, first {apart[0]}"
         rows.append(("committed files", same))
-    if report["mend"]:
-        rows.append(("to try it again", report["mend"]))
+    if report["fix"]:
+        rows.append(("to try it again", report["fix"]))
     print_rows(f"shard {report['shard']} of {place}: runs without failure", rows)

@@ -54,20 +54,20 @@ def relabelled_specification(
     before, place = source.manifest.spec, source.storage.url
     if before.label_source != "heuristic":
         problem = f"is {before.label_source}: such labels cannot be computed from distance and visibility"
-        mend = f"Relabel a heuristic run of these scenes: datagen submit heuristic --scenes-from {place}"
-        raise InputError(place, "label_source", problem, mend)
+        fix = f"Relabel a heuristic run of these scenes: datagen submit heuristic --scenes-from {place}"
+        raise InputError(place, "label_source", problem, fix)
     sources = source.manifest.sources
     stored = StoredScenes(source, sources.get("houses", "builtin"), sources.get("objects", "builtin"))
     spec = specify_again("heuristic", stored, config, options=options)
     if spec.visibility != before.visibility:
         problem = "would change visibilities, which are stored"
-        mend = "Remove it, or cast rays again: datagen submit heuristic --scenes-from RUN"
-        raise InputError(str(config), "visibility", problem, mend)
+        fix = "Remove it, or cast rays again: datagen submit heuristic --scenes-from RUN"
+        raise InputError(str(config), "visibility", problem, fix)
     version = str(load_label_source("heuristic").version)
     if (made := before.engines.get("labels")) != version:
         problem = f"visibilities are of version {made} of the label code, not {version}"
-        mend = "Cast rays again: datagen submit heuristic --scenes-from RUN"
-        raise InputError(place, "engines.labels", problem, mend)
+        fix = "Cast rays again: datagen submit heuristic --scenes-from RUN"
+        raise InputError(place, "engines.labels", problem, fix)
     # rho and distance were computed with the source's versions, whatever is installed here.
     return spec.model_copy(update={"engines": dict(before.engines)})
 
@@ -117,8 +117,8 @@ def _open_target(place: Storage, source: Run, spec: Specification) -> Run:
     run = Run.create_or_open(place, manifest, source.n)
     if run.layout != source.layout:
         problem = f"is {run.layout.scenes_per_shard}, unlike in the source"
-        mend = "Choose another --out: files can be shared only shard by shard"
-        raise InputError(f"{place.url}/manifest.json", "layout.scenes_per_shard", problem, mend)
+        fix = "Choose another --out: files can be shared only shard by shard"
+        raise InputError(f"{place.url}/manifest.json", "layout.scenes_per_shard", problem, fix)
     return run
 
 

@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError, choices
 if TYPE_CHECKING:
     from datagen.train.augment import Augmentation
 
-_MEND = "Give a TOML file as in docs/guides/train.md"
+_FIX = "Give a TOML file as in docs/guides/train.md"
 
 
 def model_sizes(words: Sequence[str]) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def model_sizes(words: Sequence[str]) -> dict[str, Any]:
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
-            sizes |= read_toml(Path(word), _MEND)
+            sizes |= read_toml(Path(word), _FIX)
             continue
         try:
             sizes[name.strip()] = parse_toml(f"value = {text}")["value"]
@@ -43,7 +43,7 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
     kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
     asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
     if word.endswith(".toml"):
-        asked = read_toml(Path(word), _MEND)
+        asked = read_toml(Path(word), _FIX)
     effects: dict[str, Any] = {}
     for name, values in asked.items():
         if name not in kinds:
@@ -56,7 +56,7 @@ def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, 
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, (name, *first["loc"])))
-            raise InputError("--augment", where, first["msg"].lower(), _MEND) from None
+            raise InputError("--augment", where, first["msg"].lower(), _FIX) from None
     return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
 
 

@@ -124,7 +124,7 @@ def _look_at(subject: _CheckedRun, shard: int) -> _CheckedShard:
     except InputError as error:  # it holds something that is not a file: the shard is not trusted
         key = error.place.removeprefix(f"{run.storage.url}/")
         return _CheckedShard(
-            shard, None, [below(prefix, Finding(key, "foreign", error.problem, error.mend, shard))]
+            shard, None, [below(prefix, Finding(key, "foreign", error.problem, error.fix, shard))]
         )
     found = check_commit(run, shard, listed)
     findings, commit = list(found.findings), found.commit

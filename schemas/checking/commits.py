@@ -52,11 +52,11 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Committ
         return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
         return CommittedShard(shard, None, ())  # there is nothing to commit
-    mend = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard again"
+    fix = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard again"
     if ours.data is None and ours.problem == "missing":
-        mend = "Make the shard again with `datagen resume`"
+        fix = "Make the shard again with `datagen resume`"
     problem = f"{ours.problem}, and {'there is no copy' if not copies else 'several attempts left copies'}"
-    return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, mend, shard),))
+    return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, fix, shard),))
 
 
 def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Read[Commit]]:
@@ -112,8 +112,8 @@ def check_account(run: Run, commit: Commit) -> list[Finding]:
         known = start_from_end(end_from_commit(commit, end.record.started if end.record else ""))
         findings.append(account_finding(run.storage, start, problem, known, shard))
     if odd := odd_cost(commit.cost):
-        mend = "Find out which program wrote it: the record is undamaged"
-        findings.append(Finding(commit_key(shard), "account", odd, mend, shard))
+        fix = "Find out which program wrote it: the record is undamaged"
+        findings.append(Finding(commit_key(shard), "account", odd, fix, shard))
     return findings
 
 

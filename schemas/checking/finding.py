@@ -58,7 +58,7 @@ class Finding:
     key: str
     kind: Kind
     problem: str
-    mend: str
+    fix: str
     shard: int | None = None
     cure: Cure | None = None
 

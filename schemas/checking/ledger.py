@@ -65,8 +65,8 @@ def _check_end(
     if start.record is None:
         yield account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
     if odd := odd_cost(noted.cost):
-        mend = "Find out which program wrote it: the record is undamaged"
-        yield Finding(end.key, "account", odd, mend, noted.shard)
+        fix = "Find out which program wrote it: the record is undamaged"
+        yield Finding(end.key, "account", odd, fix, noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
     if noted.outcome == "committed" and noted.shard not in committed:
@@ -94,7 +94,7 @@ def _check_unfinished(
 
 def check_quarantine(run: Run) -> Iterator[Finding]:
     """Check the records of quarantined shards."""
-    mend = "Restore the file from a backup; or remove it: the shard is then tried again"
+    fix = "Restore the file from a backup; or remove it: the shard is then tried again"
     for file in run.storage.list("quarantine"):
         name = file.key.removeprefix("quarantine/")
         if name.endswith(".part"):
@@ -107,7 +107,7 @@ def check_quarantine(run: Run) -> Iterator[Finding]:
             first, seed = shard * run.layout.scenes_per_shard, run.manifest.spec.seed
             problem = problem or ": ".join(other_value(record.record, seed=seed, first_scene=first) or ())
         if problem:
-            yield Finding(file.key, "record", problem, mend)
+            yield Finding(file.key, "record", problem, fix)
 
 
 def _misnamed(named: str, file: str) -> str:

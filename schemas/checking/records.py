@@ -59,16 +59,16 @@ def read(
 
 
 def compare(
-    ours: Read[Record], copy: Read[Record], shard: int | None = None, mend: str = BACKUP
+    ours: Read[Record], copy: Read[Record], shard: int | None = None, fix: str = BACKUP
 ) -> list[Finding]:
     """Check a record and its second copy; each restores the other.
 
-    `mend` is the fix where both are valid but differ.
+    `fix` says what to do where both are valid but differ.
     """
     if ours.record is not None and copy.record is not None:
         if ours.data == copy.data:
             return []
-        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", mend, shard)]
+        return [Finding(ours.key, "record", f"differs from its copy {copy.key}", fix, shard)]
     if ours.record is not None and ours.data is not None:
         return [curable(copy.key, "record", copy.problem, Restore(ours.data), shard)]
     if copy.record is not None and copy.data is not None:

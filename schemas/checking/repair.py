@@ -123,7 +123,7 @@ def _pass(
     relink = bool(files) and repaired.checked.is_sealed and place.folder is not None
     if any(finding.kind in _UNDECIDED for finding in repaired.left):
         why = "Repair the other findings first: the run cannot be sealed before"
-        repaired.left += [replace(finding, mend=why, cure=None) for finding in sealed]
+        repaired.left += [replace(finding, fix=why, cure=None) for finding in sealed]
     elif sealed or relink:
         done |= _repair_sealed(place, sealed, repaired, refused)
     return done or bool(files)
@@ -155,7 +155,7 @@ def _put(
                 place.sync([finding.key])
                 is_put = True
         except InputError as error:
-            refused[finding.key] = f"{error.problem}. {error.mend}"
+            refused[finding.key] = f"{error.problem}. {error.fix}"
         else:
             noted += [finding.key] * is_put
             return True
@@ -304,8 +304,8 @@ def _refuse_fewer_rows(place: Storage) -> None:
         return  # a damaged store does not count
     if (rows := contents.rows("sample")) < held:
         problem = f"has {held} samples, but {rows} are committed and wanted"
-        mend = "Restore the plans or commits of its shards, or remove it with `datagen unseal`"
-        raise InputError(f"{place.url}/{SEALED}", "", problem, mend)
+        fix = "Restore the plans or commits of its shards, or remove it with `datagen unseal`"
+        raise InputError(f"{place.url}/{SEALED}", "", problem, fix)
 
 
 def _repair_one(place: Storage, key: str, cure: Reseal) -> None:

@@ -63,7 +63,7 @@ def below(prefix: str, finding: Finding) -> Finding:
     if not prefix:
         return finding
     return Finding(
-        prefix + finding.key, finding.kind, finding.problem, finding.mend, finding.shard, finding.cure
+        prefix + finding.key, finding.kind, finding.problem, finding.fix, finding.shard, finding.cure
     )
 
 
@@ -73,7 +73,7 @@ def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]
     merged = sound(ours, copy)
     if merged is not None:
         _refuse_other_format(place, MERGED, merged.format_version)
-        return merged.parts, compare(ours, copy, mend=_BROKEN_OFF)
+        return merged.parts, compare(ours, copy, fix=_BROKEN_OFF)
     hashes: set[str] = set()
     for folder in sorted({"/".join(f.key.split("/")[:2]) for f in place.list("parts")}):
         run, _ = _open_run(place.below(folder)) if folder.count("/") == 1 else (None, [])
@@ -126,8 +126,8 @@ def _bad_hash(manifest: Manifest) -> str:
 def _refuse_other_format(storage: Storage, key: str, version: int) -> None:
     if version != FORMAT_VERSION:
         problem = f"{version}, and this program reads {FORMAT_VERSION}"
-        mend = "Use the version of the program that made the run"
-        raise InputError(f"{storage.url}/{key}", "format_version", problem, mend)
+        fix = "Use the version of the program that made the run"
+        raise InputError(f"{storage.url}/{key}", "format_version", problem, fix)
 
 
 def check_plans(run: Run) -> tuple[int, list[Finding]]:
@@ -140,7 +140,7 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
             if name.isascii() and name.isdigit() and len(name) < 10 and f"{folder}/{name}.json" == file.key:
                 numbers.add(int(name))
     n = 0
-    mend = "Restore the file from a backup, or set the number again with `datagen extend`"
+    fix = "Restore the file from a backup, or set the number again with `datagen extend`"
     if max(numbers) > 10 * len(numbers) + 1000:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
         return 0, [Finding("plans", "record", problem, "Move it out of the run")]
@@ -152,14 +152,14 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
         )
         found, plan = compare(ours, copy), sound(ours, copy)
         if plan is None and not found:
-            found = [Finding(key, "record", "missing, as is its copy", mend)]
+            found = [Finding(key, "record", "missing, as is its copy", fix)]
         elif plan is not None and plan.n <= n:
             problem = f"n: {plan.n} is not more than in the plan before"
             found.append(Finding(key, "record", problem, "Remove the plan"))
         findings += found
         n = max(n, plan.n if plan else 0)
     if not n:
-        findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", mend))
+        findings.append(Finding("plans", "record", "has no plan with the number of samples wanted", fix))
     return n, findings
 
 
@@ -172,8 +172,8 @@ def check_notes(storage: Storage) -> Iterator[Finding]:
     key = LINEAGE
     lineage, copy = read(storage, key, Lineage), read(storage, copy_key(key), Lineage)
     if {lineage.problem, copy.problem} != {"missing"}:
-        yield from compare(lineage, copy, mend=_BROKEN_OFF)
-    mend = "Restore the file from a backup, or remove it: no sample depends on it"
+        yield from compare(lineage, copy, fix=_BROKEN_OFF)
+    fix = "Restore the file from a backup, or remove it: no sample depends on it"
     for file in storage.list("jobs"):
         if file.key.endswith(".json") and (problem := read(storage, file.key, AnyRecord).problem):
-            yield Finding(file.key, "record", problem, mend)
+            yield Finding(file.key, "record", problem, fix)

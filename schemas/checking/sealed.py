@@ -164,8 +164,8 @@ def check_store(
         yield curable(SEALED, "sealed", problem, Reseal())
     if tally.lost:  # their rows exist only here: do not seal again
         problem = f"holds {tally.lost} shards whose commits are lost: it cannot be checked"
-        mend = "Make the shards again with `datagen resume`, which seals them with the others"
-        yield Finding(SEALED, "sealed", problem, mend)
+        fix = "Make the shards again with `datagen resume`, which seals them with the others"
+        yield Finding(SEALED, "sealed", problem, fix)
     if tally.unknown or tally.lost:
         return
     sealed = tuple(
@@ -190,8 +190,8 @@ def check_store(
             yield curable(key, "sealed", problem, Reseal(data=data))
     yield from _foreign_files(contents)
     if any(_is_behind(run, wanted[run.manifest.spec_hash], slices) for run in runs):
-        mend = "Run datagen seal to update it; nothing is damaged"
-        yield Finding(SEALED, "stale", "is older than the committed shards", mend)
+        fix = "Run datagen seal to update it; nothing is damaged"
+        yield Finding(SEALED, "stale", "is older than the committed shards", fix)
 
 
 def _is_behind(run: Run, n: int, slices: Mapping[str, SealedSlice]) -> bool:

@@ -123,8 +123,8 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
         absent = ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(done))
         if len(absent) > _MOST_MISSING:
             problem = f"{len(absent)} planned shards are missing, but a store lists at most {_MOST_MISSING}"
-            mend = "Make more of them with `datagen resume`, or make a smaller run"
-            raise InputError(run.storage.url, "plans", problem, mend)
+            fix = "Make more of them with `datagen resume`, or make a smaller run"
+            raise InputError(run.storage.url, "plans", problem, fix)
         sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
     if not shards:
         raise InputError(place.url, "commits", "no shard is committed", "Make some with `datagen resume`")

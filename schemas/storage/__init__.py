@@ -161,8 +161,8 @@ class Storage:
                     key, lambda: ours.take(theirs, source_key, key, limit_bytes), passes=FileNotFoundError
                 )
         except FileNotFoundError as e:
-            mend = "Restore the file from a copy"
-            raise InputError(f"{source.url}/{source_key}", "", "no such file", mend) from e
+            fix = "Restore the file from a copy"
+            raise InputError(f"{source.url}/{source_key}", "", "no such file", fix) from e
 
     def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
         """Link or copy many files of another storage, given as (its key, key here), as `adopt` does.

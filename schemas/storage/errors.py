@@ -21,7 +21,7 @@ NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.EN
 CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 MACHINE = (*FULL, *FORBIDDEN, errno.EMFILE, errno.ENAMETOOLONG)
 
-_MENDS = {
+_FIXES = {
     errno.ENOSPC: "Free disk space or write to another disk",
     errno.EDQUOT: "Free disk space or raise the quota",
     errno.EFBIG: "Raise the limit of file sizes (ulimit -f), or write to another file system",
@@ -34,11 +34,11 @@ _MENDS = {
     errno.EMFILE: "Raise the limit of open files (ulimit -n)",
     errno.EIO: "Check the disk",
 }
-_OTHER_MEND = "Check that the path exists, is reachable and can be written"
+_OTHER_FIX = "Check that the path exists, is reachable and can be written"
 
 _RESUME = "then continue with `datagen resume`"
-_KEYS_MEND = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
-_ENDPOINT_MEND = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
+_KEYS_FIX = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they allow in this bucket"
+_ENDPOINT_FIX = f"Check AWS_ENDPOINT_URL and the network, {_RESUME}"
 _TRUSTED = r"[A-Za-z][A-Za-z0-9.]{0,60}"
 
 
@@ -62,18 +62,18 @@ class RequestFailure:
     """The failure of one request to an object store. `passing`: a retry may succeed."""
 
     problem: str
-    mend: str
+    fix: str
     passing: bool
 
     def at(self, place: str) -> StoreUnavailable:
         """The error for this failure."""
-        return StoreUnavailable(place, "", self.problem, self.mend)
+        return StoreUnavailable(place, "", self.problem, self.fix)
 
 
 def storage_error(place: str | Path, error: OSError) -> InputError:
     """The one-line error for a failed file operation, with the fix for its errno."""
     problem = os.strerror(error.errno) if error.errno is not None else str(error)
-    return InputError(place, "", problem, _MENDS.get(error.errno or 0, _OTHER_MEND))
+    return InputError(place, "", problem, _FIXES.get(error.errno or 0, _OTHER_FIX))
 
 
 def machine_error(error: BaseException | None, codes: Sequence[int] = MACHINE) -> InputError | None:
@@ -107,25 +107,25 @@ def store_trouble(error: Exception) -> RequestFailure:
     code = _found(rf"<Code>({_TRUSTED})</Code>", text)
     if "//169.254." in text:  # address at which a cloud machine requests its role
         asked_too_often = status.startswith("5") or status == "429"
-        return RequestFailure("no credentials are set", _KEYS_MEND, passing=asked_too_often)
+        return RequestFailure("no credentials are set", _KEYS_FIX, passing=asked_too_often)
     if code == "NoSuchBucket":
-        mend = "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
-        return RequestFailure("no such bucket", mend, passing=False)
+        fix = "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
+        return RequestFailure("no such bucket", fix, passing=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
-        mend = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
-        return RequestFailure("the bucket is in another region", mend, passing=False)
+        fix = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
+        return RequestFailure("the bucket is in another region", fix, passing=False)
     if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
-        return RequestFailure(f"access denied ({code or status})", _KEYS_MEND, passing=False)
+        return RequestFailure(f"access denied ({code or status})", _KEYS_FIX, passing=False)
     if status and not status.startswith("2"):
         shown = f"{status} {code}" if code else status
         if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
-            mend = f"Wait until the store has recovered, {_RESUME}"
-            return RequestFailure(f"the store responds {shown}", mend, passing=True)
-        mend = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"
-        return RequestFailure(f"the store refuses ({shown})", mend, passing=False)
+            fix = f"Wait until the store has recovered, {_RESUME}"
+            return RequestFailure(f"the store responds {shown}", fix, passing=True)
+        fix = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"
+        return RequestFailure(f"the store refuses ({shown})", fix, passing=False)
     if code:  # a copy that fails late responds 200 with an error in its body
-        mend = f"Wait until the store has recovered, {_RESUME}"
-        return RequestFailure(f"the store responds {code}", mend, passing=True)
+        fix = f"Wait until the store has recovered, {_RESUME}"
+        return RequestFailure(f"the store responds {code}", fix, passing=True)
     return _trouble_on_the_way(text)
 
 
@@ -133,14 +133,14 @@ def _trouble_on_the_way(text: str) -> RequestFailure:
     kind = _found(r"HttpError \{\s*kind: ([A-Za-z]+)", text)
     if kind == "Connect":
         why = "unknown host name" if "dns error" in text else "the connection fails"
-        return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_MEND, passing=True)
+        return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_FIX, passing=True)
     if kind == "Timeout":
-        mend = f"Check the network, or raise DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
-        return RequestFailure("the store does not respond in time", mend, passing=True)
+        fix = f"Check the network, or raise DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
+        return RequestFailure("the store does not respond in time", fix, passing=True)
     if kind in ("Request", "Interrupted", "Decode"):
-        return RequestFailure("the store's response is cut off", _ENDPOINT_MEND, passing=True)
-    mend = "Check that AWS_ENDPOINT_URL is an S3 store"
-    return RequestFailure("the response is not that of an S3 store", mend, passing=False)
+        return RequestFailure("the store's response is cut off", _ENDPOINT_FIX, passing=True)
+    fix = "Check that AWS_ENDPOINT_URL is an S3 store"
+    return RequestFailure("the response is not that of an S3 store", fix, passing=False)
 
 
 def _found(pattern: str, text: str) -> str:

@@ -242,8 +242,8 @@ class LocalFiles:
 
     def _list(self, folder: int, prefix: str, depth: int) -> Iterator[StoredFile]:
         if depth > _MAX_DEPTH:
-            mend = "It was not written by datagen: remove it"
-            raise NotARegularFile(f"{self.folder}/{prefix}", "", "folders are nested too deeply", mend)
+            fix = "It was not written by datagen: remove it"
+            raise NotARegularFile(f"{self.folder}/{prefix}", "", "folders are nested too deeply", fix)
         with os.scandir(folder) as entries:
             for entry in entries:
                 key = prefix + entry.name
@@ -268,8 +268,8 @@ class LocalFiles:
         kind = _KINDS.get(stat.S_IFMT(mode))
         if kind is not None:
             place = f"{self.folder}/{key}"
-            mend = "Remove it, or replace it by a copy of the file"
-            raise NotARegularFile(place, "", f"{where or 'is '}{kind}, which a run never has", mend)
+            fix = "Remove it, or replace it by a copy of the file"
+            raise NotARegularFile(place, "", f"{where or 'is '}{kind}, which a run never has", fix)
 
     def _copy(self, key: str, draft: str, into: int) -> None:
         fd = self._open_file(key)

@@ -34,8 +34,8 @@ def timeout_s() -> float:
     except ValueError:
         seconds = 0.0
     if not 0.1 <= seconds <= 3600:
-        mend = "Give the timeout of the object store in seconds, 0.1 to 3600"
-        raise InputError("DATAGEN_STORE_TIMEOUT_S", given[:40], "is not a valid timeout", mend)
+        fix = "Give the timeout of the object store in seconds, 0.1 to 3600"
+        raise InputError("DATAGEN_STORE_TIMEOUT_S", given[:40], "is not a valid timeout", fix)
     return seconds
 
 
@@ -43,16 +43,16 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
     """(bucket, prefix) of an s3:// address; InputError for a bad address or endpoint."""
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
     prefix = prefix.rstrip("/")
-    mend = "Give s3://bucket/prefix"
+    fix = "Give s3://bucket/prefix"
     if "@" in bucket or "?" in url or "#" in url:
         # Not shown: it may contain a key.
         problem = "has more than a bucket and a prefix"
-        raise InputError("the s3:// address", "", problem, f"{mend}, and keys in AWS_* variables")
+        raise InputError("the s3:// address", "", problem, f"{fix}, and keys in AWS_* variables")
     if not _BUCKET.fullmatch(bucket):
-        mend = f"{mend}, with 3 to 63 small letters, digits, dots and hyphens for the bucket"
-        raise InputError(url[:200], "", "does not name a bucket", mend)
+        fix = f"{fix}, with 3 to 63 small letters, digits, dots and hyphens for the bucket"
+        raise InputError(url[:200], "", "does not name a bucket", fix)
     if prefix and any(part in ("", ".", "..") for part in prefix.split("/")):
-        raise InputError(url[:200], "", "has an empty part, or a part of dots", mend)
+        raise InputError(url[:200], "", "has an empty part, or a part of dots", fix)
     _refuse_endpoint()
     return bucket, prefix
 
@@ -70,7 +70,7 @@ def _refuse_endpoint() -> None:
         except ValueError:
             usable = False
         if not usable or " " in given:
-            mend = "Give http(s)://HOST:PORT of the store, without keys"
-            raise InputError(name, "", "is not the address of a store", mend)
+            fix = "Give http(s)://HOST:PORT of the store, without keys"
+            raise InputError(name, "", "is not the address of a store", fix)
         if given.lower().startswith("http:") and not connection_settings().get("allow_http"):
             raise InputError(name, "", "is not encrypted (http)", "Set AWS_ALLOW_HTTP=true to allow it")

@@ -1,4 +1,4 @@
-"""Bad command lines, configurations and houses: one line that names place and mend, and no trace."""
+"""Bad command lines, configurations and houses: one line that names place and fix, and no trace."""
 
 from __future__ import annotations
 

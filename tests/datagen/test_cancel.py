@@ -120,7 +120,9 @@ def test_a_job_that_lives_and_does_not_answer_is_waited_for_no_longer(
         assert cli.run(["cancel", str(run)]) == 1
         told = capsys.readouterr()
         (line,) = [line for line in told.err.splitlines() if "has not ended" in line]
-        assert job.id in line and "its last sign was 5 min" in line and f"kill -9 {work.process.pid} on" in line
+        assert (
+            job.id in line and "its last sign was 5 min" in line and f"kill -9 {work.process.pid} on" in line
+        )
         assert f"datagen resume {run}" in line and "Resume with" not in told.out
     finally:
         work.process.send_signal(signal.SIGCONT)

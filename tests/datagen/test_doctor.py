@@ -36,7 +36,7 @@ def test_a_probe_tells_the_last_line() -> None:
     assert failed.text == "RuntimeError: no such device"
 
 
-def test_broken_engines_are_named_with_a_mend(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_engines_are_named_with_a_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "find_spec", lambda name: name)
     for code in ("_SAPIEN_PHYSICS", "_PYBULLET", "_EMBREE", "_RAY"):
         monkeypatch.setattr(engines, code, "import a_module_that_is_not_there")
@@ -49,8 +49,8 @@ def test_broken_engines_are_named_with_a_mend(monkeypatch: pytest.MonkeyPatch) -
     }
     for check in found.values():
         assert "a_module_that_is_not_there" in check.detail
-        assert check.mend
-    assert "--workers 0" in found["ray"].mend  # one worker is a worker of Ray's
+        assert check.fix
+    assert "--workers 0" in found["ray"].fix  # one worker is a worker of Ray's
 
 
 def test_one_settler_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_what_is_not_installed_is_not_probed_and_its_extra_is_named(monkeypatch:
     assert found["extra sim"].status == found["extra pybullet"].status == "ok"  # a choice, not a fault
     assert found["extra labels"].status == "fail"
     assert found["extra sim"].detail == "not installed (coal); would give plan and sim labels"
-    assert found["extra sim"].mend == how_to_get("sim") != ""
+    assert found["extra sim"].fix == how_to_get("sim") != ""
     assert not arm.arm_checks()
     assert not {"embree", "pybullet"} & {check.name for check in engines.engine_checks()}
 
@@ -79,7 +79,7 @@ def test_what_is_not_installed_is_not_probed_and_its_extra_is_named(monkeypatch:
 def test_arm_libraries_that_do_not_work_are_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arm, "_LIBRARIES", "raise ImportError('libcoal.so: wrong')")
     (check,) = arm.arm_checks()
-    assert check.status == "warn" and "libcoal" in check.detail and "--force-reinstall" in check.mend
+    assert check.status == "warn" and "libcoal" in check.detail and "--force-reinstall" in check.fix
 
 
 def test_what_is_broken_of_the_arm_stack_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +89,7 @@ def test_what_is_broken_of_the_arm_stack_is_named(monkeypatch: pytest.MonkeyPatc
     found = {check.name: check for check in arm.arm_checks()}
     assert found["robot panda"].status == "warn" and "no such URDF" in found["robot panda"].detail
     assert found["grasp trial"].status == "warn" and found["grasp trial"].detail == "crashed with SIGSEGV"
-    assert all(check.mend for check in found.values() if check.status != "ok")
+    assert all(check.fix for check in found.values() if check.status != "ok")
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_container_limits_are_named(tmp_path: Path) -> None:
     (tmp_path / "memory.current").write_text(str(100 * 2**20))
     cores, memory = host.check_cores(tmp_path), host.check_memory(tmp_path)
     assert cores.status == "warn"
-    assert "--workers 1" in cores.mend
+    assert "--workers 1" in cores.fix
     assert memory.status == "fail"
     assert "container limit" in memory.detail
 
@@ -118,7 +118,7 @@ def test_disk(tmp_path: Path) -> None:
     assert host.check_disk("temporary files", tmp_path, enough=2**62).status == "warn"
     absent = host.check_disk("temporary files", tmp_path / "absent", ENOUGH_DISK_BYTES)
     assert absent.status == "warn"
-    assert absent.mend
+    assert absent.fix
 
 
 def test_cache_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def test_cache_follows_the_environment(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("DATAGEN_CACHE", str(tmp_path / "file" / "below"))
     refused = host.check_cache()
     assert refused.status == "warn"
-    assert "DATAGEN_CACHE" in refused.mend
+    assert "DATAGEN_CACHE" in refused.fix
     monkeypatch.delenv("DATAGEN_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert host.cache_folder() == tmp_path / "datagen"
@@ -138,7 +138,7 @@ def test_a_missing_library_comes_with_its_package(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(host, "LIBRARIES", {"libnothere.so.9": ("nothing", "libnothere9")})
     (check,) = host.check_libraries()
     assert check.status == "warn"
-    assert "apt-get install -y libnothere9" in check.mend
+    assert "apt-get install -y libnothere9" in check.fix
 
 
 def test_gpu_program_that_fails_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,16 +167,16 @@ def test_engines_work_where_the_tests_run_and_json_names_every_check(
     arms = [check for check in report["checks"] if check["name"].startswith(("arm", "robot", "grasp"))]
     assert len(arms) == 2 + len(ROBOTS) and {check["status"] for check in arms} == {"ok"}, arms
     for check in report["checks"]:
-        assert list(check) == ["name", "status", "detail", "mend"]
-        assert check["detail" if check["status"] == "ok" else "mend"]
+        assert list(check) == ["name", "status", "detail", "fix"]
+        assert check["detail" if check["status"] == "ok" else "fix"]
 
 
 def test_a_missing_folder_of_houses_fails(tmp_path: Path) -> None:
     houses, objects = doctor.asset_checks(f"procthor:{tmp_path / 'absent'}", "teapots:x")
     assert houses.status == objects.status == "fail"
     assert str(tmp_path / "absent") in houses.detail
-    assert houses.mend
-    assert "ycb" in objects.mend
+    assert houses.fix
+    assert "ycb" in objects.fix
 
 
 def test_real_assets_are_counted(assets: Path) -> None:

@@ -191,7 +191,7 @@ def test_a_place_without_a_run_is_refused(tmp_path: Path, capsys: pytest.Capture
     assert list(tmp_path.iterdir())
 
 
-def test_an_index_is_mended_on_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_index_is_repaired_on_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path, n=50)
     assert json_of(capsys, ["gc", str(tmp_path)])["found"]["index"]["pieces"] == 0
     assert len(index_files(run)) == 1
@@ -342,7 +342,7 @@ def test_a_commit_that_stands_has_its_files(script: list[bool], dies_at: int | N
     died_after_its_put = isinstance(answers["commit"], KeyboardInterrupt) and "put_new" in theirs.calls
     if run.committed() == {3}:
         if died_after_its_put and not swept.spared:
-            assert dies_at is not None  # the one case that only `repair` mends
+            assert dies_at is not None  # the one case that only `repair` repairs
         else:
             run.check_files(run.commit_of(3))
             assert swept.spared == 1

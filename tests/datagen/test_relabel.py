@@ -367,7 +367,7 @@ def test_runs_on_s3_are_relabelled_and_replayed_there(
     assert told["equal"] and told["drawn_again"] and told["sample"]["candidate"] == 3
 
 
-def test_damage_to_a_shared_file_is_mended_in_the_source_and_then_in_the_run(
+def test_damage_to_a_shared_file_is_repaired_in_the_source_and_then_in_the_run(
     source: Path, tmp_path: Path
 ) -> None:
     origin, out = tmp_path / "origin", tmp_path / "run"

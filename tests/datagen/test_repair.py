@@ -74,7 +74,7 @@ def test_a_shard_that_comes_out_otherwise_is_refused_and_left(
     before = files_of(copied / "shards")
     report = repaired(copied, capsys, 1)
     (left,) = [f for f in report["left"] if f["kind"] == "file"]
-    assert left["file"] == key and "other bytes" in left["mend"] and report["files_made_again"] == []
+    assert left["file"] == key and "other bytes" in left["fix"] and report["files_made_again"] == []
     assert files_of(copied / "shards") == before
     assert cli.run(["repair", str(copied)]) == 1
     assert "differs here" in capsys.readouterr().out
@@ -83,7 +83,7 @@ def test_a_shard_that_comes_out_otherwise_is_refused_and_left(
 def test_sources_that_have_moved_are_named(copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damage(copied, "shards/000001/*/rgb/c.0.0.0")
     report = repaired(copied, capsys, 1, "--houses", "builtin:3")
-    assert any("builtin:3" in f["mend"] for f in report["left"])
+    assert any("builtin:3" in f["fix"] for f in report["left"])
     assert repaired(copied, capsys, 0)["clean"]
 
 
@@ -96,10 +96,10 @@ def test_several_processes_make_shards_again(
     assert files_of(copied) == files_of(finished)
 
 
-# Made-up runs: how mending goes about it ---------------------------------------------------------
+# Made-up runs: how repair goes about it ---------------------------------------------------------
 
 
-def test_a_mending_that_is_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
+def test_an_interrupted_repair_is_finished_by_the_next(tmp_path: Path) -> None:
     make_place(tmp_path / "clean", 39)
     copy_run(tmp_path / "clean", tmp_path / "run")
     keys = [damage(tmp_path / "run", f"shards/00000{k}/*/label/c.0") for k in range(4)]
@@ -117,7 +117,7 @@ def test_a_mending_that_is_broken_off_is_finished_by_the_next(tmp_path: Path) ->
     assert files_of(tmp_path / "run") == files_of(tmp_path / "clean")
 
 
-def test_a_failing_simulator_leaves_its_shard_and_mends_the_others(tmp_path: Path) -> None:
+def test_a_failing_simulator_leaves_its_shard_and_others_are_repaired(tmp_path: Path) -> None:
     make_place(tmp_path / "run", 39)
     keys = [damage(tmp_path / "run", f"shards/00000{k}/*/label/c.0") for k in range(3)]
 
@@ -129,7 +129,7 @@ def test_a_failing_simulator_leaves_its_shard_and_mends_the_others(tmp_path: Pat
     repaired = repair_runs(open_storage(tmp_path / "run", probe=False), fail, workers=2)
     assert sorted(repaired.regenerated_files) == [keys[0], keys[2]]
     assert {f.key for f in repaired.left if f.kind == "file"} == {keys[1]}
-    assert any("left sense" in f.mend for f in repaired.left)
+    assert any("left sense" in f.fix for f in repaired.left)
 
 
 def test_a_deleted_chunk_comes_back_from_the_sealed_store(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_a_deleted_chunk_comes_back_from_the_sealed_store(tmp_path: Path) -> Non
     assert (tmp_path / "run" / key).samefile(tmp_path / "run/data.zarr/points_m/c.1.0.0")
 
 
-def test_what_cannot_be_mended_is_left_and_said(tmp_path: Path) -> None:
+def test_what_cannot_be_repaired_is_left_and_said(tmp_path: Path) -> None:
     run = make_place(tmp_path / "run", 19)
     (tmp_path / "run/ledger/b-0.json").write_bytes(b"")
     for key in ("commits/000001.json", "shards/000001/a-1/commit.json", "ledger/a-1.json"):
@@ -163,7 +163,7 @@ def test_what_cannot_be_mended_is_left_and_said(tmp_path: Path) -> None:
         run.commit_of(1)
 
 
-def test_the_parts_of_a_merged_place_are_mended(tmp_path: Path) -> None:
+def test_the_parts_of_a_merged_place_are_repaired(tmp_path: Path) -> None:
     specs = sorted((small_spec(seed) for seed in (1, 2)), key=lambda spec: spec.hash())
     for spec in specs:
         make_run(tmp_path / "clean" / part_folder(spec.hash()), 20, spec=spec)
@@ -182,7 +182,7 @@ def test_the_parts_of_a_merged_place_are_mended(tmp_path: Path) -> None:
     assert files_of(tmp_path / "run") == files_of(tmp_path / "clean"), sealed
 
 
-def test_a_relabelled_run_is_mended_after_the_one_whose_scenes_it_shares(
+def test_a_relabelled_run_is_repaired_after_the_one_whose_scenes_it_shares(
     finished: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     again = tmp_path / "again"
@@ -204,7 +204,7 @@ def quick() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_run_on_s3_is_checked_and_mended(bucket: str) -> None:
+def test_a_run_on_s3_is_checked_and_repaired(bucket: str) -> None:
     run = make_place(f"{bucket}/run", 19)
     storage = run.storage
     whole = {f.key: storage.get(f.key, 2**30) for f in storage.list("")}

@@ -219,7 +219,7 @@ def test_a_shard_that_runs_here_says_how_to_lift_its_quarantine(
     assert told.index("the last cause") < told.index("no file was written")
     assert files_of(given_up) == held
     report = json_of(capsys, ["replay", str(given_up), "--shard", "1"])
-    assert report["mend"] == f"datagen resume {given_up} --quarantined" and not report["committed"]
+    assert report["fix"] == f"datagen resume {given_up} --quarantined" and not report["committed"]
 
 
 def test_a_committed_shard_is_compared_with_its_files(

@@ -40,7 +40,7 @@ def test_a_finished_run_is_clean_also_when_its_rows_are_computed_again(
     assert "clean" in capsys.readouterr().out
 
 
-def test_findings_are_told_with_file_problem_and_mend(
+def test_findings_are_told_with_file_problem_and_fix(
     copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (copied / "plans/1.json").unlink()

@@ -49,7 +49,7 @@ class Operation:
     the user does then (the same again, where it is not given). `places` are the runs in the folder;
     `exact` operations, resumed, leave the very files that they leave undisturbed. Attempts of merges have
     the names that they have in the sources, and another merge may be at them: `shared` ones are not taken
-    back when the disk refuses, as they are links and take no room. Where an operation mends a sealed store,
+    back when the disk refuses, as they are links and take no room. Where an operation repairs a sealed store,
     each of the store's files is a unit (`by_file`), and else the whole store."""
 
     name: str
@@ -255,7 +255,7 @@ def _repair(folder: Path) -> None:
 
     repaired = repair_runs(open_storage(folder, probe=False), regenerate)
     for finding in repaired.left:
-        raise InputError(finding.key, "", finding.problem, finding.mend)  # the command ends with 1
+        raise InputError(finding.key, "", finding.problem, finding.fix)  # the command ends with 1
 
 
 def _littered(folder: Path) -> None:

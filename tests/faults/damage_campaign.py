@@ -1,4 +1,4 @@
-"""A run damaged on purpose, one file at a time: what checks find, and what mending brings back."""
+"""A run damaged on purpose, one file at a time: what checks find, and what repair brings back."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Campaign:
     not_clean: list[str] = field(default_factory=list[str])
 
     def rows(self) -> Iterator[tuple[str, int, int, int, int, int]]:
-        """(kind, tried, missed, mended, not restored, not clean after), by kind."""
+        """(kind, tried, missed, repaired, not restored, not clean after), by kind."""
         for kind in sorted(self.tried):
             counts = [
                 sum(one.startswith(f"{kind} ") for one in bad)
@@ -127,9 +127,9 @@ def keys_of(folder: Path) -> list[str]:
 
 
 def try_all(
-    clean: Path, scratch: Path, damages: Iterable[Damage], campaign: Campaign, mend_every: int = 1
+    clean: Path, scratch: Path, damages: Iterable[Damage], campaign: Campaign, repair_every: int = 1
 ) -> None:
-    """Do each damage to a run equal to `clean` and check it; mend every so many of them, and check again."""
+    """Do each damage to a run equal to `clean` and check it; fix every so many of them, and check again."""
     shutil.rmtree(scratch, ignore_errors=True)
     copy_run(clean, scratch)
     whole = {key: (clean / key).read_bytes() for key in keys_of(clean)}
@@ -139,11 +139,11 @@ def try_all(
         undo = apply(scratch, damage)
         if not [f for f in findings_at(scratch) if f.is_damage]:
             campaign.missed.append(name)
-        if number % mend_every:
+        if number % repair_every:
             undo()
             continue
         campaign.repaired[damage.kind] += 1
-        repaired = mend_at(scratch)
+        repaired = repair_at(scratch)
         if repaired.changed:
             campaign.not_restored.append(f"{name}: also touched {repaired.changed[:3]}")
         there = {key: (scratch / key).read_bytes() for key in keys_of(scratch)}
@@ -202,8 +202,8 @@ def findings_at(folder: Path) -> list[Finding]:
     return list(check_runs(open_storage(folder, probe=False, create=False), Checked()))
 
 
-def mend_at(folder: Path) -> Repaired:
-    """Mend a place of random rows."""
+def repair_at(folder: Path) -> Repaired:
+    """Repair a place of random rows."""
     return repair_runs(open_storage(folder, probe=False, create=False), regenerate)
 
 

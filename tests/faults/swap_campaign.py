@@ -1,4 +1,4 @@
-"""Two whole files that exchanged their places: what checks find, and what mending brings back or leaves."""
+"""Two whole files that exchanged their places: what checks find, and what repair brings back or leaves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from datagen.schemas.root_records import publish
 from datagen.schemas.run_records import LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal
 from datagen.schemas.storage import open_storage
-from tests.faults.damage_campaign import copy_run, findings_at, mend_at
+from tests.faults.damage_campaign import copy_run, findings_at, repair_at
 from tests.made_runs import attempt, files_of, make_run, small_spec, utc_now
 
 PLACES = ("run", "open", "merged")
@@ -119,7 +119,7 @@ def swaps(world: Path, each: int | None, rng: np.random.Generator) -> Iterator[S
 
 
 def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
-    """Exchange two files, check the places that hold them, mend these, and compare everything."""
+    """Exchange two files, check the places that hold them, fix these, and compare everything."""
     shutil.rmtree(world, ignore_errors=True)
     copy_run(clean, world)
     before = files_of(world)
@@ -133,18 +133,18 @@ def try_swap(clean: Path, world: Path, swap: Swap, found: Swaps) -> None:
     for place in swap.places:
         if not any(finding.is_damage for finding in findings_at(world / place)):
             wrong(f"{place}: missed")
-    # All are swapped before one is mended: what lies in another place counts as what is lost there.
+    # All are swapped before one is repaired: what lies in another place counts as what is lost there.
     for place in swap.places:
-        mended = mend_at(world / place)
-        left = [finding for finding in mended.left if finding.is_damage]
+        repaired = repair_at(world / place)
+        left = [finding for finding in repaired.left if finding.is_damage]
         is_left |= bool(left)
         there = files_of(world / place)
-        said = mended.written | (
-            {key for key in there if key.startswith(SEALED)} if mended.resealed else set()
+        said = repaired.written | (
+            {key for key in there if key.startswith(SEALED)} if repaired.resealed else set()
         )
         for key in sorted(said):
             if there.get(key) != before.get(f"{place}/{key}"):
-                wrong(f"{place}: {key} is not what it was, though it was mended")
+                wrong(f"{place}: {key} is not what it was, though it was repaired")
         if not left and findings_at(world / place):
             wrong(f"{place}: not clean after")
     after = files_of(world)

@@ -1,4 +1,4 @@
-"""A run with one file damaged: checks find every damage, and mending brings back what has a second source."""
+"""A run with one file damaged: checks find every damage, and repair brings back what has a second source."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ def one_of_each(clean: Path) -> list[Damage]:
     return list(found.values())
 
 
-def test_every_bit_flip_is_found_and_mended(clean: Path, tmp_path: Path):
+def test_every_bit_flip_is_found_and_repaired(clean: Path, tmp_path: Path):
     campaign = Campaign()
-    try_all(clean, tmp_path / "run", flips(clean, 60, np.random.default_rng(3)), campaign, mend_every=9)
+    try_all(clean, tmp_path / "run", flips(clean, 60, np.random.default_rng(3)), campaign, repair_every=9)
     assert (campaign.missed, campaign.not_restored, campaign.not_clean) == ([], [], [])
     assert campaign.tried.total() == 60 and len(campaign.tried) == len({kind_of(k) for k in keys_of(clean)})
 
 
-def test_every_cut_is_found_and_mended(clean: Path, tmp_path: Path):
+def test_every_cut_is_found_and_repaired(clean: Path, tmp_path: Path):
     campaign, damages = Campaign(), one_of_each(clean)
-    try_all(clean, tmp_path / "run", damages, campaign, mend_every=8)
+    try_all(clean, tmp_path / "run", damages, campaign, repair_every=8)
     assert (campaign.missed, campaign.not_restored, campaign.not_clean) == ([], [], [])
     assert campaign.tried.total() == len(damages) == 5 * len({kind_of(k) for k in keys_of(clean)})
 

@@ -1,4 +1,4 @@
-"""Whole files that exchanged their places: found, and mended where something names what they belong to."""
+"""Whole files that exchanged their places: found, and repaired where something names what they belong to."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Plan
-from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, mend_at
+from tests.faults.damage_campaign import copy_run, fewer_arrays, findings_at, repair_at
 from tests.faults.swap_campaign import Swap, Swaps, exchange, make_world, swaps, try_swap
 from tests.made_runs import attempt, files_of, make_run, small_spec, write
 
@@ -35,7 +35,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return world
 
 
-def test_a_swap_of_each_kind_is_found_and_mended_or_left_whole(clean: Path, tmp_path: Path) -> None:
+def test_a_swap_of_each_kind_is_found_and_repaired_or_left_whole(clean: Path, tmp_path: Path) -> None:
     found = Swaps()
     for swap in swaps(clean, 1, np.random.default_rng(3)):
         try_swap(clean, tmp_path / "world", swap, found)
@@ -88,7 +88,7 @@ def test_a_manifest_of_another_part_is_not_read(clean: Path, tmp_path: Path) -> 
     exchange(one / "manifest.json", other / "manifest.json")
     with pytest.raises(InputError, match=r"spec_hash.*datagen repair"):
         open_runs(tmp_path / "merged")
-    assert mend_at(tmp_path / "merged").left == []
+    assert repair_at(tmp_path / "merged").left == []
     assert files_of(tmp_path / "merged") == whole
 
 
@@ -105,7 +105,7 @@ def test_a_commit_that_the_ledger_does_not_know_gives_way_to_the_winners(tmp_pat
     exchange(tmp_path / "run" / commit_key(1), tmp_path / "run" / commit_copy_key(1, "loser"))
     for name in ("run", "twin"):
         assert {finding.key for finding in findings_at(tmp_path / name)} >= {commit_key(0)}
-        assert mend_at(tmp_path / name).left == []
+        assert repair_at(tmp_path / name).left == []
     after = files_of(tmp_path)
     assert {key for key in whole if after.get(key) != whole[key]} == {f"run/{commit_copy_key(1, 'loser')}"}
     assert after.keys() == whole.keys()  # the copy of the loser is garbage

@@ -1,4 +1,4 @@
-"""Any history of commits, crashes, resumes, merges and mends leaves what a plain dictionary says.
+"""Any history of commits, crashes, resumes, merges and repairs leaves what a plain dictionary says.
 
 After every step each place says what the model (state_model.py) says. Here a sample of histories;
 `python -m benchmarks.faults.histories` tries many more.
@@ -75,7 +75,7 @@ def changed_fields(params: HeuristicParams) -> dict[str, Any]:
 
 
 class AnyHistory(RuleBasedStateMachine):
-    """Places that are made, broken off, joined and mended in any order."""
+    """Places that are made, broken off, joined and repaired in any order."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -277,9 +277,9 @@ class AnyHistory(RuleBasedStateMachine):
         broken[bit // 8] ^= 1 << bit % 8
         run.storage.put(file, bytes(broken))  # a new file: what is linked elsewhere stays whole
         assert any(finding.key.endswith(entry.path) for finding in findings(place))
-        mended = repair_runs(open_storage(place.folder, probe=False), files_of_shard)
-        assert not [f for f in mended.left if f.is_damage]
-        if mended.resealed:  # anew, over what is committed now
+        repaired = repair_runs(open_storage(place.folder, probe=False), files_of_shard)
+        assert not [f for f in repaired.left if f.is_damage]
+        if repaired.resealed:  # anew, over what is committed now
             place.sealed = dict(place.parts)
         assert run.storage.get(file, entry.size) == before
         close_all(place)

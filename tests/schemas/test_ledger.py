@@ -69,7 +69,7 @@ def test_the_only_record_of_another_attempt_is_not_overwritten(run: Run, ending:
     edit(folder_of(run) / f"ledger/a-1{ending}", attempt="x")
     finding = only(run)
     assert (finding.key, finding.cure) == (f"ledger/a-1{ending}", None)
-    assert f"Move it to ledger/x{ending}" in finding.mend
+    assert f"Move it to ledger/x{ending}" in finding.fix
     shutil.copy(folder_of(run) / f"ledger/a-1{ending}", folder_of(run) / f"ledger/x{ending}")
     findings, _ = check(folder_of(run))
     assert isinstance(next(f for f in findings if f.key == finding.key).cure, Restore)

@@ -1,4 +1,4 @@
-"""Mending beside those who are at work: what they wrote since stays, and is told of."""
+"""Repair beside those who are at work: what they wrote since stays, and is told of."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ def answer(status: str, code: str) -> bytes:
         (None, "the store does not respond in time. Check the network, or raise"),
     ],
 )
-def test_every_trouble_is_one_line_with_its_mend(
+def test_every_trouble_is_one_line_with_its_fix(
     reply: bytes | None, problem: str, monkeypatch: pytest.MonkeyPatch
 ):
     with answering(reply) as port:

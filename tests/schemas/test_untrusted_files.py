@@ -16,11 +16,11 @@ def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"12345")
     (tmp_path / "link").symlink_to(path)
-    assert read_regular(path, 5, "mend") == read_regular(tmp_path / "link", 5, "mend") == b"12345"
-    with open_regular(path, 5, "mend") as file:
+    assert read_regular(path, 5, "fix") == read_regular(tmp_path / "link", 5, "fix") == b"12345"
+    with open_regular(path, 5, "fix") as file:
         assert not os.get_inheritable(file.fileno())
     with pytest.raises(InputError, match="5 bytes, more than the 4 allowed"):
-        read_regular(path, 4, "mend")
+        read_regular(path, 4, "fix")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket", "folder", "link to a pipe", "/dev/zero", "/dev/stdin"])
@@ -54,4 +54,4 @@ def test_a_name_of_nothing_is_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs Linux's /proc")
 def test_a_file_that_hides_its_size_is_bounded_while_it_is_read() -> None:
     with pytest.raises(InputError, match="more than 10 bytes"):
-        read_regular(Path("/proc/self/status"), 10, "mend")
+        read_regular(Path("/proc/self/status"), 10, "fix")

@@ -202,10 +202,10 @@ def test_an_end_without_a_start_and_a_start_of_a_decided_shard_without_an_end(se
     assert (finding.key, finding.kind) == ("ledger/x-1.json", "account")
 
 
-def test_an_account_that_is_damaged_and_known_from_nothing_else_cannot_be_mended(sealed: Run):
+def test_an_account_that_is_damaged_and_known_from_nothing_else_cannot_be_repaired(sealed: Run):
     (folder_of(sealed) / "ledger/x-1.json").write_bytes(b"{}")
     (finding,), _ = check(folder_of(sealed))
-    assert (finding.kind, finding.cure) == ("account", None) and "remove it" in finding.mend
+    assert (finding.kind, finding.cure) == ("account", None) and "remove it" in finding.fix
 
 
 def test_stages_that_take_longer_than_their_attempt(sealed: Run):

@@ -77,6 +77,6 @@ def test_a_missing_library_is_known_by_both_of_its_names() -> None:
     both = ModuleNotFoundError("", name="scipy.ndimage")
     for preferred in ("labels", "train"):
         found = missing_library(both, preferred)
-        assert found is not None and f"extra {preferred}" in found.mend
+        assert found is not None and f"extra {preferred}" in found.fix
     with pytest.raises(InputError, match=r"torch, plotly: is not installed.*, or stay"):
         refuse_missing("train", "or stay")

@@ -48,21 +48,21 @@ class ZeroShotDetector:
     def __init__(self, folder: str | Path, device: str = "cpu") -> None:
         where = Path(folder)
         if not (where / "config.json").is_file():
-            mend = "Name a folder that holds a detector's config.json, weights and processor"
-            raise InputError(where, "config.json", "is not in the folder of a detector", mend)
+            fix = "Name a folder that holds a detector's config.json, weights and processor"
+            raise InputError(where, "config.json", "is not in the folder of a detector", fix)
         try:
             from transformers import AutoModelForZeroShotObjectDetection, AutoProcessor
         except ImportError as error:
-            mend = how_to_get("detect")
-            raise InputError("--detector", "transformers", f"not usable ({error})", mend) from None
+            fix = how_to_get("detect")
+            raise InputError("--detector", "transformers", f"not usable ({error})", fix) from None
         try:
             self._processor: Any = AutoProcessor.from_pretrained(where, local_files_only=True)
             model: Any = AutoModelForZeroShotObjectDetection.from_pretrained(
                 where, local_files_only=True, use_safetensors=True
             )
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            mend = "Save model and processor into it again with `save_pretrained`"
-            raise InputError(where, "", f"is not a zero-shot detector: {error}", mend) from None
+            fix = "Save model and processor into it again with `save_pretrained`"
+            raise InputError(where, "", f"is not a zero-shot detector: {error}", fix) from None
         self._model = model.to(device).eval()
         self._device = device
 

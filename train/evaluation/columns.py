@@ -119,7 +119,7 @@ def gather(
 
     Scorers come by the names that they are to have. A place is (cells of its whole grids, or 0 where it
     has none; batches with `EXTRA`). Examples are drawn evenly from the scenes with whole grids and a
-    positive. `seen` is told of each batch's scenes. InputError where a score is no number, and where a
+    positive. `seen` is called with each batch's scenes. InputError where a score is no number, and where a
     scene comes twice.
     """
     parts: list[dict[str, Any]] = []

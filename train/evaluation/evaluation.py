@@ -77,8 +77,8 @@ def evaluate_set(
     columns = columns.at(columns.is_in(candidates))
     n, positives = len(columns), int(columns.label.sum())
     if not n:
-        mend = "Choose another set, or evaluate more scenes"
-        raise InputError("--candidates", candidates, "has no candidate of these runs", mend)
+        fix = "Choose another set, or evaluate more scenes"
+        raise InputError("--candidates", candidates, "has no candidate of these runs", fix)
     if positives in (0, n):
         problem = f"all {n:,} candidates have the label {int(positives > 0)}"
         raise InputError("--candidates", candidates, problem, "Evaluate a run with labels of both kinds")

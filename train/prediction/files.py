@@ -19,7 +19,7 @@ from datagen.workers.json_document import JsonNode, parse_json
 MAX_SIDE_PX = 8192
 MAX_PIXELS = 4096 * 4096
 MAX_FILE_BYTES = 256 * 2**20
-FILE_MEND = "Name an existing, smaller file"
+FILE_FIX = "Name an existing, smaller file"
 _MAX_JSON_BYTES = 2**20
 # The largest entry of R R^T - I: poses travel as text of four or five digits.
 _POSE_ROUNDING = 1e-3
@@ -45,8 +45,8 @@ def read_depth(path: Path, depth_scale_m: float) -> F32:
     """Depth (H, W) along the camera's z axis, of a 16-bit PNG; 0 where nothing was measured."""
     image = _opened(path, ("PNG",), None)
     if not image.mode.startswith("I;16"):
-        mend = "Save depth as a 16-bit grey PNG, in steps of --depth-scale (0.001 m unless given)"
-        raise InputError(path, "", f"is not a 16-bit depth image (its mode is {image.mode})", mend)
+        fix = "Save depth as a 16-bit grey PNG, in steps of --depth-scale (0.001 m unless given)"
+        raise InputError(path, "", f"is not a 16-bit depth image (its mode is {image.mode})", fix)
     return valid_depth(np.asarray(image).astype(np.float32) * np.float32(depth_scale_m))
 
 
@@ -67,8 +67,8 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float, int, int]:
     found = {key: next((n for k in keys if (n := node.find(k))), None) for key, keys in names.items()}
     missing = [" or ".join(names[key]) for key, value in found.items() if value is None]
     if missing:
-        mend = "Write fx, fy, cx, cy, width and height, in pixels (ppx and ppy serve for cx and cy)"
-        raise InputError(path, ", ".join(missing), "missing", mend)
+        fix = "Write fx, fy, cx, cy, width and height, in pixels (ppx and ppy serve for cx and cy)"
+        raise InputError(path, ", ".join(missing), "missing", fix)
     fx, fy = (_of(found[k]).number(1.0, 1e5) for k in ("fx", "fy"))
     cx, cy = (_of(found[k]).number(-1e5, 1e5) for k in ("cx", "cy"))
     width, height = (int(_of(found[k]).number(2, MAX_SIDE_PX)) for k in ("width", "height"))
@@ -88,13 +88,13 @@ def read_pose(path: Path) -> F64:
 
 def checked_pose(T: F64, place: str) -> F64:
     """The pose with its rotation made exact. InputError for NaN and for what is no rotation."""
-    mend = "Give T_world_camera as 4x4: a rotation, a position in metres, and the row 0 0 0 1"
+    fix = "Give T_world_camera as 4x4: a rotation, a position in metres, and the row 0 0 0 1"
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(place, "T_world_camera", "is not 4x4 finite numbers", mend)
+        raise InputError(place, "T_world_camera", "is not 4x4 finite numbers", fix)
     if not is_pose(T, _POSE_ROUNDING):
-        raise InputError(place, "T_world_camera", "has an upper left 3x3 part that is not a rotation", mend)
+        raise InputError(place, "T_world_camera", "has an upper left 3x3 part that is not a rotation", fix)
     if np.abs(T[:3, 3]).max() > _EXTENT_M:
-        raise InputError(place, "T_world_camera", f"is farther than {_EXTENT_M:g} m from the origin", mend)
+        raise InputError(place, "T_world_camera", f"is farther than {_EXTENT_M:g} m from the origin", fix)
     # The nearest rotation (Schoenemann 1966), so that rounded text does not stretch the cloud.
     u, _, vt = np.linalg.svd(T[:3, :3])
     exact = T.astype(np.float64)
@@ -108,13 +108,13 @@ def _of(node: JsonNode | None) -> JsonNode:
 
 
 def _document(path: Path) -> JsonNode:
-    return parse_json(read_regular(path, _MAX_JSON_BYTES, FILE_MEND), str(path))
+    return parse_json(read_regular(path, _MAX_JSON_BYTES, FILE_FIX), str(path))
 
 
 def _opened(path: Path, formats: tuple[str, ...], mode: str | None) -> Image.Image:
     """A decoded picture. Its size is checked before its pixels are decoded."""
     kinds = " or ".join(formats)
-    data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_MEND))
+    data = io.BytesIO(read_regular(path, MAX_FILE_BYTES, FILE_FIX))
     try:
         with warnings.catch_warnings():
             # Our own limit, checked below, is stricter than the one that warns.

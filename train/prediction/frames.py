@@ -140,8 +140,8 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
             files = (path / RGB, path / DEPTH, path / INTRINSICS)
             return read_frame(*files, mask=more[0], pose=more[1], depth_scale_m=depth_scale_m)
         case _:
-            mend = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
-            raise InputError(path, "--frame", "is not a frame", mend)
+            fix = f"Name a folder with {RGB}, {DEPTH} and {INTRINSICS}, an .npz archive or a .ply cloud"
+            raise InputError(path, "--frame", "is not a frame", fix)
 
 
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, str]) -> SensorFrame:
@@ -154,12 +154,12 @@ def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, 
     for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
         if picture is not None and picture.shape[:2] != image.depth_m.shape:
             problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"
-            mend = "Align colour and depth, and give images of equal size"
-            raise InputError(where[name], "", problem, mend)
+            fix = "Align colour and depth, and give images of equal size"
+            raise InputError(where[name], "", problem, fix)
     pixels = np.flatnonzero(image.depth_m.ravel())
     if not len(pixels):
-        mend = "Check the camera's depth stream, and --depth-scale"
-        raise InputError(where["depth"], "", "no pixel has depth", mend)
+        fix = "Check the camera's depth stream, and --depth-scale"
+        raise InputError(where["depth"], "", "no pixel has depth", fix)
     if image.mask is not None and not image.mask.any():
         raise InputError(where["mask"], "", "selects no pixel", "Mark the target white on black")
     on_target = None if image.mask is None else image.mask.ravel()[pixels]
@@ -176,8 +176,8 @@ def _npz_frame(path: Path, depth_scale_m: float) -> SensorFrame:
     if depth.ndim != 2 or depth.size > MAX_PIXELS or min(depth.shape) < 2:
         raise InputError(path, "depth", f"has shape {depth.shape}", "Give depth as (H, W)")
     if depth.dtype.kind != "f" and depth.dtype != np.uint16:
-        mend = "Give uint16 in steps of --depth-scale, or float in metres"
-        raise InputError(path, "depth", f"has type {depth.dtype}", mend)
+        fix = "Give uint16 in steps of --depth-scale, or float in metres"
+        raise InputError(path, "depth", f"has type {depth.dtype}", fix)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise InputError(path, "rgb", f"is {rgb.dtype} of shape {rgb.shape}", "Give rgb as uint8 (H, W, 3)")
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or (numbers[:2] < 1).any():

@@ -30,7 +30,7 @@ _LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
 _LEAST_POINTS = 300  # of all, for a residual
 _SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
 _NEIGHBOURS, _TREE_POINTS = 20, 20_000  # of clouds without a picture, for normals
-_MEND = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-pose pose.json"
+_FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-pose pose.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +69,17 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
         T = frame.T_world_camera
         if camera_height_m is not None and abs(T[2, 3] - camera_height_m) > _tolerance_m(camera_height_m):
             problem = f"is {T[2, 3]:.2f} m in the pose, but --camera-height is {camera_height_m:.2f} m"
-            mend = "Correct one of them; the floor of the pose's world is at z = 0"
-            raise InputError(frame.place, "camera height", problem, mend)
+            fix = "Correct one of them; the floor of the pose's world is at z = 0"
+            raise InputError(frame.place, "camera height", problem, fix)
         return _with_residual(frame, T, "the pose given with the frame")
     if camera_height_m is None:
-        mend = "Give --camera-height in metres above the floor, or --camera-pose pose.json"
-        raise InputError(frame.place, "camera height", "is missing", mend)
+        fix = "Give --camera-height in metres above the floor, or --camera-pose pose.json"
+        raise InputError(frame.place, "camera height", "is missing", fix)
     if gravity is not None:
         down = gravity / np.linalg.norm(gravity)
         if down[1] < 0 and abs(down[2]) < 0.95:
-            mend = "Change its sign: gravity points down, an accelerometer at rest measures the opposite"
-            raise InputError("--gravity", "", "points up in the image", mend)
+            fix = "Change its sign: gravity points down, an accelerometer at rest measures the opposite"
+            raise InputError("--gravity", "", "points up in the image", fix)
         return _with_residual(frame, level_pose(-down, camera_height_m), "gravity and the camera's height")
     up, height_m, doubt = _floor_plane(frame, camera_height_m)
     how = f"the floor's plane in the depth, {height_m:.3f} m below the camera ({camera_height_m:.3f} m given)"
@@ -130,7 +130,7 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     up = _way_up(normals, rng)
     levels = [] if up is None else _levels(points, normals, up)
     if up is None or not levels:
-        raise InputError(frame.place, "floor", "is not in the depth image: no level surface", _MEND)
+        raise InputError(frame.place, "floor", "is not in the depth image: no level surface", _FIX)
     for _ in range(_REFITS):
         up = _common_up(points, levels, up)
         levels = _levels(points, normals, up) or levels
@@ -145,8 +145,8 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
         )
         x, y, z = np.round(-up, 3)
         told = f"level surfaces suggest {x:g},{y:g},{z:g}"
-        mend = f"Correct --camera-height, or, if that surface is not the floor: {_MEND}; {told}"
-        raise InputError(frame.place, "floor", problem, mend)
+        fix = f"Correct --camera-height, or, if that surface is not the floor: {_FIX}; {told}"
+        raise InputError(frame.place, "floor", problem, fix)
     error_m = depth_error_m(points[levels[k], 2])
     # The points' height is a mean of many measurements, the given height is one more.
     weights = 1 / np.array([(error_m.mean() ** 2) / 25 + 0.004**2, _GIVEN_ERROR_M**2])
@@ -154,7 +154,7 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     below = float((points @ up + height_m < -0.03 - 4 * depth_error_m(points[:, 2])).mean())
     if below > _MOST_BELOW:
         problem = f"{below:.0%} of all points are below the plane {height_m:.2f} m under the camera"
-        raise InputError(frame.place, "floor", problem, f"Correct --camera-height, or: {_MEND}")
+        raise InputError(frame.place, "floor", problem, f"Correct --camera-height, or: {_FIX}")
     doubts = [f"it has only {share:.1%} of the points"] if share < _SURE_SHARE else []
     if abs(below_m[k] - camera_height_m) > _SURE_OFF_M:
         doubts.append(f"it is {below_m[k]:.3f} m below the camera, {camera_height_m:.3f} m given")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
-from datagen.train.prediction.files import FILE_MEND, MAX_FILE_BYTES, Bools
+from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES, Bools
 from datagen.workers.geometry.mesh import F32, U8
 
 MAX_POINTS = 20_000_000
@@ -22,7 +22,7 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MEND = "Save the cloud again as PLY, its vertices first, with x, y and z in metres"
+_FIX = "Save the cloud again as PLY, its vertices first, with x, y and z in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +39,15 @@ def read_ply(path: Path) -> PlyCloud:
 
     InputError for a header that is not one, or that promises other vertices than the file holds.
     """
-    data = read_regular(path, MAX_FILE_BYTES, FILE_MEND)
+    data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
     form, count, properties, start = _header(path, data)
     if not count:
-        raise InputError(path, "element vertex", "has no vertices", _MEND)
+        raise InputError(path, "element vertex", "has no vertices", _FIX)
     names = [name for name, _ in properties]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing or len(set(names)) < len(names):
         what = f"no property {missing[0]}" if missing else "a property named twice"
-        raise InputError(path, "element vertex", what, _MEND)
+        raise InputError(path, "element vertex", what, _FIX)
     body = memoryview(data)[start:]
     columns = (_ascii if form == "ascii" else _binary)(path, body, count, properties, _FORMATS[form])
     with np.errstate(over="ignore"):  # doubles beyond float32 are infinite, and are left out below
@@ -58,7 +58,7 @@ def read_ply(path: Path) -> PlyCloud:
         colours = np.stack([_colour(columns[c]) for c in ("red", "green", "blue")], axis=1)
     on_target = columns["target"] != 0 if "target" in names else None
     if not finite.any():
-        raise InputError(path, "element vertex", "no vertex is finite", _MEND)
+        raise InputError(path, "element vertex", "no vertex is finite", _FIX)
     return PlyCloud(points[finite], colours[finite], None if on_target is None else on_target[finite])
 
 
@@ -66,7 +66,7 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
     """(format, vertices, their properties, where the body starts)."""
     end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     if not data.startswith(b"ply") or end < 0 or (line_end := data.find(b"\n", end)) < 0:
-        raise InputError(path, "header", "is not that of a PLY file", _MEND)
+        raise InputError(path, "header", "is not that of a PLY file", _FIX)
     lines = data[:end].decode("ascii", errors="replace").splitlines()
     form, count, properties, element = "", -1, list[tuple[str, str]](), ""
     for number, line in enumerate(lines[1:], start=2):
@@ -81,22 +81,22 @@ def _header(path: Path, data: bytes) -> tuple[str, int, list[tuple[str, str]], i
                 element, count = "vertex", _count(path, place, n)
             case ["element", name, *_]:
                 if not element:
-                    raise InputError(path, place, f"element {name[:40]} comes before the vertices", _MEND)
+                    raise InputError(path, place, f"element {name[:40]} comes before the vertices", _FIX)
                 element = name
             case ["property", kind, name] if element == "vertex" and kind in _TYPES and len(properties) < 64:
                 properties.append((name, _TYPES[kind]))
             case ["property", *_] if element and element != "vertex":
                 pass
             case _:
-                raise InputError(path, place, f"is not valid: {line[:60]}", _MEND)
+                raise InputError(path, place, f"is not valid: {line[:60]}", _FIX)
     if not form or count < 0:
-        raise InputError(path, "header", "has no format, or no vertices", _MEND)
+        raise InputError(path, "header", "has no format, or no vertices", _FIX)
     return form, count, properties, line_end + 1
 
 
 def _count(path: Path, place: str, text: str) -> int:
     if not (text.isascii() and text.isdigit()) or len(text) > 18:
-        raise InputError(path, place, f"{text[:40]} is not a number of vertices", _MEND)
+        raise InputError(path, place, f"{text[:40]} is not a number of vertices", _FIX)
     if int(text) > MAX_POINTS:
         raise InputError(path, place, f"has {int(text):,} vertices", f"Give at most {MAX_POINTS:,}")
     return int(text)
@@ -125,7 +125,7 @@ def _ascii(path: Path, body: memoryview, count: int, properties: list[tuple[str,
     try:
         table = np.array([line.split() for line in lines], "S32").astype(np.float64)
     except ValueError:
-        raise InputError(path, "vertices", "are not rows of numbers of equal length", _MEND) from None
+        raise InputError(path, "vertices", "are not rows of numbers of equal length", _FIX) from None
     if table.shape != (count, len(properties)):
         raise _short(path, count, len(table))
     return {name: _as_declared(table[:, k], kind) for k, (name, kind) in enumerate(properties)}
@@ -137,7 +137,7 @@ def _as_declared(values: npt.NDArray[np.float64], kind: str) -> npt.NDArray[np.g
 
 
 def _short(path: Path, count: int, found: int) -> InputError:
-    return InputError(path, "element vertex", f"has {found:,} of {count:,} vertices", _MEND)
+    return InputError(path, "element vertex", f"has {found:,} of {count:,} vertices", _FIX)
 
 
 def _colour(values: npt.NDArray[np.generic]) -> U8:

@@ -210,8 +210,8 @@ def _grounds(
         raise InputError("frames", "", "are missing", "Give at least one frame")
     for frame in frames:
         if len(frames) > 1 and frame.T_world_camera is None:
-            mend = "Give each of several frames its T_world_camera: pose.json in its folder, or in the .npz"
-            raise InputError(frame.place, "pose", "missing", mend)
+            fix = "Give each of several frames its T_world_camera: pose.json in its folder, or in the .npz"
+            raise InputError(frame.place, "pose", "missing", fix)
     height_m = camera_height_m if len(frames) == 1 else None
     return [find_ground(frame, height_m, gravity) for frame in frames]
 
@@ -232,8 +232,8 @@ def _with_target(
             *frames[1:],
         ]
     if not any(frame.on_target is not None for frame in frames):
-        mend = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
-        raise InputError(first.place, "target", "is not marked", mend)
+        fix = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
+        raise InputError(first.place, "target", "is not marked", fix)
     return list(frames)
 
 

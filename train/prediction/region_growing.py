@@ -34,8 +34,8 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     depth_m = image.depth_m
     if depth_m[v, u] == 0:
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
-        mend = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
-        raise InputError("--click", f"{u},{v}", "has no depth", mend)
+        fix = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
+        raise InputError("--click", f"{u},{v}", "has no depth", fix)
     grid, facets = image.world_grid(T_world_camera), image.facets(T_world_camera)
     seed = grid[v, u]
     far_m = np.linalg.norm(grid - seed, axis=2)

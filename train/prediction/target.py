@@ -48,8 +48,8 @@ def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
     wanted, have = int(mask.sum()), int(known.sum())
     if have < max(_LEAST_POINTS, _LEAST_SHARE * wanted):
         problem = f"only {have} of the target's {wanted} pixels have depth"
-        mend = "Take the frame from another angle or distance, or add frames"
-        raise InputError(frame.place, "target", problem, mend)
+        fix = "Take the frame from another angle or distance, or add frames"
+        raise InputError(frame.place, "target", problem, fix)
     if have == wanted:
         return frame, Filled(wanted, 0)
     depth_m = from_nearest(image.depth_m, known)
@@ -79,8 +79,8 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
     if len(kept) < _LEAST_POINTS:
         problem = f"has {len(kept)} points, but {_LEAST_POINTS} are needed"
-        mend = "Give a mask of the whole target, or a frame that shows more of it"
-        raise InputError("target", "", problem, mend)
+        fix = "Give a mask of the whole target, or a frame that shows more of it"
+        raise InputError("target", "", problem, fix)
     ahead = kept[:, :2].mean(axis=0) - eye_m[:2]
     far_m = float(np.linalg.norm(ahead))
     ahead = ahead / far_m if far_m > 1e-6 else np.array([0.0, 1.0])

@@ -56,8 +56,8 @@ class TensorBoardCallback:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            mend = how_to_get("train")
-            raise InputError("--tensorboard", "", "the package tensorboard is not installed", mend) from None
+            fix = how_to_get("train")
+            raise InputError("--tensorboard", "", "the package tensorboard is not installed", fix) from None
         self._writer = SummaryWriter(folder, purge_step=step + 1)
         self._step = step
 

@@ -41,7 +41,7 @@ _DTYPES = {"F32", "I64", "U8", "BOOL"}
 _UNSIGNED = b"0" * 64  # in place of the checksum where the checksum is taken
 _NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 _MAX_TEXT = 4096
-_MEND = "Name a checkpoint of `datagen train`, or train it again"
+_FIX = "Name a checkpoint of `datagen train`, or train it again"
 
 
 class EpochRecord(ValidationMetrics):
@@ -110,23 +110,23 @@ def put_weights(model: Model, weights: Mapping[str, Tensor], place: str) -> None
     wanted = model.state_dict()
     for name in sorted(wanted.keys() ^ weights.keys()):
         problem = "the model has no such weights" if name in weights else "the checkpoint lacks it"
-        raise InputError(place, name, problem, _MEND)
+        raise InputError(place, name, problem, _FIX)
     for name, tensor in wanted.items():
         ours, theirs = (tuple(tensor.shape), tensor.dtype), (tuple(weights[name].shape), weights[name].dtype)
         if ours != theirs:
             problem = f"is {theirs[1]} {theirs[0]}, but {ours[1]} {ours[0]} in the model"
-            raise InputError(place, name, problem, _MEND)
+            raise InputError(place, name, problem, _FIX)
     model.load_state_dict(weights)
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load a complete checkpoint on the CPU. InputError as `load_model`; memory is bounded by its size."""
-    place, data = str(path), read_regular(Path(path), MAX_BYTES, _MEND)
+    place, data = str(path), read_regular(Path(path), MAX_BYTES, _FIX)
     try:
         tensors, text = read_pickled(data) if data[:2] == b"PK" else _read(data)
     except (SafetensorError, *NOT_PICKLED, AttributeError) as e:
         problem = f"not a datagen checkpoint, or damaged ({e!s:.200})"
-        raise InputError(place, "", problem, _MEND) from None
+        raise InputError(place, "", problem, _FIX) from None
     document = _document(place, text)
     try:
         head = replace(_HEAD.validate_python(document["head"]), digest=hashlib.sha256(data).hexdigest())
@@ -135,8 +135,8 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         first = e.errors()[0] if isinstance(e, ValidationError) else None
         where = ".".join(str(part) for part in first["loc"]) if first else "head"
         problem = first["msg"].lower() if first else f"incomplete ({e})"
-        raise InputError(place, where, problem, _MEND) from None
-    _refuse_not_finite(place, tensors, _MEND)
+        raise InputError(place, where, problem, _FIX) from None
+    _refuse_not_finite(place, tensors, _FIX)
     return Checkpoint(head, below("weights/", tensors), below("resume/", tensors), loop)
 
 
@@ -147,7 +147,7 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """
     path = Path(path)
     document = {
-        "sha256": _UNSIGNED.decode(),  # before any other text that could hold so many zeros
+        "sha256": _UNSIGNED.decode(),  # before any other text that could hold as many zeros
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "head": {k: v for k, v in asdict(checkpoint.head).items() if k != "digest"},
@@ -155,8 +155,8 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     }
     stored = {f"weights/{k}": _own(v) for k, v in checkpoint.weights.items()}
     stored |= {f"resume/{k}": _own(v) for k, v in checkpoint.resume.items()}
-    mend = "Nothing was overwritten. Train again with a smaller --lr and a new --out"
-    _refuse_not_finite(str(path), stored, mend)
+    fix = "Nothing was overwritten. Train again with a smaller --lr and a new --out"
+    _refuse_not_finite(str(path), stored, fix)
     data = safetensors.torch.save(stored, {"head": json.dumps(document, allow_nan=False)})
     data = data.replace(_UNSIGNED, hashlib.sha256(data).hexdigest().encode(), 1)
     with whole_file(path, durable=True, alone=True) as file:
@@ -176,18 +176,18 @@ def only_writer(path: str | Path) -> Generator[None]:
         except (BlockingIOError, FileNotFoundError):
             mine = False
         if not mine:
-            mend = "Wait for it, stop it, or give another --out"
-            raise InputError(path, "", "is being trained by another process", mend)
+            fix = "Wait for it, stop it, or give another --out"
+            raise InputError(path, "", "is being trained by another process", fix)
         try:
             yield
         finally:
             lock.unlink(missing_ok=True)
 
 
-def _refuse_not_finite(place: str, tensors: Mapping[str, Tensor], mend: str) -> None:
+def _refuse_not_finite(place: str, tensors: Mapping[str, Tensor], fix: str) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise InputError(place, name, "has NaN or infinite numbers", mend)
+            raise InputError(place, name, "has NaN or infinite numbers", fix)
 
 
 def _own(tensor: Tensor) -> Tensor:
@@ -222,7 +222,7 @@ def _document(place: str, text: object) -> dict[str, Any]:
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError(place, "head", "is not that of a datagen checkpoint", _MEND)
+        raise InputError(place, "head", "is not that of a datagen checkpoint", _FIX)
     _refuse_odd_values(place, document)
     version = document.get("format_version")
     if version not in (1, FORMAT_VERSION):
@@ -251,8 +251,8 @@ def _refuse_odd_values(place: str, document: dict[str, Any]) -> None:
                 problem = (
                     f"text with control characters or surrogates, or of more than {_MAX_TEXT} characters"
                 )
-                raise InputError(place, where, problem, _MEND)
+                raise InputError(place, where, problem, _FIX)
             case int() | float() if not -(2.0**63) < value < 2.0**63:
-                raise InputError(place, where, f"{value!s:.20} is not a usable number", _MEND)
+                raise InputError(place, where, f"{value!s:.20} is not a usable number", _FIX)
             case _:
                 pass

@@ -89,8 +89,8 @@ def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: St
             if answer is None:
                 child.join()
                 problem = f"a process exited with code {child.exitcode} without a message"
-                mend = "Run the same command to resume, with fewer --processes if memory was short"
-                raise InputError("datagen train", "--processes", problem, mend)
+                fix = "Run the same command to resume, with fewer --processes if memory was short"
+                raise InputError("datagen train", "--processes", problem, fix)
             finished = finished and bool(answer)
     return finished
 

@@ -54,8 +54,8 @@ def validate(
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
     mean_loss = float(np.average(loss, weights=weight))
     if not np.isfinite(mean_loss):
-        mend = "Train again with a smaller --lr, or look at the samples with `datagen verify`"
-        raise InputError("validation", "loss", f"{mean_loss} over {len(loss)} samples", mend)
+        fix = "Train again with a smaller --lr, or look at the samples with `datagen verify`"
+        raise InputError("validation", "loss", f"{mean_loss} over {len(loss)} samples", fix)
     counts = confusion((p >= 0.5).astype(np.float64), label == 1, np.zeros(len(p), np.int64), 1)[0]
     balanced, auc = float(balanced_accuracy(counts)), area_under_roc(label == 1, p)
     return {

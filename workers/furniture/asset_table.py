@@ -44,14 +44,14 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
     `asset-database.json` ({objectType: [{assetId, boundingBox}]} or one flat list).
     """
     path = next((folder / name for name in TABLE_NAMES if (folder / name).exists()), None)
-    mend = "Put asset_sizes.json into the folder; `datagen assets fetch procthor-10k` gets both."
+    fix = "Put asset_sizes.json into the folder; `datagen assets fetch procthor-10k` gets both."
     if path is None:
-        raise InputError(folder, "", f"has no size table ({' or '.join(TABLE_NAMES)})", mend)
-    text = read_regular(path, _LARGEST_TABLE_BYTES, mend)
+        raise InputError(folder, "", f"has no size table ({' or '.join(TABLE_NAMES)})", fix)
+    text = read_regular(path, _LARGEST_TABLE_BYTES, fix)
     root = parse_json(text, str(path))
     assets = [_own_entry(node) if own else _thor_entry(node) for node, own in _entries(root)]
     if not assets:
-        raise InputError(path, "", "is an empty size table", mend)
+        raise InputError(path, "", "is an empty size table", fix)
     return {asset.asset_id: asset for asset in assets}, text
 
 

@@ -50,7 +50,7 @@ _KEPT_MESHES = 512
 _SURFACE_HEIGHTS_M = (0.25, 1.5)
 _WALL_TOP_M = 2.2  # parts above it meet no robot
 _SMALL_M = 0.35
-_MEND = "Download the scenes again."
+_FIX = "Download the scenes again."
 
 # The stage as stored in the ProcTHOR set, and every file's frame, to the world.
 _Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -92,14 +92,14 @@ class Ai2thorHouses:
         if house_id not in self.scenes:
             raise InputError(self.root, "", f"has no house {house_id!r}", "Give the id of one of its houses.")
         path = self.scenes[house_id]
-        text = read_regular(path, _MAX_SCENE_BYTES, _MEND)
+        text = read_regular(path, _MAX_SCENE_BYTES, _FIX)
         scene = parse_json(text, str(path))
         digest = hashlib.sha256(text)
         stage, is_stage_turned = self._stage(scene, house_id)
         digest.update(stage.digest)
         mesh = _without_ceiling(stage.mesh.transformed(_stage_pose(is_stage_turned)))
         if not len(mesh.faces):
-            raise scene.get("stage_instance").error("has neither walls nor floor", _MEND)
+            raise scene.get("stage_instance").error("has neither walls nor floor", _FIX)
         skipped: Counter[str] = Counter()
         placed: list[tuple[StaticBody, F64, F64, Mesh]] = []
         for number, entry in enumerate(scene.get("object_instances").items(_MAX_OBJECTS)):
@@ -135,7 +135,7 @@ class Ai2thorHouses:
             return self._templates[file]
         mesh = read_glb(file)
         mesh = mesh.transformed(_Y_UP_TO_WORLD)
-        with open_regular(file, MAX_FILE_BYTES, _MEND) as stream:
+        with open_regular(file, MAX_FILE_BYTES, _FIX) as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         is_stage = "stages" in file.relative_to(self.root).parts  # the folder above may have any name
         template = _Template(mesh, () if is_stage else convex_parts(mesh), digest)
@@ -163,7 +163,7 @@ class Ai2thorHouses:
         """The object type by the semantic id of the template's configuration, else by its name."""
         config = self.root / _CONFIGS / f"{name}.object_config.json"
         if config.is_file():
-            found = parse_json(read_regular(config, 1 << 20, _MEND), str(config)).find("semantic_id")
+            found = parse_json(read_regular(config, 1 << 20, _FIX), str(config)).find("semantic_id")
             if found is not None:
                 known = self.types.get(int(found.number(-1, 1e9)))
                 if known is not None:
@@ -181,15 +181,15 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     covers the bytes of its scene and meshes and the types of its objects.
     """
     base = Path(folder)
-    mend = "Name it as ai2thor:DIR, where DIR holds ai2thor-hab/ and ai2thorhab-uncompressed/."
+    fix = "Name it as ai2thor:DIR, where DIR holds ai2thor-hab/ and ai2thorhab-uncompressed/."
     roots = [base, base / "ai2thor", base / "scene_datasets/ai2thor", base / "data/scene_datasets/ai2thor"]
     root = next((r for r in roots if folder and (r / _SCENES).is_dir()), None)
     if root is None:
-        raise InputError(folder or "ai2thor", "", "has no folder ai2thor-hab/configs/scenes", mend)
+        raise InputError(folder or "ai2thor", "", "has no folder ai2thor-hab/configs/scenes", fix)
     top = root / _SCENES
     sizes = {p.relative_to(top).as_posix().removesuffix(_SUFFIX): n for p, n in _sizes(top, f"*{_SUFFIX}")}
     if not sizes:
-        raise InputError(top, "", "has no scenes", mend)
+        raise InputError(top, "", "has no scenes", fix)
     listing: list[object] = [[i, sizes[i]] for i in sorted(sizes)]
     places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
     files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
@@ -204,7 +204,7 @@ def _sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
     try:
         found = [(p, p.stat().st_size) for p in itertools.islice(folder.rglob(pattern), _MAX_FILES + 1)]
     except OSError as error:
-        raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _MEND) from None
+        raise InputError(str(error.filename), "", f"cannot be read: {error.strerror}", _FIX) from None
     odd = next((p for p, _ in found if not p.relative_to(folder).as_posix().isprintable()), None)
     if odd is not None:
         raise InputError(odd, "", "has a name with unprintable characters", "Rename the file.")
@@ -217,7 +217,7 @@ def _types(root: Path) -> dict[int, str]:
     path = root / "ai2thor-hab/configs/object_semantic_id_mapping.json"
     if not path.is_file():
         return {}
-    node = parse_json(read_regular(path, 1 << 20, _MEND), str(path))
+    node = parse_json(read_regular(path, 1 << 20, _FIX), str(path))
     members = cast(dict[str, Any], node.value) if isinstance(node.value, dict) else {}
     place = str(path)
     return {

@@ -22,7 +22,7 @@ _MAX_COUNT = 10_000_000  # positions, normals, colours and indices of MAX_FACES 
 _MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
 _PLAIN = (180, 178, 174)
-_MEND = "Download the asset again, or remove the scenes that use it."
+_FIX = "Download the asset again, or remove the scenes that use it."
 # What a damaged file makes trimesh raise, which checks little by itself: references to what is not there and
 # values of other types, short buffers, nodes that hold each other, textures that Pillow cannot read (OSError)
 # or refuses for their size, a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
@@ -37,7 +37,7 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
-    data = read_regular(path, MAX_FILE_BYTES, _MEND)
+    data = read_regular(path, MAX_FILE_BYTES, _FIX)
     _check_header(path, data)
     try:
         # From memory, so that no address in the file is followed to another one.
@@ -48,18 +48,18 @@ def read_glb(path: Path) -> Mesh:
         if 0 < count <= MAX_FACES:
             return _merged([m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)])
     except _DAMAGE as error:
-        raise InputError(path, "", f"is a damaged glTF file ({type(error).__name__})", _MEND) from None
+        raise InputError(path, "", f"is a damaged glTF file ({type(error).__name__})", _FIX) from None
     problem = "no triangles" if count == 0 else f"{count} triangles, more than {MAX_FACES}"
-    raise InputError(path, "", problem, _MEND)
+    raise InputError(path, "", problem, _FIX)
 
 
 def _check_header(path: Path, data: bytes) -> None:
     """Refuse by the counts that the file itself states, before anything is unpacked."""
     if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
-        raise InputError(path, "", "is not a binary glTF file", _MEND)
+        raise InputError(path, "", "is not a binary glTF file", _FIX)
     length = int.from_bytes(data[12:16], "little")
     if length > _MAX_JSON_BYTES:
-        raise InputError(path, "", f"has a description of {length:,} bytes", _MEND)
+        raise InputError(path, "", f"has a description of {length:,} bytes", _FIX)
     root = parse_json(data[20 : 20 + length], str(path))
     try:
         counts = [int(a["count"]) for a in root.value.get("accessors", [])]
@@ -71,9 +71,9 @@ def _check_header(path: Path, data: bytes) -> None:
             ]
             counts += [counts[k] for k in named]
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
-        raise InputError(path, "", "has an invalid description", _MEND) from None
+        raise InputError(path, "", "has an invalid description", _FIX) from None
     if counts and (min(counts) < 0 or sum(counts) > _MAX_COUNT):
-        raise InputError(path, "accessors", "have impossible counts of vertices or indices", _MEND)
+        raise InputError(path, "accessors", "have impossible counts of vertices or indices", _FIX)
 
 
 def _merged(pieces: list[Any]) -> Mesh:

@@ -39,7 +39,7 @@ _MAX_UNPACKED_BYTES, _MAX_RATIO = 256 << 20, 100
 _MAX_IN_MEMORY_BYTES = 2 << 30
 _FORMAT = 2  # raise it when the layout of the cached files changes
 _ID_KEY = re.compile(rb'"_id"\s*:\s*"([^"\\]{1,200})"')
-_MEND = "Restore the file from its source."
+_FIX = "Restore the file from its source."
 _MAX_INDEX_BYTES = 512 * MAX_LINES
 _MOST_CACHED = 64  # files: unpacked houses and their indexes
 _IDLE_S = 86_400.0
@@ -98,12 +98,12 @@ def open_lines(path: Path, cache: Path | None) -> LineIndex:
         return _build_in_memory(path)
     except OSError as error:
         if isinstance(error, gzip.BadGzipFile):
-            raise InputError(path, "", f"is not a gzip file ({error})", _MEND) from None
+            raise InputError(path, "", f"is not a gzip file ({error})", _FIX) from None
         raise InputError(path, "", f"cannot be read ({error.strerror})", "Make it readable.") from None
     except EOFError:
-        raise InputError(path, "", "is a truncated gzip file", _MEND) from None
+        raise InputError(path, "", "is a truncated gzip file", _FIX) from None
     except zlib.error as error:
-        raise InputError(path, "", f"has damaged compressed data ({error})", _MEND) from None
+        raise InputError(path, "", f"has damaged compressed data ({error})", _FIX) from None
 
 
 def houses_cache() -> Path | None:
@@ -121,7 +121,7 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     if path.suffix == ".json":
         yield from _documents(path)
         return
-    with open_regular(path, _MAX_FILE_BYTES, _MEND) as file:
+    with open_regular(path, _MAX_FILE_BYTES, _FIX) as file:
         room, stream = _MAX_FILE_BYTES, cast(IO[bytes], file)
         if path.suffix == ".gz":
             room = _MAX_UNPACKED_BYTES + _MAX_RATIO * os.fstat(file.fileno()).st_size
@@ -135,7 +135,7 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
                 problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB"
                 if len(line) <= MAX_LINE_BYTES:
                     problem = f"more than {MAX_LINES:,} lines" if room >= 0 else "unpacks to too many bytes"
-                raise InputError(f"{path}:{number}", "", problem, _MEND)
+                raise InputError(f"{path}:{number}", "", problem, _FIX)
             if line := line.strip():
                 yield number, line
 
@@ -155,7 +155,7 @@ def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _file_digest(path: Path) -> str:
-    with open_regular(path, _MAX_FILE_BYTES, _MEND) as stream:
+    with open_regular(path, _MAX_FILE_BYTES, _FIX) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -254,6 +254,6 @@ def _build_in_memory(path: Path) -> LineIndex:
         collector.add(number, line)
         data += line + b"\n"
         if collector.offset > _MAX_IN_MEMORY_BYTES:
-            mend = "Set DATAGEN_CACHE to a folder with space for the unpacked houses."
-            raise InputError(path, "", "is too large to unpack in memory", mend)
+            fix = "Set DATAGEN_CACHE to a folder with space for the unpacked houses."
+            raise InputError(path, "", "is too large to unpack in memory", fix)
     return _index(path, data, collector.arrays())

@@ -47,8 +47,8 @@ class ProcthorHouses:
         if house_id not in self.rows:
             raise InputError(self.folder, "", f"has no house {house_id!r}", "Give one of its ids.")
         if house_id in self.clashes:
-            mend = "Rename or remove one of them."
-            raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", mend)
+            fix = "Rename or remove one of them."
+            raise InputError(self.folder, house_id, f"two houses: {self.clashes[house_id]}", fix)
         file, row = self.rows[house_id]
         index = self.files[file]
         text = index.line(row)
@@ -63,15 +63,15 @@ def open_procthor(folder: str) -> ProcthorHouses:
     so that another compression or another cut into files gives the same digest.
     """
     path = Path(folder)
-    mend = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json."
+    fix = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json."
     if not folder or not path.is_dir():
-        raise InputError(folder or "procthor", "", "no such folder of houses", mend)
+        raise InputError(folder or "procthor", "", "no such folder of houses", fix)
     assets, table = read_asset_table(path)
     with os.scandir(path) as entries:
         found = (e.name for e in entries if e.name.endswith(_SUFFIXES) and e.name not in _NOT_HOUSES)
         names = sorted(itertools.islice(found, _MAX_FILES + 1))
     if not names:
-        raise InputError(path, "", "has no *.jsonl.gz, *.jsonl or *.json file with houses", mend)
+        raise InputError(path, "", "has no *.jsonl.gz, *.jsonl or *.json file with houses", fix)
     if len(names) > _MAX_FILES:
         raise InputError(path, "", f"has more than {_MAX_FILES} files", "Join them as JSON lines.")
     cache = houses_cache()
@@ -86,7 +86,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
             raise InputError(path, name, f"has more than {MAX_LINES:,} houses", "Divide them among folders.")
     rows, clashes = _rows(files)
     if not rows:
-        raise InputError(path, "", "has files without houses", mend)
+        raise InputError(path, "", "has files without houses", fix)
     digests = [[i, files[f].digests[r].tobytes().hex()] for i, (f, r) in rows.items()]
     digest = digest_of([digests, hash_bytes(table.decode("utf-8", "replace")).hex()])
     return ProcthorHouses(digest, path, assets, files, rows, clashes)

@@ -112,8 +112,8 @@ def arm_in_scene(
 def arm_of(spec: Specification) -> ArmParams:
     """The specification's arm section. Raises InputError where it has none."""
     if spec.arm is None:
-        mend = "Submit plan or sim, which have an arm"
-        raise InputError("specification", "arm", f"none for label source {spec.label_source}", mend)
+        fix = "Submit plan or sim, which have an arm"
+        raise InputError("specification", "arm", f"none for label source {spec.label_source}", fix)
     return spec.arm
 
 

@@ -74,8 +74,8 @@ def read_obj(path: Path) -> ObjMesh:
                 raise ValueError("a tab follows the keyword")
         except ValueError as error:
             shown = line[:60].decode("utf-8", "replace").strip()
-            mend = "Export the mesh again as text OBJ"
-            raise InputError(path, f"line {number}", f"{error}: {shown!r}", mend) from None
+            fix = "Export the mesh again as text OBJ"
+            raise InputError(path, f"line {number}", f"{error}: {shown!r}", fix) from None
         if len(faces) > 3 * MAX_FACES or len(vertices) > 3 * MAX_VERTICES or len(uv) > 2 * MAX_VERTICES:
             problem = f"the mesh has more than {MAX_FACES:,} faces or {MAX_VERTICES:,} vertices"
             raise InputError(path, "", problem, "Simplify the mesh")

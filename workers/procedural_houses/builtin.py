@@ -51,8 +51,8 @@ class BuiltinHouses:
         """Draw and build the house."""
         number = house_id.removeprefix("builtin-")
         if not number.isdecimal() or int(number) >= self.count or _house_id(int(number)) != house_id:
-            mend = f"Give one of builtin-0000 to {_house_id(self.count - 1)}."
-            raise InputError("builtin", "", f"has no house {house_id!r}", mend)
+            fix = f"Give one of builtin-0000 to {_house_id(self.count - 1)}."
+            raise InputError("builtin", "", f"has no house {house_id!r}", fix)
         document = house_document(int(number))
         digest = hash_bytes(canonical_json(document)).hex()
         return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)

@@ -94,8 +94,8 @@ class _Drawing:
     def __init__(self) -> None:
         self._world: int = pybullet.connect(pybullet.DIRECT)
         if self._world < 0:
-            mend = "Render fewer scenes at once in one process, or use another renderer"
-            raise InputError("--renderer", "pybullet", "Bullet cannot open another world", mend)
+            fix = "Render fewer scenes at once in one process, or use another renderer"
+            raise InputError("--renderer", "pybullet", "Bullet cannot open another world", fix)
         self._label_of_body: list[int] = []
 
     def __enter__(self) -> _Drawing:

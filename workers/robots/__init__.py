@@ -51,8 +51,8 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     bottom, top = description.limits.base_height_m or (0.0, math.inf)
     # Stored heights are float32, which may lie just outside.
     if not bottom - _STEP_M <= base_height_m <= min(top + _STEP_M, _HIGHEST_MOUNT_M):
-        mend = _within("base height", bottom, top)
-        raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", mend)
+        fix = _within("base height", bottom, top)
+        raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", fix)
     own = description.extension is None
     return _mounted(name, None if own else reach_m, min(max(base_height_m, bottom), top))
 

@@ -120,8 +120,8 @@ def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float])
             if joint.name in stops:
                 continue
             if joint.kind != "fixed" and joint.name not in held:
-                mend = "Name it in the robot's file, or use the URDF that ManiSkill brings"
-                raise InputError(tree.path, f"joint {joint.name}", "has no fixed position", mend)
+                fix = "Name it in the robot's file, or use the URDF that ManiSkill brings"
+                raise InputError(tree.path, f"joint {joint.name}", "has no fixed position", fix)
             T = found[parent][1] @ joint.T_parent_child
             if joint.kind == "prismatic":
                 T = T @ translation(*(joint.axis * held[joint.name]))

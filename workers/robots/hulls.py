@@ -26,7 +26,7 @@ from datagen.workers.robots.urdf import Shape
 # PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _MAX_BYTES = 64 << 20
-_MEND = "Install mani_skill again, or correct the file"
+_FIX = "Install mani_skill again, or correct the file"
 _BOX_BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 _TAKEN_AT_ONCE = 4
 _PUSHES = 50
@@ -65,7 +65,7 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
-    data = read_regular(path, _MAX_BYTES, _MEND)
+    data = read_regular(path, _MAX_BYTES, _FIX)
     try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix, process=False)
         points = np.asarray(mesh.vertices, np.float64)
@@ -148,4 +148,4 @@ def _outside(points: F64, hull: ConvexHull) -> F64:
 
 
 def _wrong(path: Path, problem: str) -> InputError:
-    return InputError(path, "", problem, _MEND)
+    return InputError(path, "", problem, _FIX)

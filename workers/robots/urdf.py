@@ -15,7 +15,7 @@ from datagen.workers.geometry.mesh import F64
 
 _MAX_BYTES = 8 << 20
 _MAX_LINKS = 1000
-_MEND = "Install mani_skill again, or correct the file"
+_FIX = "Install mani_skill again, or correct the file"
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
@@ -100,7 +100,7 @@ def read_urdf(path: Path) -> UrdfTree:
     finite, a joint between links that do not exist, two parents of one link, a loop.
     """
     try:
-        root = ElementTree.fromstring(read_regular(path, _MAX_BYTES, _MEND))
+        root = ElementTree.fromstring(read_regular(path, _MAX_BYTES, _FIX))
     except ElementTree.ParseError as error:
         raise _wrong(path, "", f"is not XML ({error})") from error
     if root.tag != "robot":
@@ -257,4 +257,4 @@ def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
 
 
 def _wrong(path: Path, field: str, problem: str) -> InputError:
-    return InputError(path, field, problem, _MEND)
+    return InputError(path, field, problem, _FIX)

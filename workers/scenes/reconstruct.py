@@ -23,7 +23,7 @@ from datagen.workers.world import PreparedHouse, World
 Record = Mapping[str, Any]  # one row of the scene table, or the samples' columns, by field name
 
 _PLACE = "stored scenes"
-_MEND = "Make the run with these scenes again"
+_FIX = "Make the run with these scenes again"
 # Of rotations, which engines give as float32.
 _ROUNDING = 1e-5
 _EXTENT_M = 1000.0  # no house is larger
@@ -123,7 +123,7 @@ def _within(values: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray
 
 
 def _senseless(index: int, name: str) -> InputError:
-    return InputError(_PLACE, f"scene {index}, {name}", "has impossible values", _MEND)
+    return InputError(_PLACE, f"scene {index}, {name}", "has impossible values", _FIX)
 
 
 def _same(name: str, found: str, stored: str) -> None:

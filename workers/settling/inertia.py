@@ -34,8 +34,8 @@ def mass_properties(name: str, parts_m: Sequence[F32], mass_kg: float) -> MassPr
         try:
             hull = ConvexHull(points)
         except QhullError as error:
-            mend = "Remove the part or give it thickness"
-            raise InputError(name, f"convex_parts_m[{k}]", "has no volume", mend) from error
+            fix = "Remove the part or give it thickness"
+            raise InputError(name, f"convex_parts_m[{k}]", "has no volume", fix) from error
         corners = points[hull.simplices] - inside  # (T, 3, 3): tetrahedra with `inside` as apex
         v6 = np.abs(np.linalg.det(corners))  # six times each volume
         total = corners.sum(1)

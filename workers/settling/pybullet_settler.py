@@ -35,8 +35,8 @@ def settle_pybullet(
     """
     world = pybullet.connect(pybullet.DIRECT)
     if world < 0:
-        mend = "Run fewer scenes at once in one process, or use another settler"
-        raise InputError("--settler", "pybullet", "Bullet cannot open another physics world", mend)
+        fix = "Run fewer scenes at once in one process, or use another settler"
+        raise InputError("--settler", "pybullet", "Bullet cannot open another physics world", fix)
     try:
         with tempfile.TemporaryDirectory(prefix="datagen-bullet-") as folder:
             bodies, T_object_inertial = _fill(

@@ -108,8 +108,8 @@ class DatagenGraspEnv(BaseEnv):
         if any(
             t.prepared.robot.urdf != self.robot.urdf or t.prepared.params != self.params for t in self.tasks
         ):
-            mend = "Make one environment for each robot and set of parameters"
-            raise InputError(ENV_ID, "tasks", "differ in robot or parameters", mend)
+            fix = "Make one environment for each robot and set of parameters"
+            raise InputError(ENV_ID, "tasks", "differ in robot or parameters", fix)
         self.scripts = [_script(task) for task in self.tasks]
         self.rises_m = [planned_rise_m(task.plan, self.robot) for task in self.tasks]
         kwargs = {"sim_backend": "physx_cpu", "render_backend": "none", "reconfiguration_freq": 1} | kwargs
@@ -204,8 +204,8 @@ class DatagenGraspEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         if len(env_idx) != self.num_envs:
-            mend = "Reset them together, or make environments of their own"
-            raise InputError(ENV_ID, "env_idx", "environments are reset one by one", mend)
+            fix = "Reset them together, or make environments of their own"
+            raise InputError(ENV_ID, "env_idx", "environments are reset one by one", fix)
         for actor, at in self.things:
             actor.set_pose(Pose.create(at, device=self.device))
             actor.set_linear_velocity(torch.zeros(3))

@@ -34,7 +34,7 @@ def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool])
     torch.save(told, f"{job.out}.{ranks.rank}")
     ranks.gather("told")
     if ranks.rank == 1:
-        raise InputError("place", "field", "problem", "Mend")
+        raise InputError("place", "field", "problem", "Fix it")
     ranks.gather("never answered")
     return True
 

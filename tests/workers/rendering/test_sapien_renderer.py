@@ -50,7 +50,7 @@ def test_what_came_before_leaves_nothing_in_the_kept_scene() -> None:
     assert (first.depth_m == again.depth_m).all()
 
 
-def test_without_a_render_device_the_error_names_the_mend() -> None:
+def test_without_a_render_device_the_error_names_the_fix() -> None:
     program = (
         "from datagen.schemas.errors import InputError\n"
         "from tests.workers.rendering.engines import cameras, mixed_stage\n"

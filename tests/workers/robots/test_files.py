@@ -70,7 +70,7 @@ def test_parts_in_files_are_those_of_the_links(reach_m: float) -> None:
             np.testing.assert_allclose(corners.min(axis=0), part.min(axis=0), atol=1e-6)
 
 
-def test_what_is_asked_for_again_is_marked_as_used_and_mended(folder: Path) -> None:
+def test_what_is_asked_for_again_is_marked_as_used_and_repaired(folder: Path) -> None:
     robot = arm(0.7)
     urdf = robot.urdf
     whole = {name: (folder / name).read_bytes() for name in names(folder)}
