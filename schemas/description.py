@@ -58,7 +58,7 @@ _COMMENT = (
 
 
 def described(specs: Sequence[Specification], samples: Sequence[int] = ()) -> dict[str, Any]:
-    """The global attributes of a store over runs of these specifications, with `n` samples each."""
+    """The global attributes of a store over runs of these specifications, with `samples` each."""
     assets = list(dict.fromkeys(asset for spec in specs for asset in _assets(spec)))
     labels = _listed(spec.label_source for spec in specs)
     houses = _listed(_house(spec).name for spec in specs)

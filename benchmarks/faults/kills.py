@@ -1,4 +1,4 @@
-"""Random kill -9 of workers and drivers: is the run that of an undisturbed job, with every attempt in the ledger?
+"""Random kill -9 of workers and drivers: is the run as if undisturbed, with every attempt in the ledger?
 
 python -m benchmarks.faults.kills [--worker-kills 200] [--driver-kills 50] [--shards 600] [--workers 3]
 """
