@@ -13,14 +13,14 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
     if not labels:
         print_rows(f"audit of {report['label_source']} labels", [("labels", "none committed")])
         return
-    redraws = ", ".join(f"{cause} {count}" for cause, count in report["redraws"].items()) or "none"
+    rejected = ", ".join(f"{cause} {count}" for cause, count in report["redraws"].items()) or "none"
     print_rows(
         f"audit of {report['label_source']} labels",
         [
             ("labels", f"{labels:,} in {report['scenes']:,} scenes"),
             ("made from", report["made_from"]),
             ("positive", f"{report['positives']:,} ({100 * report['positive_share']:.1f}%)"),
-            ("redraws", redraws),
+            ("rejected", rejected),
             ("worker time", _worker_time(useful)),
             *([("relabelled files", _worker_time(before))] if before["wall_s"] else []),
             (
