@@ -31,7 +31,7 @@ define environment
 endef
 
 venv:
-	$(call environment,all dev)
+	$(call environment)
 
 # Only what labels need: a quarter of the whole.
 venv-labels:
