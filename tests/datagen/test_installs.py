@@ -53,24 +53,24 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_wheel(tmp_path_factory.mktemp("wheel with spaces"))
 
 
-def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, finished: Path, tmp_path: Path) -> None:
+def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, tmp_path: Path) -> None:
     base = Installed(wheel, tmp_path)
     for words in (["--help"], ["doctor", "--help"], ["assets", "list"]):
         base.succeed(*words)
     for verb in ("verify", "audit", "status", "logs", "seal", "unseal", "repair", "gc", "cancel"):
-        base.succeed(verb, finished)
-    base.succeed("merge", finished, "--out", tmp_path / "merged")
+        base.succeed(verb, copied)
+    base.succeed("merge", copied, "--out", tmp_path / "merged")
     doctor = base.run("doctor")
     assert doctor.returncode == 1 and "Traceback" not in doctor.stderr and "[labels]" in doctor.stdout
     out = tmp_path / "out"
     base.lacks("labels", *submit_arguments(out, PER_SCENE))
     base.lacks("labels", "submit", "sim", "--n", "48", "--out", out)
-    base.lacks("labels", "resume", finished)
-    base.lacks("labels", "show", finished, "--scene", "0", "--out", out)
-    base.lacks("labels", "replay", finished, "0")
-    base.lacks("labels", "verify", finished, "--deep", "1")
-    base.lacks("train", "train", "stage1", finished, "--out", out)
-    base.lacks("train", "evaluate", "model.ckpt", finished)
+    base.lacks("labels", "resume", copied)
+    base.lacks("labels", "show", copied, "--scene", "0", "--out", out)
+    base.lacks("labels", "replay", copied, "0")
+    base.lacks("labels", "verify", copied, "--deep", "1")
+    base.lacks("train", "train", "stage1", copied, "--out", out)
+    base.lacks("train", "evaluate", "model.ckpt", copied)
     assert not out.exists()
 
 
