@@ -73,6 +73,18 @@ def test_documents_that_are_named_in_code_are_there() -> None:
     assert not missing
 
 
+def test_files_that_are_named_in_documents_are_there() -> None:
+    """`tests/...py`, `test_name.py` alone, and modules by their path, outside blocks of code."""
+    tests = {file.name for file in (REPOSITORY / "tests").rglob("test_*.py")}
+    missing: list[str] = []
+    for page in PAGES:
+        for name in re.findall(r"`((?:\w+/)*\w+\.py)`", prose(page)):
+            is_there = (REPOSITORY / name).is_file() or ("/" not in name and name in tests)
+            if not is_there and ("/" in name or name.startswith("test_")):
+                missing.append(f"{page.name}: {name}")
+    assert not missing
+
+
 def test_a_dead_link_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
