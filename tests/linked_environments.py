@@ -49,7 +49,10 @@ def install_wheel(wheel: Path, folder: Path) -> Path:
 def link_libraries(site: Path, *extras: str) -> None:
     """Link what the wheel asks for with these extras, and what that asks for in turn."""
     libraries = Path(sysconfig.get_path("purelib"))
-    for name in _closure(DISTRIBUTION, extras, {}):
+    names = list(_closure(DISTRIBUTION, extras, {}))
+    if {"all", "sim"} & set(extras) and "mani-skill" not in names:
+        names.append("mani-skill")  # where pip cannot, users install it by a command of its own
+    for name in names:
         if name != DISTRIBUTION:
             for file in distribution(name).files or ():
                 _link(libraries, site, Path(file).parts)

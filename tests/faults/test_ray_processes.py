@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,7 +60,8 @@ def kill_machine(machine: psutil.Process) -> None:
     """SIGKILL to all of its processes, as when the power goes."""
     tree = [machine, *machine.children(recursive=True)]
     for process in tree:
-        process.kill()
+        with suppress(psutil.NoSuchProcess):  # one may end between the list and the signal
+            process.kill()
     psutil.wait_procs(tree, timeout=60)
 
 
