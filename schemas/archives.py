@@ -12,7 +12,7 @@ DAMAGED_ZIP = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,  # a truncated member
-    RuntimeError,  # an encrypted member; NotImplementedError for an unknown version or flag
+    RuntimeError,  # an encrypted member; its subclass NotImplementedError: an unknown version or method
     # An offset before the start of the file, or a bad member; UnicodeDecodeError for a name not in UTF-8.
     ValueError,
 )

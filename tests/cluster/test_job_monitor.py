@@ -23,7 +23,7 @@ class PaperBoard:
     """Remembers what was published and when; the stop request is a function of the time."""
 
     clock: FakeClock
-    wished: Callable[[float], StopMode | None] = lambda now_s: None
+    requested: Callable[[float], StopMode | None] = lambda now_s: None
     told: list[tuple[float, JobStatus]] = field(default_factory=list)
     looked_s: list[float] = field(default_factory=list)
 
@@ -32,16 +32,16 @@ class PaperBoard:
 
     def stop_requested(self) -> StopMode | None:
         self.looked_s.append(self.clock.now_s)
-        return self.wished(self.clock.now_s)
+        return self.requested(self.clock.now_s)
 
 
 def watched(
     shards: int,
-    wished: Callable[[float], StopMode | None] = lambda now_s: None,
+    requested: Callable[[float], StopMode | None] = lambda now_s: None,
     stop: StopRequest | None = None,
 ) -> tuple[JobSummary, PaperBoard, PaperRecorder, Heard]:
     clock, recorder, heard = FakeClock(), PaperRecorder(), Heard()
-    board, stop = PaperBoard(clock, wished), stop or StopRequest()
+    board, stop = PaperBoard(clock, requested), stop or StopRequest()
     executor = SimulatedExecutor(clock, lambda o, n: ("committed", SHARD_S), slots=4)
     events = JobMonitor(board, stop, labels_per_shard=10, shown=heard, clock=clock)
     summary = drive(range(shards), lambda o: o, executor, recorder, RetryPolicy(), events, stop, clock)
@@ -77,10 +77,10 @@ def test_a_request_to_end_at_once_ends_what_is_in_flight_by_force() -> None:
 
 
 def test_force_may_follow_a_drain() -> None:
-    def wish(now_s: float) -> StopMode | None:
+    def request(now_s: float) -> StopMode | None:
         return None if now_s < 30 else "drain" if now_s < 33 else "force"
 
-    summary, _, recorder, _ = watched(400, wish)
+    summary, _, recorder, _ = watched(400, request)
     assert summary.end == "interrupted" and recorder.closed["cancelled"] > 0
 
 

@@ -248,7 +248,7 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line(
     cases: list[tuple[list[str], list[str]]] = [
         ([file], ["PATH", "no run is given"]),
         ([file, str(tmp_path / "none")], ["none", "neither a checkpoint file nor a run folder"]),
-        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "not a"]),
+        ([str(tmp_path / "thesis.tex"), run], ["thesis.tex", "not a datagen checkpoint"]),
         ([file, heuristic], ["label_source: is heuristic", "datagen submit sim"]),
         ([run, "--baselines", "none"], ["PATH", "no model or baseline given"]),
         ([file, file, run], ["the same checkpoint as"]),

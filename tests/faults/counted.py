@@ -133,7 +133,7 @@ def start_driver(
 
 
 def all_at_once(drivers: int) -> Any:
-    """What drivers wait at until so many are ready."""
+    """What drivers wait at until N are ready."""
     return _FORKS.Barrier(drivers)
 
 

@@ -80,7 +80,7 @@ class _Reference:
 
 
 def campaign(shim: Shim, work: Path, operations: Iterable[Operation], sample: int | None) -> list[Finding]:
-    """Try the operations at all their points, or at so many of each kind of end."""
+    """Try the operations at all their points, or at N of each kind of end."""
     findings: list[Finding] = []
     for operation in operations:
         _warm_up(operation)

@@ -129,7 +129,7 @@ def keys_of(folder: Path) -> list[str]:
 def try_all(
     clean: Path, scratch: Path, damages: Iterable[Damage], campaign: Campaign, repair_every: int = 1
 ) -> None:
-    """Do each damage to a run equal to `clean` and check it; fix every so many of them, and check again."""
+    """Do each damage to a run equal to `clean` and check it; repair every N-th of them, and check again."""
     shutil.rmtree(scratch, ignore_errors=True)
     copy_run(clean, scratch)
     whole = {key: (clean / key).read_bytes() for key in keys_of(clean)}

@@ -66,7 +66,7 @@ class Outcome:
 
 
 def campaign(address: str, shards: int, faults: Faults, folder: Path) -> Outcome:
-    """Make a run of so many shards at the address, whose proxy does as `faults` says, and seal it.
+    """Make a run of N shards at the address, whose proxy does as `faults` says, and seal it.
 
     A job that ends with an InputError is begun again, and the store is up again by then. Raises
     AssertionError where the run then is not what an undisturbed one is.

@@ -98,7 +98,7 @@ def kind_of(path: str) -> str:
 
 
 def swaps(world: Path, each: int | None, rng: np.random.Generator) -> Iterator[Swap]:
-    """Pairs of files of one sort and, of chunks, of one size, that differ: all, or so many of each sort."""
+    """Pairs of files of one sort and, of chunks, of one size, that differ: all, or N of each sort."""
     files = files_of(world)
     by_kind: dict[tuple[str, int], list[str]] = {}
     for path, data in files.items():

@@ -9,6 +9,7 @@ import psutil
 import pytest
 
 from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.ray_cluster import RaySettings, ray_cluster
 from datagen.cluster.ray_executor import RayExecutor
@@ -23,13 +24,20 @@ def test_who_fills_the_memory_is_ended_and_tried_once_more(
 ) -> None:
     for number in range(4):  # another program that grows or ends meanwhile moves the threshold
         (tmp_path / str(number)).mkdir()
-        if fill_the_memory(tmp_path / str(number), monkeypatch):
-            return
-    pytest.skip("the memory of other programs does not stand still")
+        summary, recorder, stood_still = fill_the_memory(tmp_path / str(number), monkeypatch)
+        if stood_still:
+            break
+    assert summary.totals.committed == 1 and summary.totals.retries == 1
+    ended, committed = recorder.entries
+    assert (ended.outcome, committed.outcome) == ("out_of_memory", "committed")
+    assert "memory" in ended.cause and ended.host is not None and ended.host.pid != os.getpid()
+    assert ended.cost is not None and ended.cost.wall_s > 0
 
 
-def fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether other programs' memory stood still, so that the job was held to what it should do."""
+def fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[JobSummary, PaperRecorder, bool]:
+    """How a job ended, its ledger, and whether other programs' memory stayed the same meanwhile."""
     from ray._private.utils import get_system_memory, get_used_memory
 
     total = get_system_memory()
@@ -54,11 +62,4 @@ def fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
             [0], make_task, RayExecutor(perform, settings, ray), recorder, policy, Heard(), StopRequest()
         )
     now = max(get_used_memory(), total - psutil.virtual_memory().available)
-    if abs(now - used) > FILL_BYTES / 4:
-        return False
-    assert summary.totals.committed == 1 and summary.totals.retries == 1
-    ended, committed = recorder.entries
-    assert (ended.outcome, committed.outcome) == ("out_of_memory", "committed")
-    assert "memory" in ended.cause and ended.host is not None and ended.host.pid != os.getpid()
-    assert ended.cost is not None and ended.cost.wall_s > 0
-    return True
+    return summary, recorder, abs(now - used) <= FILL_BYTES / 4
