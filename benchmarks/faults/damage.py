@@ -1,6 +1,6 @@
 """A run damaged in every way: what checks miss, and what repair does not bring back.
 
-    python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--fix-every 1]
+    python -m benchmarks.faults.damage [--flips 1000] [--cuts-every 1] [--repair-every 1]
 
 Random single bit flips over every sort of file, and each file in turn removed, cut and grown; each damage is
 checked, repaired and checked again, and the run is then compared with what it was, byte by byte.
@@ -31,8 +31,8 @@ def main() -> None:
     """Print the table; ends with 1 where anything was missed or not brought back."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--flips", type=int, default=1000)
-    options.add_argument("--cuts-every", type=int, default=1, help="take each so-manieth removal and cut")
-    options.add_argument("--fix-every", type=int, default=1, help="repair every N-th damage only")
+    options.add_argument("--cuts-every", type=int, default=1, help="take each N-th removal and cut only")
+    options.add_argument("--repair-every", type=int, default=1, help="repair each N-th damage only")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--folder", type=Path, help="where the run is made [the system's temporary folder]")
     chosen = options.parse_args()
