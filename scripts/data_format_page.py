@@ -46,9 +46,9 @@ RUN/
 
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 
-Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are all
-equally long; the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by
-scene, and the samples of a scene lie together, in the order of their candidates.
+Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are equally long;
+the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by scene, then by candidate.
+[How a run is stored](../explanation/runs.md) says why.
 
 ## Arrays
 
@@ -62,25 +62,16 @@ and `flag_meanings`: the words that the codes 0, 1, ... stand for.
 `data.zarr` has consolidated metadata. Its root's attributes hold the specification and, by the conventions
 {CONVENTIONS}, `title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`,
 `history` and `comment`; they follow from the specification and n alone. Its arrays also have
-`coordinates`, and `flag_values` beside `flag_meanings`. Stores that an older program sealed lack these
+`coordinates`, and `flag_values` with `flag_meanings`. Stores that an older program sealed lack these
 attributes and remain valid; sealing again adds them.
 
-```python
-import xarray, zarr
-zarr.open("RUN/data.zarr", mode="r")["label"][:]
-xarray.open_zarr("RUN/data.zarr")
-```
-
-Scenes and samples are two tables. A data frame over both dimensions would have a row for every pair of a
-scene and a sample, so `xarray.Dataset.to_dataframe` is not of use here: `datagen.candidates("RUN")` returns
-the pandas table of samples joined with their scenes ([Python](python.md)).
+[Read the data](../guides/read-data.md) opens a store; [Python](../guides/python.md#tables-of-candidates)
+joins samples and scenes to a table.
 
 ## Versions
 
-Schema version {SCHEMA_VERSION}. A run keeps the version it was begun with, also under newer programs. A new
-array raises the version (`Field.since`); no stored array is renamed, retyped or removed. The versions of
-the code that makes scenes and labels are in the specification's `engines`, and so in its hash
-([rules for changes](../development/index.md#versions-of-stored-data)).
+Schema version {SCHEMA_VERSION}. A run keeps the version it was begun with, also under newer programs.
+No stored array is renamed, retyped or removed ([rules for changes](../development/index.md#versions-of-stored-data)).
 """
 
 _OUTCOME_HEAD = (
