@@ -47,8 +47,8 @@ RUN/
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 
 Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are equally long;
-the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by scene, then by candidate.
-[How a run is stored](../explanation/runs.md) says why.
+the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by scene, then by
+candidate. [How a run is stored](../explanation/runs.md) says why.
 
 ## Arrays
 
@@ -71,7 +71,8 @@ joins samples and scenes to a table.
 ## Versions
 
 Schema version {SCHEMA_VERSION}. A run keeps the version it was begun with, also under newer programs.
-No stored array is renamed, retyped or removed ([rules for changes](../development/index.md#versions-of-stored-data)).
+No stored array is renamed, retyped or removed
+([rules for changes](../development/index.md#versions-of-stored-data)).
 """
 
 _OUTCOME_HEAD = (
