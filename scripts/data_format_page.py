@@ -130,13 +130,17 @@ def _table(title: str, fields: Fields, earlier: list[tuple[str, Fields]]) -> lis
     if shared:
         head += [f"The arrays of `{like}`, and:", ""]
     head += [
-        f"| array | type | dimensions after `{title}` | unit | frame | range | meaning |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| array | type (dimensions after `{title}`) | unit, frame, range | meaning |",
+        "| --- | --- | --- | --- |",
     ]
     return head + [
-        f"| `{f.name}` | {f.dtype} | {', '.join(f.dims)} | {f.unit} | {f.frame} | {_range(f)} | {f.doc} |"
+        f"| `{f.name}` | {_type(f)} | {', '.join(filter(None, (f.unit, f.frame, _range(f))))} | {f.doc} |"
         for f in fields[shared:]
     ]
+
+
+def _type(field: Field) -> str:
+    return f"{field.dtype} ({', '.join(field.dims)})" if field.dims else field.dtype
 
 
 def _range(field: Field) -> str:
