@@ -5,7 +5,7 @@ r"""Write frames of test scenes as folders for `datagen predict --frame`, such a
 Each scene is drawn in a house of the test split and rendered with stereo noise. The camera's height, for
 `--camera-height`, is printed. The pictures docs/images/predict.png and predict-unseen.png were made by
 
-    HEURISTIC=12000 SIM_IN_RANGE=600 SIM_CLEAR=450 scripts/paper.sh small PAPER    # only its training runs are used
+    HEURISTIC=12000 SIM_IN_RANGE=600 SIM_CLEAR=450 scripts/paper.sh small PAPER    # its training runs
     datagen train stage1 PAPER/runs/heuristic --epochs 3 --threads 1 --out stage1.ckpt
     datagen train stage2 PAPER/runs/train-in-range PAPER/runs/train-clear --init stage1.ckpt --epochs 4 \
         --threads 1 --out model.ckpt
