@@ -24,7 +24,6 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import quaternion_wxyz
 from datagen.workers.registry import entry
 from datagen.workers.robots import ROBOTS, open_robot
-from datagen.workers.robots.arm import Arm
 from datagen.workers.robots.description import robots_folder
 from datagen.workers.robots.robot import Robot
 
@@ -59,7 +58,7 @@ def _print_robot(name: str, reach_m: float | None, height_m: float, count: int) 
     # Opened before: what a process pays once (meshes, hulls) is not what a scene pays.
     robot = open_robot(name, reach_m, height_m)
     started = time.process_time()
-    Arm(entry(ROBOTS, name, "--robot"), reach_m, height_m)
+    Robot(entry(ROBOTS, name, "--robot"), reach_m, height_m)
     opened_ms = (time.process_time() - started) * 1e3
     rng = np.random.default_rng(0)
     q = _random(robot, rng, count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,8 +25,10 @@ from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
-from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.reconstruct import ReconstructedScene
+
+if TYPE_CHECKING:  # the heuristic's pictures need no library of arms
+    from datagen.workers.robots.robot import Robot
 
 Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")

@@ -18,7 +18,7 @@ from datagen.workers.geometry.transforms import look_at
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.rays import RayScene, ray_mesh
-from datagen.workers.robots.robot import Gripper
+from datagen.workers.robots.gripper import Gripper
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 _SAME_M, _SAME_RAD = 0.004, 0.06  # joint angles reach a grasp within 0.5 mm and 0.5 degrees

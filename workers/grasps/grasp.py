@@ -9,7 +9,7 @@ from datagen.workers.geometry.mesh import F32, F64
 
 @dataclass(frozen=True, eq=False)
 class GraspSet:
-    """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.robot.Gripper`)."""
+    """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.gripper.Gripper`)."""
 
     T_object_tcp: F64  # (G, 4, 4)
     opening_m: F32  # (G,), at which the hand comes in: the object's width there and some air

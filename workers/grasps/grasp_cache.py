@@ -14,7 +14,7 @@ from datagen.workers.content_cache import Arrays, CacheFolder
 from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.grasps.search import VERSION, ScoredGrasps, search_grasps
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.robot import Gripper, Parts
+from datagen.workers.robots.gripper import Gripper, Parts
 
 _KEPT_IN_MEMORY = 512
 _CACHE = CacheFolder(

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F32, F64
+from datagen.workers.robots.gripper import Gripper
 from datagen.workers.robots.hulls import polyhedron
-from datagen.workers.robots.robot import Gripper
 
 Bools = npt.NDArray[np.bool_]
 

@@ -14,7 +14,7 @@ from datagen.workers.grasps.floating_hand import HandTest, held_trials
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
 from datagen.workers.grasps.hand_poses import flipped, hand_poses, varied
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.robot import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 Bools = npt.NDArray[np.bool_]
 

@@ -13,7 +13,7 @@ from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.grasp_cache import scored_grasps
 from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.robots.robot import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 MIN_CLEAR_GRASPS = 20
 MIN_HELD_SHARE = 0.25

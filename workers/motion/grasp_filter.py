@@ -9,7 +9,7 @@ import numpy as np
 from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.motion.collision import Bools, Hulls, Ints, Placed, hits, hulls_of
-from datagen.workers.robots.robot import Gripper
+from datagen.workers.robots.gripper import Gripper
 
 # Poses found by inverse kinematics are this near to the asked ones: 0.5 mm, and 0.5 degrees at the palm.
 IK_SLACK_M = 0.0015

@@ -11,8 +11,8 @@ from datagen.workers.registry import entry
 from datagen.workers.robots.description import RobotDescription, RobotLimits
 
 if TYPE_CHECKING:
-    from datagen.workers.robots.arm import Arm
-    from datagen.workers.robots.robot import Gripper, Robot
+    from datagen.workers.robots.gripper import Gripper
+    from datagen.workers.robots.robot import Robot
 
 ROBOTS: dict[str, str] = {
     "panda-scaled": "datagen.workers.robots.panda:PANDA_SCALED",
@@ -69,7 +69,7 @@ def _description(name: str) -> RobotDescription:
 
 
 @lru_cache(maxsize=64)
-def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Arm:
+def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     if _description(name).lift is not None:
         return _built(name, reach_m, base_height_m)
     # Pedestals of any height carry the same arm.
@@ -77,9 +77,9 @@ def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Arm:
 
 
 @lru_cache(maxsize=64)
-def _built(name: str, reach_m: float | None, base_height_m: float) -> Arm:
+def _built(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     # Imported when asked for, so that limits can be read without a simulator.
-    build = entry({name: "datagen.workers.robots.arm:Arm"}, name, "--robot")
+    build = entry({name: "datagen.workers.robots.robot:Robot"}, name, "--robot")
     return build(_description(name), reach_m, base_height_m)
 
 

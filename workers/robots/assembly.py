@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.transforms import inverse, translation
+from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.chain import Chain, largest_reach_m
 from datagen.workers.robots.description import HandDescription, RobotDescription, robots_folder
+from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import shape_parts
-from datagen.workers.robots.robot import Gripper, Parts
 from datagen.workers.robots.urdf import Inertial, Joint, Link, Shape, UrdfTree, read_urdf, scaled_inertial
 
 _TUBE_SIDES = 12
@@ -264,26 +263,6 @@ def _fingers(hand: UrdfTree, description: HandDescription) -> tuple[Joint, Joint
     if abs(left.upper - right.upper) > 1e-9:
         raise _wrong(hand.path, f"joint {right.name}", "opens less or more than the other finger")
     return left, right
-
-
-def gripper_of(name: str, pad_size_m: tuple[float, float], assembly: Assembly) -> Gripper:
-    """The hand alone, in its TCP frame."""
-    from_palm = inverse(assembly.T_palm_tcp)
-    palm, *fingers = assembly.bodies[-3:]
-    palm_parts = tuple(_moved(part, from_palm) for part in palm.parts_m)
-    left, right = (
-        tuple(_moved(part, from_palm @ joint.T_parent_child) for part in body.parts_m)
-        for body, joint in zip(fingers, assembly.fingers, strict=True)
-    )
-    opening = 2 * assembly.fingers[0].upper
-    depth = -max(float(part[:, 2].max()) for part in palm_parts)
-    parts = [part.tolist() for part in (*palm_parts, *left, *right)]
-    digest = digest_of([name, opening, list(pad_size_m), depth, parts])
-    return Gripper(name, digest, opening, pad_size_m, depth, palm_parts, (left, right))
-
-
-def _moved(part: F32, T: F64) -> F32:
-    return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
 
 def _scaled_pose(T: F64, scale: float) -> F64:

@@ -1,97 +1,190 @@
-"""The interface of robots for planner and physics: an arm on a mount, with a parallel gripper."""
+"""Robots for planner and physics: an arm on a mount, with a parallel gripper."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
+import pinocchio
 
-from datagen.workers.geometry.mesh import F32, F64, Mesh
+from datagen.schemas.identity import digest_of
+from datagen.workers.geometry.mesh import F32, F64, Mesh, concatenate
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.houses.glb import read_glb
+from datagen.workers.robots.assembly import Assembly, LinkBody, assemble
+from datagen.workers.robots.description import HandDescription, RobotDescription
+from datagen.workers.robots.gripper import Gripper, Parts
+from datagen.workers.robots.hulls import hull_faces
+from datagen.workers.robots.inverse_kinematics import solve
+from datagen.workers.robots.robot_files import RobotFiles, hull_of
+from datagen.workers.robots.self_collision import SelfCollision
 
-Parts = tuple[F32, ...]  # convex parts, each (V, 3)
-_Y = np.array([0.0, 1.0, 0.0], np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Gripper:
-    """A parallel gripper in its TCP frame.
-
-    The origin lies between the pads' centres, z is the direction of approach, out of the palm, and
-    the fingers close along y. Finger 0 is on the side of +y, finger 1 on that of -y; both move by
-    half the opening.
-    """
-
-    name: str
-    digest: str  # of all that follows: grasps are kept by it
-    max_opening_m: float
-    pad_size_m: tuple[float, float]  # of the rubber that touches: along x and along z
-    palm_depth_m: float  # from the TCP back to the palm's surface, along -z
-    palm_parts_m: Parts  # TCP frame
-    finger_parts_m: tuple[Parts, Parts]  # TCP frame, fingers closed (opening 0)
-
-    def parts_at(self, opening_m: float) -> Parts:
-        """All convex parts of the hand, TCP frame, with the pads `opening_m` apart."""
-        shift: F32 = (_Y * (opening_m / 2)).astype(np.float32)
-        left, right = self.finger_parts_m
-        return (*self.palm_parts_m, *(p + shift for p in left), *(p - shift for p in right))
+# Its binary modules have no types.
+pin: Any = pinocchio
+_GREY = 190
+_read_visual = lru_cache(maxsize=64)(read_glb)
 
 
-class Robot(Protocol):
-    """A robot at one mount height. A joints move the arm; L links carry its shape.
+class Robot:
+    """A robot at one mount height, moved by pinocchio. A joints move the arm; L links carry its shape.
 
     Base frame: the arm's mount, at (x, y, base_height_m) in the world, z up, x to the front. Equal
-    arguments of `open_robot` give equal numbers on every machine of one platform.
+    arguments give equal numbers on every machine of one platform.
     """
 
-    name: str  # as the registry and the specification name it
-    reach_m: float  # largest distance from the first joint that moves the TCP to the TCP
-    shoulder_m: F64  # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther
-    base_height_m: float
-    base_radius_m: float | None  # footprint of its own mobile base; None stands on a pedestal
-    gripper: Gripper
-    T_base_root: F64  # (4, 4), pose of the URDF's root link in the base frame
-    joint_names: tuple[str, ...]  # (A,) of the arm, from the base on
-    finger_joint_names: tuple[str, str]
-    q_lower_rad: F64  # (A,)
-    q_upper_rad: F64  # (A,)
-    speed_limit_radps: F64  # (A,)
-    homes_rad: F64  # (H, A), tucked, free of self-collision
-    stiffness: float  # drives of the arm, as ManiSkill's agent has them
-    damping: float
-    force_limit_n: float
-    link_names: tuple[str, ...]  # (L,)
-    link_parts_m: tuple[Parts, ...]  # (L,) convex parts in link frames, fingers fully open
-    self_pairs: tuple[tuple[int, int], ...]  # pairs of links that must not touch
+    def __init__(self, description: RobotDescription, reach_m: float | None, base_height_m: float) -> None:
+        lift = description.lift
+        lift_m = base_height_m - lift.mount_at_zero_m if lift else 0.0
+        assembly = assemble(description, reach_m, lift_m)
+        count = len(assembly.arm)
+        self.name = description.name  # as the registry and the specification name it
+        # Largest distance from the first joint that moves the TCP to the TCP.
+        self.reach_m: float = assembly.reach_m if reach_m is None else reach_m
+        self.scale = assembly.scale
+        self.base_height_m = base_height_m
+        self.base_radius_m = description.limits.base_radius_m  # None stands on a pedestal
+        self.gripper = _gripper(description.hand, assembly)
+        self.T_base_root: F64 = inverse(assembly.T_root_mount)  # (4, 4), pose of the URDF's root link
+        # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther.
+        self.shoulder_m: F64 = (self.T_base_root @ assembly.arm[0].T_parent_child)[:3, 3]
+        self.joint_names = tuple(joint.name for joint in assembly.arm)  # (A,) from the base on
+        self.finger_joint_names = (assembly.fingers[0].name, assembly.fingers[1].name)
+        self.q_lower_rad: F64 = np.array([joint.lower for joint in assembly.arm])  # (A,)
+        self.q_upper_rad: F64 = np.array([joint.upper for joint in assembly.arm])  # (A,)
+        self.speed_limit_radps: F64 = np.array([joint.speed for joint in assembly.arm])  # (A,)
+        self.homes_rad: F64 = np.array(description.homes_rad)  # (H, A), tucked, free of self-collision
+        self.stiffness = description.stiffness  # drives of the arm, as ManiSkill's agent has them
+        self.damping = description.damping
+        self.force_limit_n = description.force_limit_n
+        self.link_names = tuple(body.name for body in assembly.bodies)  # (L,)
+        # (L,) convex parts in link frames, fingers fully open.
+        self.link_parts_m: tuple[Parts, ...] = tuple(body.parts_m for body in assembly.bodies)
+        self._assembly = assembly
+        self._model = _model_of(assembly, self.T_base_root)
+        self._data = self._model.createData()
+        self._tcp = self._model.getFrameId("tcp")
+        first = self._tcp - len(self.link_names)
+        self._frames = range(first, self._tcp)
+        frames = self._model.frames
+        joints = [frames[f].parentJoint for f in self._frames]
+        placements = [frames[f].placement.homogeneous for f in self._frames]
+        # One hull a finger is close enough and four times as fast as its boxes.
+        parts = [*self.link_parts_m[:-2], *((hull_of(p),) for p in self.link_parts_m[-2:])]
+        self._self_collision = SelfCollision(self._model, parts, joints, placements)
+        self.self_pairs = self._self_collision.pairs  # pairs of links that must not touch
+        names = self.link_names
+        disabled = [
+            (names[a], names[b])
+            for a in range(len(names))
+            for b in range(a + 1, len(names))
+            if (a, b) not in self.self_pairs and not (b <= count and b == a + 1)
+        ]
+        self._files = RobotFiles(self.name, assembly, disabled)
 
     @property
     def urdf(self) -> Path:
-        """For physics engines, with paths of meshes that resolve.
+        """Path of its URDF for physics engines, with paths of meshes that resolve.
 
         The files are written when asked for and stay for an hour at least: read them soon, and ask again.
         """
-        ...
+        return self._files.urdf()
+
+    def at_height(self, base_height_m: float) -> Robot:
+        """The same arm on a pedestal of another height; both share what they are made of."""
+        other = copy.copy(self)
+        other.base_height_m = base_height_m
+        return other
 
     def T_base_link(self, q_rad: F64) -> F64:
         """Poses (L, 4, 4) of the links at the joints (A,)."""
-        ...
+        pin.framesForwardKinematics(self._model, self._data, q_rad)
+        placements = self._data.oMf
+        T = np.empty((len(self._frames), 4, 4))
+        for k, frame in enumerate(self._frames):
+            T[k] = placements[frame].homogeneous
+        return T
 
     def T_base_tcp(self, q_rad: F64) -> F64:
         """Pose (4, 4) of the gripper's TCP at the joints (A,)."""
-        ...
+        pin.forwardKinematics(self._model, self._data, q_rad)
+        return pin.updateFramePlacement(self._model, self._data, self._tcp).homogeneous
 
     def ik(self, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
-        """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None.
-
-        Damped least squares from the seed, bounded in iterations; no draw of its own.
-        """
-        ...
+        """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
+        return solve(self._model, self._data, self._tcp, T_base_tcp, q_seed_rad)
 
     def collides_itself(self, q_rad: F64) -> bool:
         """Whether any of `self_pairs` touch at the joints (A,)."""
-        ...
+        return self._self_collision.touches(q_rad)
 
     def link_meshes(self) -> tuple[Mesh, ...]:
-        """(L,) meshes to look at, link frames; loaded when first asked for."""
-        ...
+        """(L,) meshes to look at, link frames."""
+        return tuple(_mesh_of(body) for body in self._assembly.bodies)
+
+
+def _model_of(assembly: Assembly, T_base_root: F64) -> Any:
+    """Joints of the arm alone; then a frame for every body, fingers open, and one for the TCP."""
+    model = pin.Model()
+    at = 0
+    placements = [T_base_root]
+    parents = [0]
+    for joint in assembly.arm:
+        T = (T_base_root if at == 0 else np.eye(4)) @ joint.T_parent_child
+        kind = (
+            pin.JointModelRZ()
+            if np.array_equal(joint.axis, (0, 0, 1))
+            else pin.JointModelRevoluteUnaligned(joint.axis)
+        )
+        limits = (np.array([v]) for v in (joint.effort, joint.speed, joint.lower, joint.upper))
+        at = model.addJoint(at, kind, pin.SE3(T), joint.name, *limits)
+        placements.append(np.eye(4))
+        parents.append(at)
+    T_palm = assembly.palm.T_parent_child
+    placements.append(T_palm)
+    for joint in assembly.fingers:
+        slide = np.eye(4)
+        slide[:3, 3] = joint.axis * joint.upper
+        placements.append(T_palm @ joint.T_parent_child @ slide)
+    placements.append(T_palm @ assembly.T_palm_tcp)
+    parents += [at] * 4
+    names = [*(body.name for body in assembly.bodies), "tcp"]
+    for name, joint_id, T in zip(names, parents, placements, strict=True):
+        model.addFrame(pin.Frame(name, joint_id, 0, pin.SE3(T), pin.FrameType.OP_FRAME))
+    return model
+
+
+def _gripper(hand: HandDescription, assembly: Assembly) -> Gripper:
+    from_palm = inverse(assembly.T_palm_tcp)
+    palm, *fingers = assembly.bodies[-3:]
+    palm_parts = tuple(_moved(part, from_palm) for part in palm.parts_m)
+    left, right = (
+        tuple(_moved(part, from_palm @ joint.T_parent_child) for part in body.parts_m)
+        for body, joint in zip(fingers, assembly.fingers, strict=True)
+    )
+    opening = 2 * assembly.fingers[0].upper
+    depth = -max(float(part[:, 2].max()) for part in palm_parts)
+    parts = [part.tolist() for part in (*palm_parts, *left, *right)]
+    digest = digest_of([hand.name, opening, list(hand.pad_size_m), depth, parts])
+    return Gripper(hand.name, digest, opening, hand.pad_size_m, depth, palm_parts, (left, right))
+
+
+def _moved(part: F32, T: F64) -> F32:
+    return (part.astype(np.float64) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+
+def _mesh_of(body: LinkBody) -> Mesh:
+    """A body's visual meshes, else its hulls, in the link frame. Raises InputError naming a broken file."""
+    meshes: list[Mesh] = []
+    for shape in body.visuals:
+        assert shape.mesh is not None
+        T = np.diag([body.scale] * 3 + [1.0]) @ shape.T_link_shape @ np.diag([*shape.scale, 1.0])
+        meshes.append(_read_visual(shape.mesh).transformed(T))
+    return concatenate([*meshes, *(_plain(part) for part in body.drawn_m)])
+
+
+def _plain(corners_m: F32) -> Mesh:
+    faces, _ = hull_faces(corners_m)
+    return Mesh(corners_m, faces, np.full((len(faces), 3), _GREY, np.uint8))

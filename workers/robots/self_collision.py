@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import polyhedron
-from datagen.workers.robots.robot import Parts
 
 # Its binary modules have no types.
 pin: Any = pinocchio

@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 
 from datagen.workers.robots.description import RobotDescription, RobotLimits, turned_homes
-from datagen.workers.robots.franka_hand import FRANKA_HAND
+from datagen.workers.robots.panda import FRANKA_HAND
 
 XARM7 = RobotDescription(
     name="xarm7",

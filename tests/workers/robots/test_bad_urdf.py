@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from datagen.schemas.errors import InputError
 from datagen.workers.robots.assembly import assemble
 from datagen.workers.robots.description import robots_folder
-from datagen.workers.robots.franka_hand import FRANKA_HAND
-from datagen.workers.robots.panda import PANDA, PANDA_SCALED
+from datagen.workers.robots.panda import FRANKA_HAND, PANDA, PANDA_SCALED
 from datagen.workers.robots.urdf import read_urdf, rotation_rpy, rpy_rotation
 
 

@@ -13,12 +13,11 @@ pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run 
 
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.robots import open_robot
-from datagen.workers.robots.arm import Arm
 from datagen.workers.robots.description import RobotDescription, robots_folder
 from datagen.workers.robots.fetch import FETCH
-from datagen.workers.robots.franka_hand import FRANKA_HAND
 from datagen.workers.robots.hulls import MAX_CORNERS, mesh_hulls, outer_hull, read_points
-from datagen.workers.robots.panda import PANDA, PANDA_SCALED
+from datagen.workers.robots.panda import FRANKA_HAND, PANDA, PANDA_SCALED
+from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import Inertial, UrdfTree, read_urdf, scaled_inertial
 from datagen.workers.robots.xarm7 import XARM7
 
@@ -150,7 +149,7 @@ def test_without_the_extension_the_hand_would_meet_the_forearm() -> None:
     bare = replace(PANDA_SCALED, extension=replace(PANDA_SCALED.extension, longest_m=0.0))
     pairs = {
         length_m: {(robot.link_names[a], robot.link_names[b]) for a, b in robot.self_pairs}
-        for length_m, robot in ((0.05, open_robot("panda-scaled", 0.3, 0.8)), (0.0, Arm(bare, 0.3, 0.8)))
+        for length_m, robot in ((0.05, open_robot("panda-scaled", 0.3, 0.8)), (0.0, Robot(bare, 0.3, 0.8)))
     }
     # They touch in most poses, and the rule that drops such pairs would hide it.
     assert ("panda_link5", "panda_hand") in pairs[0.05] - pairs[0.0]

@@ -14,8 +14,8 @@ import trimesh
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
-from datagen.workers.robots.arm import Arm
 from datagen.workers.robots.panda import PANDA_SCALED
+from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.robot_files import RobotFiles
 from datagen.workers.robots.urdf import read_urdf
 
@@ -26,8 +26,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "robots"
 
 
-def arm(reach_m: float) -> Arm:
-    return Arm(PANDA_SCALED, reach_m, 0.8)
+def arm(reach_m: float) -> Robot:
+    return Robot(PANDA_SCALED, reach_m, 0.8)
 
 
 def names(folder: Path) -> set[str]:
@@ -106,10 +106,10 @@ _CHILD = """
 import os, sys
 from datagen.workers.content_cache import alone_in, drop_unused
 from datagen.workers.robots import robot_files
-from datagen.workers.robots.arm import Arm
+from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.panda import PANDA_SCALED
 from datagen.workers.robots.urdf import read_urdf
-robots = [Arm(PANDA_SCALED, reach_m, 0.8) for reach_m in (0.6, *map(float, sys.argv[1:]))]
+robots = [Robot(PANDA_SCALED, reach_m, 0.8) for reach_m in (0.6, *map(float, sys.argv[1:]))]
 for k in range(7):
     if k:
         with alone_in(urdf.parent):
