@@ -23,6 +23,7 @@ from datagen.workers.geometry.transforms import translation
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.part_merging import merge_parts
 from datagen.workers.settling.sapien_bodies import add_object, add_static
+from tests.workers.objects.merging_errors import added_volume_share, cut_off_m, error_m
 
 
 def main() -> None:
@@ -48,16 +49,15 @@ def main() -> None:
         ratios = []
         for model in models:
             started_s = time.process_time()
-            merged = merge_parts(model.convex_parts_m, options.limit)
+            parts_m = model.convex_parts_m
+            merged = merge_parts(parts_m, options.limit)
             took_ms = 1e3 * (time.process_time() - started_s)
-            before, after = (
-                step_us(parts, model.mass_kg, options.steps)
-                for parts in (model.convex_parts_m, merged.parts_m)
-            )
+            before, after = (step_us(parts, model.mass_kg, options.steps) for parts in (parts_m, merged))
             ratios.append(before / after)
             print(
-                f"{model.name:<24} {merged.n_before:>5} {len(merged.parts_m):>4} {1e3 * merged.error_m:>8.1f}"
-                f" {1e3 * merged.shrink_m:>6.2f} {100 * merged.added_volume_share:>+6.0f}% {took_ms:>8.0f}"
+                f"{model.name:<24} {len(parts_m):>5} {len(merged):>4} {1e3 * error_m(parts_m, merged):>8.1f}"
+                f" {1e3 * cut_off_m(parts_m, merged):>6.2f}"
+                f" {100 * added_volume_share(parts_m, merged):>+6.0f}% {took_ms:>8.0f}"
                 f" {before:>7.0f} {after:>6.0f} {ratios[-1]:>5.1f}"
             )
     if ratios:

@@ -24,11 +24,11 @@ from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import ray_scene
 from datagen.workers.rendering.frame import SceneGeometry
-from datagen.workers.rendering.pybullet_renderer import PybulletScene
 from datagen.workers.rendering.rays import RayScene, first_hits, into_frame
 from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.world import assemble_world
+from tests.workers.rendering.pybullet_visibility import PybulletScene
 
 TARGET_RATIO, TARGET_DIFFERENCE = 20.0, 0.02
 NEAR_M = 0.025  # a rasteriser's usual near plane, and a little for rays beside the middle one

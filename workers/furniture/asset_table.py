@@ -49,16 +49,15 @@ def read_asset_table(folder: Path) -> tuple[dict[str, Asset], bytes]:
         raise InputError(folder, "", f"has no size table ({' or '.join(TABLE_NAMES)})", fix)
     text = read_regular(path, _LARGEST_TABLE_BYTES, fix)
     root = parse_json(text, str(path))
-    assets = [_own_entry(node) if own else _thor_entry(node) for node, own in _entries(root)]
+    assets = {asset.asset_id: asset for asset in _assets(root)}
     if not assets:
         raise InputError(path, "", "is an empty size table", fix)
-    return {asset.asset_id: asset for asset in assets}, text
+    return assets, text
 
 
-def _entries(root: JsonNode) -> Iterator[tuple[JsonNode, bool]]:
+def _assets(root: JsonNode) -> Iterator[Asset]:
     if isinstance(root.value, list):
-        for node in root.items(_MAX_ASSETS):
-            yield node, False
+        yield from map(_thor_entry, root.items(_MAX_ASSETS))
         return
     members: Mapping[str, object] = root.value if isinstance(root.value, dict) else {}
     if not members:
@@ -68,16 +67,13 @@ def _entries(root: JsonNode) -> Iterator[tuple[JsonNode, bool]]:
     for key, value in members.items():
         node = JsonNode(root.place, f"$.{key[:100]}", value)
         if isinstance(value, list):
-            for item in node.items(_MAX_ASSETS):
-                yield item, False
+            yield from map(_thor_entry, node.items(_MAX_ASSETS))
         else:
-            yield JsonNode(root.place, node.path, (key, value)), True
+            yield _own_entry(key, node)
 
 
-def _own_entry(node: JsonNode) -> Asset:
-    key, value = node.value
-    asset_id = JsonNode(node.place, node.path, key).text()
-    entry = JsonNode(node.place, node.path, value)
+def _own_entry(key: str, entry: JsonNode) -> Asset:
+    asset_id = JsonNode(entry.place, entry.path, key).text()
     sides = [_side(s) for s in entry.get("size").items(3)]
     if len(sides) != 3:
         raise entry.get("size").error(f"has {len(sides)} numbers, not 3")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections import Counter, OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
@@ -26,6 +26,7 @@ from datagen.schemas.identity import digest_of
 from datagen.schemas.untrusted_files import open_regular, read_regular
 from datagen.workers.furniture.support_tops import CARRYING_TYPES
 from datagen.workers.geometry.mesh import F32, F64, Mesh
+from datagen.workers.geometry.transforms import rotation_of
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon
 from datagen.workers.houses.glb import MAX_FILE_BYTES, read_glb
 from datagen.workers.houses.house import House, Room, StaticBody, Surface
@@ -43,6 +44,7 @@ _SUFFIX = ".scene_instance.json"
 _SCENES = Path("ai2thor-hab/configs/scenes")
 _OBJECTS = Path("ai2thorhab-uncompressed/assets")
 _CONFIGS = Path("ai2thorhab-uncompressed/configs")
+_STAGES = Path("ai2thor-hab/assets")
 _MAX_FILES = 200_000  # of one kind
 _MAX_SCENE_BYTES = 16 << 20
 _MAX_OBJECTS = 5000
@@ -52,7 +54,7 @@ _WALL_TOP_M = 2.2  # parts above it meet no robot
 _SMALL_M = 0.35
 _FIX = "Download the scenes again."
 
-# The stage as stored in the ProcTHOR set, and every file's frame, to the world.
+# Every file's frame to the world, and what turns the stages of the ProcTHOR set back about the vertical.
 _Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 _PROCTHOR_STAGE = np.array([[0, 0, -1.0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -95,9 +97,10 @@ class Ai2thorHouses:
         text = read_regular(path, _MAX_SCENE_BYTES, _FIX)
         scene = parse_json(text, str(path))
         digest = hashlib.sha256(text)
-        stage, is_stage_turned = self._stage(scene, house_id)
+        stage = self._template(self.root / _STAGES / f"{_template_name(scene.get('stage_instance'))}.glb")
         digest.update(stage.digest)
-        mesh = _without_ceiling(stage.mesh.transformed(_stage_pose(is_stage_turned)))
+        turn = _PROCTHOR_STAGE if house_id.startswith("ProcTHOR/") else np.eye(4)
+        mesh = _without_ceiling(stage.mesh.transformed(_in_world(turn)))
         if not len(mesh.faces):
             raise scene.get("stage_instance").error("has neither walls nor floor", _FIX)
         skipped: Counter[str] = Counter()
@@ -117,24 +120,18 @@ class Ai2thorHouses:
         owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
         surfaces: list[Surface] = []
         for (body, _, T, local), owner in zip(placed, owners, strict=True):
-            bodies.append(_with_room(body, owner))
+            bodies.append(replace(body, room_id=owner))
             if owner and body.object_type in CARRYING_TYPES:
                 surfaces.extend(_surfaces(body, owner, T, local))
         return House(
             house_id, digest.hexdigest(), tuple(rooms), tuple(bodies), tuple(surfaces), dict(skipped)
         )
 
-    def _stage(self, scene: JsonNode, house_id: str) -> tuple[_Template, bool]:
-        name = _template_name(scene.get("stage_instance"))
-        file = self.root / "ai2thor-hab/assets" / f"{name}.glb"
-        return self._template(file), house_id.startswith("ProcTHOR/")
-
     def _template(self, file: Path) -> _Template:
         if file in self._templates:
             self._templates.move_to_end(file)
             return self._templates[file]
-        mesh = read_glb(file)
-        mesh = mesh.transformed(_Y_UP_TO_WORLD)
+        mesh = read_glb(file).transformed(_Y_UP_TO_WORLD)
         with open_regular(file, MAX_FILE_BYTES, _FIX) as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         is_stage = "stages" in file.relative_to(self.root).parts  # the folder above may have any name
@@ -191,7 +188,7 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     if not sizes:
         raise InputError(top, "", "has no scenes", fix)
     listing: list[object] = [[i, sizes[i]] for i in sorted(sizes)]
-    places = ((_OBJECTS, "*.glb"), (Path("ai2thor-hab/assets"), "*.glb"), (_CONFIGS, "*.object_config.json"))
+    places = ((_OBJECTS, "*.glb"), (_STAGES, "*.glb"), (_CONFIGS, "*.object_config.json"))
     files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
     listing += [[p.relative_to(root).as_posix(), n] for p, n in files]
     types = _types(root)
@@ -217,9 +214,9 @@ def _types(root: Path) -> dict[int, str]:
     path = root / "ai2thor-hab/configs/object_semantic_id_mapping.json"
     if not path.is_file():
         return {}
-    node = parse_json(read_regular(path, 1 << 20, _FIX), str(path))
-    members = cast(dict[str, Any], node.value) if isinstance(node.value, dict) else {}
     place = str(path)
+    value = parse_json(read_regular(path, 1 << 20, _FIX), place).value
+    members = cast(dict[str, Any], value) if isinstance(value, dict) else {}
     return {
         int(JsonNode(place, f"$.{k}", v).number(-1, 1e9)): JsonNode(place, "$", k).text()
         for k, v in members.items()
@@ -237,29 +234,21 @@ def _template_name(entry: JsonNode) -> str:
 
 
 def _pose(entry: JsonNode) -> F64:
-    """`T_world_object` of an instance; object meshes are already z up, so both sides are turned."""
+    """`T_world_object` of an instance."""
     x, y, z = _numbers(entry.get("translation"), 3, EXTENT_M)
     found = entry.find("rotation")
     q = np.array([1.0, 0, 0, 0] if found is None else _numbers(found, 4, 2.0))
     if not 0.5 < np.linalg.norm(q) < 2.0:
         raise entry.get("rotation").error("is not a unit quaternion")
-    w, i, j, k = q / np.linalg.norm(q)
-    rotation = np.array(
-        [
-            [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
-            [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
-            [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
-        ]
-    )
     scale = entry.find("uniform_scale")
     stretched = entry.find("non_uniform_scale")
     factors = np.full(3, 1.0 if scale is None else scale.number(1e-3, 1e3))
     if stretched is not None:
         factors = factors * [n.number(1e-3, 1e3) for n in stretched.items(3)]
     T = np.eye(4)
-    T[:3, :3] = rotation * factors
+    T[:3, :3] = rotation_of(q) * factors
     T[:3, 3] = (x, y, z)
-    return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
+    return _in_world(T)
 
 
 def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
@@ -269,10 +258,9 @@ def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
     return values
 
 
-def _stage_pose(is_turned: bool) -> F64:
-    """Pose of a z-up stage mesh: ProcTHOR stages are turned back by 90 degrees about the vertical."""
-    turn = _PROCTHOR_STAGE if is_turned else np.eye(4)
-    return _Y_UP_TO_WORLD @ turn @ np.linalg.inv(_Y_UP_TO_WORLD)
+def _in_world(T: F64) -> F64:
+    """A pose (4, 4) of the files for meshes that are z up already: both sides are turned."""
+    return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
 
 
 def _walls_and_rooms(
@@ -300,7 +288,7 @@ def _walls_and_rooms(
     rooms: list[Room] = []
     for room in plain:
         kind = next((name for t, name in _ROOM_BY_TYPE if t in within[room.room_id]), "Room")
-        rooms.append(Room(room.room_id, kind, room.polygon_m, room.ceiling_m))
+        rooms.append(replace(room, room_type=kind))
     parts = slab_parts(stage, 0.02, _WALL_TOP_M)
     return [StaticBody("stage", "wall", "Wall", "", "", stage, parts)], rooms
 
@@ -312,12 +300,6 @@ def _without_ceiling(stage: Mesh) -> Mesh:
     near_top = corner_z.min(1) > max(1.8, float(stage.vertices_m[:, 2].max()) - 0.5)
     kept = ~((np.abs(normals[:, 2]) > 0.9) & near_top)
     return Mesh(stage.vertices_m, stage.faces[kept], stage.face_rgb[kept])
-
-
-def _with_room(body: StaticBody, room_id: str) -> StaticBody:
-    return StaticBody(
-        body.body_id, body.kind, body.object_type, body.asset_id, room_id, body.visual, body.convex_parts_m
-    )
 
 
 def _surfaces(body: StaticBody, room_id: str, T: F64, local: Mesh) -> list[Surface]:

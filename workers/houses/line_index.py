@@ -16,7 +16,7 @@ import mmap
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
@@ -88,14 +88,8 @@ def open_lines(path: Path, cache: Path | None) -> LineIndex:
     """The index of a .jsonl, .jsonl.gz or .json file; `cache` None keeps everything in memory."""
     try:
         digest = _file_digest(path)
-        if cache is not None:
-            found = _from_cache(path, cache, digest)
-            if found is not None:
-                return found
-            made = _build_in_cache(path, cache, digest)
-            if made is not None:
-                return made
-        return _build_in_memory(path)
+        cached = cache and (_from_cache(path, cache, digest) or _build_in_cache(path, cache, digest))
+        return cached or _build_in_memory(path)
     except OSError as error:
         if isinstance(error, gzip.BadGzipFile):
             raise InputError(path, "", f"is not a gzip file ({error})", _FIX) from None
@@ -174,31 +168,27 @@ def _own_id(line: bytes) -> str:
     return name if name.isprintable() and "\N{REPLACEMENT CHARACTER}" not in name else ""
 
 
-class _Collector:
-    """Gathers the index while lines pass by."""
-
-    def __init__(self) -> None:
-        self.spans: list[tuple[int, int]] = []
-        self.digests: list[bytes] = []
-        self.ids: list[str] = []
-        self.numbers: list[int] = []
-        self.offset = 0
-
-    def add(self, number: int, line: bytes) -> None:
-        self.spans.append((self.offset, len(line)))
-        self.digests.append(hashlib.sha256(line).digest())
-        self.ids.append(_own_id(line))
-        self.numbers.append(number)
-        self.offset += len(line) + 1
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        return {
-            "spans": np.array(self.spans, np.int64).reshape(-1, 2),
-            "digests": np.frombuffer(b"".join(self.digests), np.uint8).reshape(-1, 32),
-            "ids": np.frombuffer("\n".join(self.ids).encode(), np.uint8),
-            "numbers": np.array(self.numbers, np.int64),
-            "size": np.array(self.offset, np.int64),
-        }
+def _copy(path: Path, write: Callable[[bytes], object]) -> dict[str, npt.NDArray[Any]]:
+    """Writes the lines of a file one after another; the index of what was written."""
+    spans: list[tuple[int, int]] = []
+    digests: list[bytes] = []
+    ids: list[str] = []
+    numbers: list[int] = []
+    offset = 0
+    for number, line in _lines(path):
+        write(line + b"\n")
+        spans.append((offset, len(line)))
+        digests.append(hashlib.sha256(line).digest())
+        ids.append(_own_id(line))
+        numbers.append(number)
+        offset += len(line) + 1
+    return {
+        "spans": np.array(spans, np.int64).reshape(-1, 2),
+        "digests": np.frombuffer(b"".join(digests), np.uint8).reshape(-1, 32),
+        "ids": np.frombuffer("\n".join(ids).encode(), np.uint8),
+        "numbers": np.array(numbers, np.int64),
+        "size": np.array(offset, np.int64),
+    }
 
 
 def _index(path: Path, data: mmap.mmap | bytearray, arrays: dict[str, npt.NDArray[Any]]) -> LineIndex:
@@ -233,27 +223,24 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
 def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
     """Unpacks into the cache; None where the cache cannot take it (full, gone, read-only)."""
     data_path, index_path = _names(cache, digest)
-    collector = _Collector()
     try:
         with whole_file(data_path) as file:
-            for number, line in _lines(path):
-                file.write(line + b"\n")
-                collector.add(number, line)
+            arrays = _copy(path, file.write)
     except OSError:
         return None  # where the source is at fault, reading it into memory reports that
-    if not write_arrays(index_path, collector.arrays()):
+    if not write_arrays(index_path, arrays):
         return None
     drop_unused(cache, _MOST_CACHED, _IDLE_S)
     return _from_cache(path, cache, digest)
 
 
 def _build_in_memory(path: Path) -> LineIndex:
-    collector = _Collector()
     data = bytearray()
-    for number, line in _lines(path):
-        collector.add(number, line)
-        data += line + b"\n"
-        if collector.offset > _MAX_IN_MEMORY_BYTES:
+
+    def write(line: bytes) -> None:
+        data.extend(line)
+        if len(data) > _MAX_IN_MEMORY_BYTES:
             fix = "Set DATAGEN_CACHE to a folder with space for the unpacked houses."
             raise InputError(path, "", "is too large to unpack in memory", fix)
-    return _index(path, data, collector.arrays())
+
+    return _index(path, data, _copy(path, write))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.houses.floors import MAX_CORNERS, clean_polygon, floor_solids
 from datagen.workers.houses.furniture_bodies import object_bodies
-from datagen.workers.houses.house import House, Room, StaticBody, Surface
+from datagen.workers.houses.house import House, Room, StaticBody
 from datagen.workers.houses.walls import WINDOW_SILL_M, Hole, WallSegment, wall_bodies
 from datagen.workers.json_document import EXTENT_M, JsonNode
 
@@ -40,20 +41,10 @@ def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str,
     furniture, surfaces = object_bodies(root.get("objects"), assets, skipped)
     owners = room_ids_at(np.array([xy for _, xy in furniture]).reshape(-1, 2), rooms)
     owner_of = {body.body_id: owner for (body, _), owner in zip(furniture, owners, strict=True)}
-    bodies = [
-        StaticBody(
-            b.body_id, b.kind, b.object_type, b.asset_id, owner_of[b.body_id], b.visual, b.convex_parts_m
-        )
-        for b, _ in furniture
-    ]
-    usable: list[Surface] = []
-    for s in surfaces:
-        if not owner_of[s.body_id]:
-            skipped["surface outside every room"] += 1
-            continue
-        usable.append(
-            Surface(s.surface_id, s.body_id, s.object_type, owner_of[s.body_id], s.T_world_surface, s.size_m)
-        )
+    bodies = [replace(b, room_id=owner_of[b.body_id]) for b, _ in furniture]
+    usable = [replace(s, room_id=owner_of[s.body_id]) for s in surfaces if owner_of[s.body_id]]
+    if len(usable) < len(surfaces):
+        skipped["surface outside every room"] = len(surfaces) - len(usable)
     everything = (*floors, *wall_bodies(list(walls.values()), holes), *bodies)
     return House(house_id, digest, tuple(rooms), everything, tuple(usable), dict(skipped))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,27 +12,13 @@ from datagen.schemas.identity import digest_of
 from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.objects import shapes
 from datagen.workers.objects.builtin_table import RECIPES
-from datagen.workers.objects.convex import ConvexParts, convex_parts, fits_gripper
+from datagen.workers.objects.convex import convex_parts, fits_gripper
 from datagen.workers.objects.model import ObjectModel
-from datagen.workers.objects.shapes import Paint, ParametricSolid
+from datagen.workers.objects.shapes import ParametricSolid
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
 # Part of every digest: raise it when `shapes` or the assembly here changes what comes out.
 GENERATOR_VERSION = 1
-
-_SHAPES: dict[str, Callable[..., ParametricSolid]] = {
-    "block": shapes.block,
-    "lathe": shapes.lathe,
-    "vessel": shapes.vessel,
-    "tube": shapes.tube,
-}
-_PAINTS: dict[str, Callable[..., Paint]] = {
-    "plain": shapes.plain,
-    "bands": shapes.bands,
-    "label": shapes.label,
-    "checks": shapes.checks,
-    "faces_of_box": shapes.faces_of_box,
-}
 
 
 class BuiltinObjects:
@@ -77,7 +63,7 @@ def _model(name: str, digest: str) -> ObjectModel:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centre = (low + high) / 2
     centred = (vertices - centre).astype(np.float32)
-    parts: ConvexParts = convex_parts(part - centre for part in solid.parts_m)
+    parts = convex_parts(part - centre for part in solid.parts_m)
     mass_kg = PUBLISHED_MASS_KG[name]
     size = high - low
     return ObjectModel(
@@ -93,10 +79,10 @@ def _model(name: str, digest: str) -> ObjectModel:
 
 
 def _piece(piece: dict[str, Any]) -> ParametricSolid:
+    """The solid that a piece names, by functions of `shapes`."""
     arguments = {key: value for key, value in piece.items() if key not in ("shape", "with", "put")}
-    for key in ("centres_m", "radii_m"):
-        if key in arguments:
-            arguments[key] = np.array(arguments[key], np.float64)
+    for key in arguments.keys() & {"centres_m", "radii_m"}:
+        arguments[key] = np.array(arguments[key], np.float64)
     paint = {key: value for key, value in piece["with"].items() if key != "paint"}
-    solid = _SHAPES[piece["shape"]](**arguments, paint=_PAINTS[piece["with"]["paint"]](**paint))
-    return shapes.moved(solid, **piece["put"])
+    painted = getattr(shapes, piece["with"]["paint"])(**paint)
+    return shapes.moved(getattr(shapes, piece["shape"])(**arguments, paint=painted), **piece["put"])

@@ -7,12 +7,15 @@ where it is put. Because pieces are data, their hash is an object's digest.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 Piece = dict[str, Any]
 Rgb = tuple[int, int, int]
 Vector = tuple[float, float, float]
 Points = list[tuple[float, float]]  # (radius, height)
+_ZERO: Vector = (0, 0, 0)
+_ONE: Vector = (1, 1, 1)
 
 
 def plain(rgb: Rgb) -> Piece:
@@ -27,14 +30,8 @@ def bands(*levels: tuple[float, Rgb], axis: int = 2) -> Piece:
 
 def label(body: Rgb, print_: Rgb, low: float, high: float, text: Rgb) -> Piece:
     """A printed band between two heights of a body."""
-    return {
-        "paint": "label",
-        "body": body,
-        "print_": print_,
-        "low_m": low / 1000,
-        "high_m": high / 1000,
-        "text": text,
-    }
+    span = {"low_m": low / 1000, "high_m": high / 1000}
+    return {"paint": "label", "body": body, "print_": print_, **span, "text": text}
 
 
 def checks(period: float, first: Rgb, second: Rgb) -> Piece:
@@ -47,74 +44,55 @@ def sides(*colours: Rgb) -> Piece:
     return {"paint": "faces_of_box", "colours": list(colours)}
 
 
-def put(at: Vector, turn_deg: Vector, scale: Vector) -> Piece:
-    """Where a piece goes: scaled, turned by a rotation vector, then shifted."""
-    return {
-        "offset_m": [v / 1000 for v in at],
-        "turn": [math.radians(v) for v in turn_deg],
-        "scale": list(scale),
-    }
+def _piece(
+    shape: str,
+    paint: Piece,
+    at: Vector = _ZERO,
+    turn_deg: Vector = _ZERO,
+    scale: Vector = _ONE,
+    **arguments: Any,
+) -> Piece:
+    """A piece that is scaled, turned by a rotation vector, then shifted."""
+    turn = [math.radians(v) for v in turn_deg]
+    put = {"offset_m": _metres(at), "turn": turn, "scale": list(scale)}
+    return {"shape": shape, **arguments, "with": paint, "put": put}
+
+
+def _metres(lengths: Iterable[float]) -> list[float]:
+    return [v / 1000 for v in lengths]
+
+
+def _outline(points: Points) -> list[tuple[float, float]]:
+    return [(r / 1000, z / 1000) for r, z in points]
 
 
 def block(
-    x: float,
-    y: float,
-    z: float,
-    paint: Piece,
-    at: Vector = (0, 0, 0),
-    turn_deg: Vector = (0, 0, 0),
-    cells: int = 6,
+    x: float, y: float, z: float, paint: Piece, at: Vector = _ZERO, turn_deg: Vector = _ZERO, cells: int = 6
 ) -> Piece:
     """A box about its centre."""
-    return {
-        "shape": "block",
-        "size_m": [x / 1000, y / 1000, z / 1000],
-        "cells": cells,
-        "with": paint,
-        "put": put(at, turn_deg, (1, 1, 1)),
-    }
+    return _piece("block", paint, at, turn_deg, size_m=_metres((x, y, z)), cells=cells)
 
 
 def lathe(
     profile: Points,
     paint: Piece,
-    at: Vector = (0, 0, 0),
-    turn_deg: Vector = (0, 0, 0),
-    scale: Vector = (1, 1, 1),
+    at: Vector = _ZERO,
+    turn_deg: Vector = _ZERO,
+    scale: Vector = _ONE,
     segments: int = 32,
 ) -> Piece:
     """A solid of revolution, from its outline bottom to top."""
-    return {
-        "shape": "lathe",
-        "profile_m": [(r / 1000, z / 1000) for r, z in profile],
-        "segments": segments,
-        "with": paint,
-        "put": put(at, turn_deg, scale),
-    }
+    return _piece("lathe", paint, at, turn_deg, scale, profile_m=_outline(profile), segments=segments)
 
 
 def vessel(outer: Points, inner: Points, paint: Piece, segments: int = 20) -> Piece:
     """An open vessel; the outer outline has one point more, its foot."""
-    return {
-        "shape": "vessel",
-        "outer_m": [(r / 1000, z / 1000) for r, z in outer],
-        "inner_m": [(r / 1000, z / 1000) for r, z in inner],
-        "segments": segments,
-        "with": paint,
-        "put": put((0, 0, 0), (0, 0, 0), (1, 1, 1)),
-    }
+    return _piece("vessel", paint, outer_m=_outline(outer), inner_m=_outline(inner), segments=segments)
 
 
 def tube(centres: list[Vector], radii: list[float], paint: Piece, flat: float = 1.0) -> Piece:
     """A bent bar along a path in a plane."""
-    return {
-        "shape": "tube",
-        "centres_m": [[v / 1000 for v in c] for c in centres],
-        "radii_m": [r / 1000 for r in radii],
-        "flat": flat,
-        "with": paint,
-        "put": put((0, 0, 0), (0, 0, 0), (1, 1, 1)),
-    }
+    return _piece("tube", paint, centres_m=[_metres(c) for c in centres], radii_m=_metres(radii), flat=flat)
 
 
 def cylinder(diameter: float, height: float, levels: int = 8) -> Points:

@@ -39,7 +39,6 @@ class ConvexParts:
 
     vertices_m: tuple[F32, ...]
     volume_m3: float  # sum over the parts; parts of a decomposition hardly overlap
-    n_dropped: int  # flat parts left out
 
 
 def read_convex_parts(path: Path) -> ConvexParts:
@@ -70,21 +69,18 @@ def read_convex_parts(path: Path) -> ConvexParts:
 
 
 def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
-    """The hulls of point sets, each (V, 3); sets without volume are dropped and counted."""
+    """The hulls of point sets, each (V, 3); sets without volume are dropped."""
     kept: list[F32] = []
-    volume, dropped = 0.0, 0
+    volume = 0.0
     for points in points_m:
         try:
             hull = ConvexHull(np.asarray(points, np.float64))
         except (QhullError, ValueError):
-            dropped += 1
             continue
-        if hull.volume < MIN_THICKNESS_M * hull.area / 2:
-            dropped += 1
-            continue
-        volume += float(hull.volume)
-        kept.append(np.asarray(points, np.float32)[np.sort(hull.vertices)])
-    return ConvexParts(tuple(kept), volume, dropped)
+        if hull.volume >= MIN_THICKNESS_M * hull.area / 2:
+            volume += float(hull.volume)
+            kept.append(np.asarray(points, np.float32)[np.sort(hull.vertices)])
+    return ConvexParts(tuple(kept), volume)
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:

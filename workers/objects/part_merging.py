@@ -8,13 +8,12 @@ from __future__ import annotations
 import hashlib
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 from scipy.ndimage import map_coordinates
 
-from datagen.workers.content_cache import Arrays, CacheFolder
+from datagen.workers.content_cache import CacheFolder
 from datagen.workers.geometry.mesh import F32
 from datagen.workers.objects.hulls import (
     Hull,
@@ -32,8 +31,7 @@ MERGER_VERSION = 2
 MAX_VERTICES = 64
 # Pairs that a part is looked at in: those whose bounding boxes are nearest.
 _NEIGHBOURS = 12
-# Grid cells and surface samples along the object's longest side.
-_CELLS_ACROSS, _SAMPLES_ACROSS = 32, 128
+_CELLS_ACROSS = 32  # of the distance grid, along the object's longest side
 # Hulls whose errors differ by less are compared by the volume they add.
 _ERROR_STEP_M = 2e-4
 _CACHE = CacheFolder(
@@ -41,34 +39,16 @@ _CACHE = CacheFolder(
     {
         "vertices": (np.float32, ("corners", 3)),
         "cuts": (np.int64, ("cuts",)),
-        "n_before": (np.int64, ()),
-        "figures": (np.float64, (3,)),
     },
     most_files=4096,  # of some 20 KB each
     most_bytes=32 * 2**20,
 )
 
 
-@dataclass(frozen=True, eq=False)
-class MergedParts:
-    """At most `limit` convex parts that fill what the original parts fill, and how much more.
-
-    Every original vertex lies in one of the merged parts, or at most `shrink_m` outside.
-    """
-
-    parts_m: tuple[F32, ...]  # each (V, 3)
-    n_before: int
-    # Largest distance from a point of the merged surfaces to the union of the original parts. Both
-    # are sampled 1/128 of the longest side apart: it may be 0.8 of that too large or too small.
-    error_m: float
-    shrink_m: float  # what MAX_VERTICES cut off: how far an original vertex lies outside its merged part
-    added_volume_share: float  # sum over the merged parts by that over the original ones, less 1
+_known: dict[str, tuple[F32, ...]] = {}
 
 
-_known: dict[str, MergedParts] = {}
-
-
-def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
+def merge_parts(parts_m: Sequence[F32], limit: int) -> tuple[F32, ...]:
     """Joins convex parts, each (V, 3) with volume, until at most `limit` are left.
 
     Greedy: at each step the pair is joined whose hull reaches least far out of the union of all
@@ -76,46 +56,36 @@ def merge_parts(parts_m: Sequence[F32], limit: int) -> MergedParts:
     sectors, and an opening, which reaches far, is closed last. By volume alone thin slivers come
     first, whatever they reach across: the corner between a wall and its floor.
 
-    Where there are `limit` parts or fewer they are returned as they are. Else the result depends
-    neither on the order of the parts nor on that of their vertices; it is kept in memory and in the
-    cache folder, because it takes about a second. Raises ValueError where `limit` is not positive.
+    Every original vertex lies in one of the merged parts, but for what `MAX_VERTICES` cuts off. Where
+    there are `limit` parts or fewer they are returned as they are. Else the result depends neither on
+    the order of the parts nor on that of their vertices; it is kept in memory and in the cache folder,
+    because it takes about a second. Raises ValueError where `limit` is not positive.
     """
     if limit < 1:
         raise ValueError(f"limit {limit}: at least one part must be left")
     if len(parts_m) <= limit:
-        return MergedParts(tuple(parts_m), len(parts_m), 0.0, 0.0, 0.0)
+        return tuple(parts_m)
     key = _key(parts_m, limit)
     if key not in _known:
         stored = _CACHE.load(key)
-        merged = _restored(stored) if stored is not None else _merge(parts_m, limit)
         if stored is None:
-            _CACHE.store(key, _stored(merged))
+            merged = _merge(parts_m, limit)
+            cuts = np.cumsum([len(part) for part in merged])[:-1]
+            _CACHE.store(key, {"vertices": np.concatenate(merged), "cuts": cuts})
+        else:
+            merged = tuple(np.split(stored["vertices"], stored["cuts"]))
         _known[key] = merged
     return _known[key]
 
 
-def _merge(parts_m: Sequence[F32], limit: int) -> MergedParts:
+def _merge(parts_m: Sequence[F32], limit: int) -> tuple[F32, ...]:
     originals = sorted((hull_of(part) for part in parts_m), key=lambda hull: hull.vertices_m.tobytes())
-    step_m = extent_m(originals) / _SAMPLES_ACROSS
-    groups = _groups(originals, limit)
-    merged: list[Hull] = []
-    shrink_m = 0.0
-    for group in groups:
-        whole = hull_of(np.concatenate([originals[k].vertices_m for k in group]))
-        few = hull_of(few_vertices(whole.vertices_m, MAX_VERTICES)) if len(group) > 1 else whole
-        if few is not whole:
-            shrink_m = max(shrink_m, float(distances_m([few], whole.vertices_m, step_m).max()))
-        merged.append(few)
-    joined = [hull for hull, group in zip(merged, groups, strict=True) if len(group) > 1]
-    points = np.concatenate([surface_points_m(hull, step_m) for hull in joined])
-    before, after = (sum(hull.volume_m3 for hull in hulls) for hulls in (originals, merged))
-    return MergedParts(
-        parts_m=tuple(hull.vertices_m.astype(np.float32) for hull in merged),
-        n_before=len(originals),
-        error_m=float(distances_m(originals, points, step_m).max()),
-        shrink_m=shrink_m,
-        added_volume_share=after / before - 1,
-    )
+    merged: list[F32] = []
+    for group in _groups(originals, limit):
+        whole = hull_of(np.concatenate([originals[k].vertices_m for k in group])).vertices_m
+        few = hull_of(few_vertices(whole, MAX_VERTICES)).vertices_m if len(group) > 1 else whole
+        merged.append(few.astype(np.float32))
+    return tuple(merged)
 
 
 def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:
@@ -190,18 +160,3 @@ def _key(parts_m: Sequence[F32], limit: int) -> str:
     for blob in blobs:
         digest.update(hashlib.sha256(blob).digest())
     return digest.hexdigest()
-
-
-def _stored(merged: MergedParts) -> Arrays:
-    return {
-        "vertices": np.concatenate(merged.parts_m),
-        "cuts": np.cumsum([len(part) for part in merged.parts_m])[:-1],
-        "n_before": np.array(merged.n_before, np.int64),
-        "figures": np.array([merged.error_m, merged.shrink_m, merged.added_volume_share]),
-    }
-
-
-def _restored(stored: Arrays) -> MergedParts:
-    error_m, shrink_m, share = (float(figure) for figure in stored["figures"])
-    parts = tuple(np.split(stored["vertices"], stored["cuts"]))
-    return MergedParts(parts, int(stored["n_before"]), error_m, shrink_m, share)

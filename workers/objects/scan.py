@@ -33,7 +33,6 @@ _CACHE = CacheFolder(
         "part_vertices": (np.float32, ("corners", 3)),
         "part_cuts": (np.int64, ("cuts",)),
         "volume": (np.float64, ()),
-        "n_dropped": (np.int64, ()),
         "size_m": (np.float64, (3,)),
     },
     most_files=1024,
@@ -137,7 +136,7 @@ def read_scan(visual: Path, texture: Path, collision: Path) -> Scan:
     centred = tuple((part - centre).astype(np.float32) for part in parts.vertices_m)
     return Scan(
         Mesh(vertices_m, faces, colours, Texture(image, uv)),
-        ConvexParts(centred, parts.volume_m3, parts.n_dropped),
+        ConvexParts(centred, parts.volume_m3),
         (float(size[0]), float(size[1]), float(size[2])),
     )
 
@@ -162,7 +161,6 @@ def _stored(scan: Scan) -> Arrays:
         "part_vertices": np.concatenate(scan.parts.vertices_m),
         "part_cuts": np.cumsum([len(part) for part in scan.parts.vertices_m])[:-1],
         "volume": np.array(scan.parts.volume_m3, np.float64),
-        "n_dropped": np.array(scan.parts.n_dropped, np.int64),
         "size_m": np.array(scan.size_m),
     }
 
@@ -173,6 +171,6 @@ def _restored(stored: Arrays) -> Scan:
     width, depth, height = (float(length) for length in stored["size_m"])
     return Scan(
         Mesh(stored["vertices"], stored["faces"], stored["face_rgb"], texture),
-        ConvexParts(parts, float(stored["volume"]), int(stored["n_dropped"])),
+        ConvexParts(parts, float(stored["volume"])),
         (width, depth, height),
     )

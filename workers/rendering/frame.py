@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -71,7 +70,4 @@ def pixel_directions(camera: Camera, pixels: npt.NDArray[np.int64]) -> F32:
     return np.stack([x, y, np.ones(len(pixels))], axis=1).astype(np.float32)
 
 
-class Renderer(Protocol):
-    """Renders one frame of a scene."""
-
-    def __call__(self, scene: SceneGeometry, camera: Camera) -> Frame: ...
+Renderer = Callable[[SceneGeometry, Camera], Frame]

@@ -1,11 +1,9 @@
-"""RGB-D frames and visible pixels by pybullet's TinyRenderer: a software rasteriser, no render device."""
+"""RGB-D frames by pybullet's TinyRenderer: a software rasteriser, no render device."""
 
 from __future__ import annotations
 
 import tempfile
-from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +11,13 @@ import pybullet
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32, F64, I32, U8, Mesh, concatenate
-from datagen.workers.geometry.transforms import inverse, look_at, quaternion_wxyz
+from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate
+from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
 from datagen.workers.rendering.face_texture import face_normals, face_texture
-from datagen.workers.rendering.frame import I16, Camera, Frame, SceneGeometry
+from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 
-# What is nearer or farther is not drawn. A near plane far off keeps depth sharp; one close to the
-# eye shows the wall that an eye stands in.
-_NEAR_M, _NEAR_FOR_BODIES_M, _FAR_M = 0.02, 0.001, 60.0
+# What is nearer or farther is not drawn. A near plane far off keeps depth sharp.
+_NEAR_M, _FAR_M = 0.02, 60.0
 # Bullet silently drops what exceeds 131,072 vertices of one mesh.
 _MAX_FACES = 40_000
 _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
@@ -29,67 +26,16 @@ _AMBIENT, _DIFFUSE = 0.7, 0.3
 
 def render_pybullet(scene: SceneGeometry, camera: Camera) -> Frame:
     """The whole frame of a scene, built from scratch. Raises InputError where Bullet cannot."""
-    with PybulletScene(scene) as loaded:
-        return loaded.render(camera)
+    with Drawing() as drawing:
+        drawing.add_scene(scene)
+        return drawing.render(camera)
 
 
-class PybulletScene:
-    """A scene loaded once, for many images; a context manager that frees it at the end."""
+class Drawing:
+    """One Bullet world that holds visual meshes only, each with the number that pixels report.
 
-    def __init__(self, scene: SceneGeometry) -> None:
-        self._scene = scene
-        self._closing = ExitStack()
-        self._alone: dict[int, _Drawing] = {}
-        with ExitStack() as undo:  # a scene that fails to load leaves nothing behind
-            self._full = undo.enter_context(_Drawing())
-            # An eye within a wall or a cupboard sees it from inside.
-            house = concatenate([body.visual for body in scene.house.bodies])
-            self._full.add(house, np.eye(4), 0, both_sides=True)
-            for k, model in enumerate(scene.objects):
-                self._full.add(model.visual, scene.T_world_object[k], 1 + k)
-            self._closing = undo.pop_all()
-
-    def __enter__(self) -> PybulletScene:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._closing.close()
-
-    def render(self, camera: Camera) -> Frame:
-        """The frame that a camera sees."""
-        return self._full.render(camera)
-
-    def visible_pixels(self, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
-        """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
-
-        The same cameras as `datagen.workers.rendering.visibility.visible_pixels`: each eye (N, 3) looks at
-        the target's centre through `window` x `window` pixels that touch its bounding sphere.
-        """
-        if target not in self._alone:
-            drawing = self._closing.enter_context(_Drawing())
-            drawing.add(self._scene.objects[target].visual, self._scene.T_world_object[target], 1 + target)
-            self._alone[target] = drawing
-        alone_px, visible_px = np.zeros(len(eyes_m), np.int32), np.zeros(len(eyes_m), np.int32)
-        centre_m = self._scene.T_world_object[target, :3, 3]
-        radius_m = self._scene.objects[target].radius_m
-        for row, eye_m in enumerate(eyes_m):
-            distance_m = float(np.linalg.norm(eye_m - centre_m))
-            if distance_m <= radius_m * 1.05:
-                continue
-            sine = radius_m / distance_m
-            f_px = window / 2 * np.sqrt(1 - sine**2) / sine
-            T = look_at(eye_m, centre_m)
-            camera = Camera(T, window, window, f_px, f_px, window / 2, window / 2)
-            on_target = self._alone[target].bodies(camera) == 1 + target
-            alone_px[row] = on_target.sum()
-            visible_px[row] = (on_target & (self._full.bodies(camera) == 1 + target)).sum()
-        return alone_px, visible_px
-
-
-class _Drawing:
-    """One Bullet world that holds visual meshes only, each with the number that pixels report."""
+    A context manager that frees the world at the end.
+    """
 
     def __init__(self) -> None:
         self._world: int = pybullet.connect(pybullet.DIRECT)
@@ -98,13 +44,18 @@ class _Drawing:
             raise InputError("--renderer", "pybullet", "Bullet cannot open another world", fix)
         self._label_of_body: list[int] = []
 
-    def __enter__(self) -> _Drawing:
+    def __enter__(self) -> Drawing:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         pybullet.disconnect(physicsClientId=self._world)
+
+    def add_scene(self, scene: SceneGeometry) -> None:
+        """Draw a house as 0 and its objects from 1 on."""
+        # An eye within a wall or a cupboard sees it from inside.
+        self.add(concatenate([body.visual for body in scene.house.bodies]), np.eye(4), 0, both_sides=True)
+        for k, model in enumerate(scene.objects):
+            self.add(model.visual, scene.T_world_object[k], 1 + k)
 
     def add(self, mesh: Mesh, T_world_mesh: F64, label: int, both_sides: bool = False) -> None:
         """Draw a mesh at a pose (4, 4); its pixels report `label`.
@@ -143,21 +94,14 @@ class _Drawing:
             pybullet.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=self._world)
             self._label_of_body.append(label)
 
-    def render(self, camera: Camera) -> Frame:
-        rgba, buffer, segments = self._image(camera, _NEAR_M)
-        body = self._labels(segments)
+    def render(self, camera: Camera, near_m: float = _NEAR_M) -> Frame:
+        """The frame that a camera sees; its bodies are the labels, -1 for none."""
+        rgba, buffer, segments = self._image(camera, near_m)
+        body = np.array([*self._label_of_body, -1], np.int16)[segments]  # -1, the background, takes the last
         # The buffer holds OpenGL's window depth, which is not linear in metres.
-        depth_m = _FAR_M * _NEAR_M / (_FAR_M - (_FAR_M - _NEAR_M) * buffer.astype(np.float64))
+        depth_m = _FAR_M * near_m / (_FAR_M - (_FAR_M - near_m) * buffer.astype(np.float64))
         depth_m[body < 0] = 0.0
         return Frame(camera, np.ascontiguousarray(rgba[..., :3]), depth_m.astype(np.float32), body)
-
-    def bodies(self, camera: Camera) -> I16:
-        """The labels (H, W) that a camera sees; -1 for none."""
-        return self._labels(self._image(camera, _NEAR_FOR_BODIES_M)[2])
-
-    def _labels(self, segments: npt.NDArray[np.int32]) -> I16:
-        labels = np.array([*self._label_of_body, -1], np.int16)  # -1, the background, takes the last
-        return labels[segments]
 
     def _image(self, camera: Camera, near_m: float) -> tuple[U8, F32, npt.NDArray[np.int32]]:
         h, w = camera.height_px, camera.width_px

@@ -66,9 +66,7 @@ def prepare_trials(
         still_parts_m=still,
         still_low_m=low,
         still_high_m=high,
-        parts_m=tuple(
-            merge_parts(model.convex_parts_m, params.hulls_per_object).parts_m for model in scene.models
-        ),
+        parts_m=tuple(merge_parts(model.convex_parts_m, params.hulls_per_object) for model in scene.models),
         mass_kg=np.array([model.mass_kg for model in scene.models]),
         T_world_object=scene.T_world_object,
     )

@@ -15,8 +15,9 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects import open_objects, part_merging
 from datagen.workers.objects.convex import opening_depth
 from datagen.workers.objects.hulls import distances_m, few_vertices, hull_of, surface_points_m
-from datagen.workers.objects.part_merging import MAX_VERTICES, MergedParts, merge_parts
+from datagen.workers.objects.part_merging import MAX_VERTICES, merge_parts
 from datagen.workers.objects.scan import read_scan
+from tests.workers.objects.merging_errors import added_volume_share, cut_off_m, error_m
 
 
 def box(low: F64, high: F64) -> F32:
@@ -35,29 +36,18 @@ def scattered(seed: int, n: int) -> list[F32]:
     ]
 
 
-def farthest_outside(points: F64, parts: tuple[F32, ...]) -> float:
-    """How far a point lies beyond the faces of the part that comes nearest to holding it."""
-    beyond = np.full(len(points), np.inf)
-    for part in parts:
-        planes = ConvexHull(part.astype(np.float64)).equations
-        beyond = np.minimum(beyond, (points @ planes[:, :3].T + planes[:, 3]).max(axis=1))
-    return float(beyond.max())
-
-
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 14), limit=st.integers(1, 8))
 def test_merged_parts_are_few_and_hold_every_vertex(seed: int, n: int, limit: int) -> None:
     parts = scattered(seed, n)
     merged = merge_parts(parts, limit)
-    assert len(merged.parts_m) == min(n, limit) and merged.n_before == n
-    # A face that cuts a vertex off is nearer to it than the nearest point of the part.
-    assert (
-        farthest_outside(np.concatenate(parts).astype(np.float64), merged.parts_m) <= merged.shrink_m + 1e-6
-    )
+    assert len(merged) == min(n, limit)
+    is_cut = max(len(part) for part in merged) >= MAX_VERTICES
+    assert cut_off_m(parts, merged) <= (0.01 if is_cut else 1e-6)
     if n > limit:
-        new = [part for part in merged.parts_m if not any(np.isin(part, old).all() for old in parts)]
+        new = [part for part in merged if not any(np.isin(part, old).all() for old in parts)]
         assert new and max(len(part) for part in new) <= MAX_VERTICES
-        assert merged.error_m > 0
+        assert error_m(parts, merged) > 0
 
 
 @settings(max_examples=5, deadline=None)
@@ -67,16 +57,14 @@ def test_neither_order_of_parts_nor_of_vertices_matters(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shuffled = [rng.permutation(parts[k]) for k in rng.permutation(len(parts))]
     first, second = part_merging._merge(parts, 4), part_merging._merge(shuffled, 4)
-    assert [part.tobytes() for part in first.parts_m] == [part.tobytes() for part in second.parts_m]
-    assert (first.error_m, first.shrink_m) == (second.error_m, second.shrink_m)
+    assert [part.tobytes() for part in first] == [part.tobytes() for part in second]
     assert part_merging._key(parts, 4) == part_merging._key(shuffled, 4) != part_merging._key(parts, 5)
 
 
 def test_few_parts_stay_as_they_are() -> None:
     parts = scattered(0, 5)
     merged = merge_parts(parts, 5)
-    assert all(new is old for new, old in zip(merged.parts_m, parts, strict=True))
-    assert (merged.error_m, merged.shrink_m, merged.added_volume_share) == (0, 0, 0)
+    assert all(new is old for new, old in zip(merged, parts, strict=True))
     with pytest.raises(ValueError, match="limit 0"):
         merge_parts(parts, 0)
 
@@ -90,8 +78,8 @@ def test_the_error_is_that_of_a_drawn_case() -> None:
         box(np.array([0, 0.01, 0]), np.array([0.01, 0.04, 0.01])),
     ]
     merged = merge_parts(bars, 1)
-    assert merged.error_m == pytest.approx(a * b / (a + b), abs=0.8 * 0.06 / 128)
-    assert merged.added_volume_share == pytest.approx((a * b / 2) / (0.06 + 0.03) / 0.01, abs=1e-4)
+    assert error_m(bars, merged) == pytest.approx(a * b / (a + b), abs=0.8 * 0.06 / 128)
+    assert added_volume_share(bars, merged) == pytest.approx((a * b / 2) / (0.06 + 0.03) / 0.01, abs=1e-4)
 
 
 def test_parts_that_fill_a_box_are_joined_without_error() -> None:
@@ -102,8 +90,9 @@ def test_parts_that_fill_a_box_are_joined_without_error() -> None:
         for y, y2 in pairwise(ticks)
     ]
     merged = merge_parts(boxes, 1)
-    assert merged.error_m < 1e-6 and merged.added_volume_share == pytest.approx(0, abs=1e-5)
-    assert len(merged.parts_m[0]) == 8
+    assert error_m(boxes, merged) < 1e-6
+    assert added_volume_share(boxes, merged) == pytest.approx(0, abs=1e-5)
+    assert len(merged[0]) == 8
 
 
 def test_64_vertices_span_nearly_what_all_span() -> None:
@@ -139,19 +128,18 @@ def test_what_was_merged_is_read_from_the_cache(own_cache: Path, monkeypatch: py
     assert merge_parts(parts[::-1], 2) is first
     (file,) = (own_cache / "hulls").iterdir()
 
-    def refuse(*_: object) -> MergedParts:
+    def refuse(*_: object) -> tuple[F32, ...]:
         raise AssertionError("merged again")
 
     monkeypatch.setattr(part_merging, "_known", {})
     with monkeypatch.context() as patch:
         patch.setattr(part_merging, "_merge", refuse)
         again = merge_parts(parts, 2)
-    assert [part.tobytes() for part in again.parts_m] == [part.tobytes() for part in first.parts_m]
-    assert (again.n_before, again.error_m, again.shrink_m) == (6, first.error_m, first.shrink_m)
+    assert [part.tobytes() for part in again] == [part.tobytes() for part in first]
 
     monkeypatch.setattr(part_merging, "_known", {})
     file.write_bytes(file.read_bytes()[:100])
-    assert merge_parts(parts, 2).error_m == first.error_m
+    assert [part.tobytes() for part in merge_parts(parts, 2)] == [part.tobytes() for part in first]
 
 
 def free_depth(visual_m: F32, parts: tuple[F32, ...]) -> F64:
@@ -179,15 +167,15 @@ def free_depth(visual_m: F32, parts: tuple[F32, ...]) -> F64:
 
 def check_opening(visual_m: F32, parts: tuple[F32, ...]) -> None:
     merged = merge_parts(parts, 16)
-    assert len(merged.parts_m) == 16
+    assert len(merged) == 16
     depth_m = opening_depth(visual_m, parts)
     assert depth_m > 0.03
-    assert opening_depth(visual_m, merged.parts_m) == depth_m
-    before, after = free_depth(visual_m, parts), free_depth(visual_m, merged.parts_m)
+    assert opening_depth(visual_m, merged) == depth_m
+    before, after = free_depth(visual_m, parts), free_depth(visual_m, merged)
     # Fingers reach as far down as before, up to what flat pieces of wall take away at the floor.
     assert after[0] >= before[0] - 0.003
     assert (after >= before - 0.010).all()
-    assert merged.error_m < 0.010 and merged.shrink_m < 0.002
+    assert error_m(parts, merged) < 0.010 and cut_off_m(parts, merged) < 0.002
 
 
 @pytest.mark.parametrize("name", ["024_bowl", "065-a_cups", "065-j_cups"])

@@ -13,9 +13,10 @@ pybullet = pytest.importorskip("pybullet", reason="pybullet has no wheels from P
 from datagen.workers.geometry.mesh import Mesh
 from datagen.workers.rendering.embree_renderer import ray_scene, render_embree
 from datagen.workers.rendering.frame import Camera, SceneGeometry
-from datagen.workers.rendering.pybullet_renderer import PybulletScene, render_pybullet
+from datagen.workers.rendering.pybullet_renderer import render_pybullet
 from datagen.workers.rendering.visibility import visible_pixels
 from tests.workers.rendering.engines import assert_same_hues, assert_same_view, cameras, mixed_stage
+from tests.workers.rendering.pybullet_visibility import PybulletScene
 from tests.workers.worlds import box_body, camera_at, table_house
 
 
