@@ -61,7 +61,7 @@ def robot_bodies(robot: Robot, pedestal_radius_m: float) -> RobotBodies:
             fingers.append(sides.get(name, 0))
     if robot.base_radius_m is None:
         r, height_m = (pedestal_radius_m, pedestal_radius_m), robot.base_height_m
-        column = frustum((0.0, 0.0), (-height_m, 0.0), r, r, _PEDESTAL_RGB, _PEDESTAL_SIDES)
+        column = frustum((-height_m, 0.0), r, r, _PEDESTAL_RGB, _PEDESTAL_SIDES)
         meshes.append(join([column])[0])
         links.append(-1)
         fingers.append(0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import shade
-from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, mirrored
 
 _STEEL: Rgb = (176, 178, 182)
 _DARK: Rgb = (44, 44, 48)
@@ -34,8 +34,8 @@ def toilet(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     centre = (0.0, tank / 2)
     reach = y - tank / 2
     return [
-        frustum(centre, (0.0, seat - 0.04), (0.5 * x, 0.62 * reach), (0.75 * x, 0.97 * reach), rgb),
-        frustum(centre, (seat - 0.04, seat), (0.78 * x, reach), (0.78 * x, reach), shade(rgb, 0.95), 12),
+        frustum((0.0, seat - 0.04), (0.5 * x, 0.62 * reach), (0.75 * x, 0.97 * reach), rgb, centre_m=centre),
+        frustum((seat - 0.04, seat), (0.78 * x, reach), (0.78 * x, reach), shade(rgb, 0.95), 12, centre),
         box((-0.85 * x, 0.85 * x), (-y, -y + tank), (seat - 0.05, height - 0.03), rgb),
         box((-0.9 * x, 0.9 * x), (-y, -y + tank + 0.01), (height - 0.03, height), shade(rgb, 0.95)),
     ]
@@ -51,8 +51,7 @@ def sink(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     solids = [
         box((-x, x), (-y, -y + 2 * wall), z, rgb),
         box((-x, x), (y - wall, y), z, rgb),
-        box((-x, -x + wall), (-y + 2 * wall, y - wall), z, rgb),
-        box((x - wall, x), (-y + 2 * wall, y - wall), z, rgb),
+        *mirrored((x - wall, x), (-y + 2 * wall, y - wall), z, rgb),
         box((-x + wall, x - wall), (-y + 2 * wall, y - wall), (z[0], z[0] + 0.25 * deep), shade(rgb, 0.88)),
     ]
     if z[0] > 0.3:
@@ -78,7 +77,7 @@ def stove(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     x, y, height = asset.halves_m
     radii = (0.28 * x, 0.28 * y)
     plates = [
-        frustum((sx * 0.45 * x, sy * 0.4 * y), (height - 0.012, height), radii, radii, _DARK)
+        frustum((height - 0.012, height), radii, radii, _DARK, centre_m=(sx * 0.45 * x, sy * 0.4 * y))
         for sx in (-1, 1)
         for sy in (-1, 1)
     ]
@@ -93,8 +92,5 @@ def stove(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 def wall_cabinet(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A hanging cupboard with two doors."""
     x, y, height = asset.halves_m
-    doors = [
-        box((side, side + x - 0.01), (y - 0.02, y - 0.004), (0.01, height - 0.01), shade(rgb, 1.06))
-        for side in (-x + 0.005, 0.005)
-    ]
+    doors = mirrored((0.005, x - 0.005), (y - 0.02, y - 0.004), (0.01, height - 0.01), shade(rgb, 1.06))
     return [box((-x, x), (-y, y - 0.02), (0.0, height), rgb), *doors]

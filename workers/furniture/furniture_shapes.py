@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import hash_bytes, shade
-from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, mirrored
 from datagen.workers.furniture.support_tops import hutch_depth_m, top_height_m, top_rectangles
 
 _CUSHION_PILLOW: Rgb = (232, 228, 220)
@@ -51,9 +51,7 @@ def counter(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     solids: list[ColouredSolid] = []
     for k, r in enumerate(top_rectangles(asset)):
         # The toe space is at the side that faces the room: +y for the back run, inwards for wings.
-        front = (
-            (0.0, 0.0, 0.0, 0.06) if k == 0 else (0.06, 0.0, 0.0, 0.0) if k == 1 else (0.0, 0.06, 0.0, 0.0)
-        )
+        front = ((0.0, 0.0, 0.0, 0.06), (0.06, 0.0, 0.0, 0.0), (0.0, 0.06, 0.0, 0.0))[k]
         x = (r.x[0] + front[0], r.x[1] - front[1])
         y = (r.y[0] + front[2], r.y[1] - front[3])
         solids.append(box(x, y, (0.0, 0.1), shade(cupboard, 0.55)))
@@ -107,8 +105,7 @@ def desk(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     if hutch > 0:
         back = (-y, -y + hutch)
         solids.append(box((-x, x), (-y, -y + 0.02), (top, height), dark))
-        solids.append(box((-x, -x + 0.02), (-y + 0.02, back[1]), (top, height), dark))
-        solids.append(box((x - 0.02, x), (-y + 0.02, back[1]), (top, height), dark))
+        solids += mirrored((x - 0.02, x), (-y + 0.02, back[1]), (top, height), dark)
         solids.append(box((-x + 0.02, x - 0.02), (-y + 0.02, back[1]), (height - 0.02, height), rgb))
     return solids
 
@@ -145,8 +142,7 @@ def tv_stand(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
         box((-x, x), (-y, y), (top - 0.03, top), rgb),
         box((-x, x), (-y, y), (0.05, 0.08), dark),
         box((-x + 0.03, x - 0.03), (-y + 0.03, y - 0.03), (0.0, 0.05), shade(rgb, 0.55)),
-        box((-x, -x + 0.03), (-y, y), inner, dark),
-        box((x - 0.03, x), (-y, y), inner, dark),
+        *mirrored((x - 0.03, x), (-y, y), inner, dark),
         box((-0.015, 0.015), (-y + 0.02, y - 0.01), inner, dark),
         box((-x + 0.03, x - 0.03), (-y, -y + 0.02), inner, shade(rgb, 0.7)),
     ]
@@ -167,8 +163,7 @@ def shelf(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     dark = shade(rgb, 0.88)
     side = min(0.025, 0.1 * x)
     solids = [
-        box((-x, -x + side), (-y, y), (0.0, top - 0.025), dark),
-        box((x - side, x), (-y, y), (0.0, top - 0.025), dark),
+        *mirrored((x - side, x), (-y, y), (0.0, top - 0.025), dark),
         box((-x + side, x - side), (-y, -y + 0.012), (0.0, top - 0.025), shade(rgb, 0.75)),
         box((-x, x), (-y, y), (top - 0.025, top), rgb),
         box((-x + side, x - side), (-y + 0.012, y), (0.03, 0.05), rgb),
@@ -205,8 +200,7 @@ def sofa(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
         box((-x + 0.03, x - 0.03), (-y + 0.03, y - 0.03), (0.0, 0.06), _DARK),
         box((-x + arm, x - arm), (-y + back, y - 0.02), (0.06, seat - 0.1), shade(rgb, 0.85)),
         box((-x + arm, x - arm), (-y, -y + back), (0.06, height), shade(rgb, 0.93)),
-        box((-x, -x + arm), (-y, y), (0.06, arm_top), shade(rgb, 0.9)),
-        box((x - arm, x), (-y, y), (0.06, arm_top), shade(rgb, 0.9)),
+        *mirrored((x - arm, x), (-y, y), (0.06, arm_top), shade(rgb, 0.9)),
     ]
     for k in range(cushions):
         left = -x + arm + k * wide
@@ -218,11 +212,9 @@ def chair(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Four legs, a seat and a back at the rear."""
     x, y, height = asset.halves_m
     seat = seat_height_m(asset, 0.5)
-    back = box((-x, x), (-y, -y + 0.035), (seat + 0.3 * (height - seat), height), rgb)
-    posts = [
-        box((-x, -x + 0.035), (-y, -y + 0.035), (seat, seat + 0.3 * (height - seat)), shade(rgb, 0.85)),
-        box((x - 0.035, x), (-y, -y + 0.035), (seat, seat + 0.3 * (height - seat)), shade(rgb, 0.85)),
-    ]
+    rear, low = (-y, -y + 0.035), seat + 0.3 * (height - seat)
+    back = box((-x, x), rear, (low, height), rgb)
+    posts = mirrored((x - 0.035, x), rear, (seat, low), shade(rgb, 0.85))
     legs = _legs(x, y, (0.0, seat - 0.04), 0.035, shade(rgb, 0.85))
     return [box((-x, x), (-y, y), (seat - 0.04, seat), rgb), back, *posts, *legs]
 
@@ -231,7 +223,7 @@ def stool(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A seat on four legs."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
-    seat = frustum((0.0, 0.0), (top - 0.05, top), (x, y), (x, y), rgb, 12)
+    seat = frustum((top - 0.05, top), (x, y), (x, y), rgb, 12)
     return [seat, *_legs(0.75 * x, 0.75 * y, (0.0, top - 0.05), 0.035, shade(rgb, 0.8))]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.colours import hash_bytes, pick, shade
-from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, profile
+from datagen.workers.furniture.solids import ColouredSolid, Rgb, ball, box, frustum, mirrored, profile
 
 _DARK: Rgb = (38, 38, 42)
 _STEEL: Rgb = (176, 178, 182)
@@ -21,7 +21,7 @@ def block(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 def column(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """An elliptic cylinder: rolls, tins, candles."""
     x, y, height = asset.halves_m
-    return [frustum((0.0, 0.0), (0.0, height), (x, y), (x, y), rgb, 12)]
+    return [frustum((0.0, height), (x, y), (x, y), rgb, 12)]
 
 
 def pebble(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
@@ -37,10 +37,8 @@ def plant(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     leaf = pick(_LEAF, asset.asset_id)
     crown = height - pot
     return [
-        frustum((0.0, 0.0), (0.0, pot), (0.38 * x, 0.38 * y), (0.55 * x, 0.55 * y), rgb),
-        frustum(
-            (0.0, 0.0), (pot, pot + 0.35 * crown), (0.06 * x, 0.06 * y), (0.1 * x, 0.1 * y), (96, 78, 50), 6
-        ),
+        frustum((0.0, pot), (0.38 * x, 0.38 * y), (0.55 * x, 0.55 * y), rgb),
+        frustum((pot, pot + 0.35 * crown), (0.06 * x, 0.06 * y), (0.1 * x, 0.1 * y), (96, 78, 50), 6),
         ball((0.0, 0.0, height - 0.3 * crown), (0.62 * x, 0.62 * y, 0.3 * crown), leaf),
         ball((-0.4 * x, 0.15 * y, pot + 0.4 * crown), (0.6 * x, 0.7 * y, 0.3 * crown), shade(leaf, 0.88)),
         ball((0.4 * x, -0.15 * y, pot + 0.45 * crown), (0.6 * x, 0.7 * y, 0.3 * crown), shade(leaf, 1.12)),
@@ -53,9 +51,9 @@ def lamp(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     pole = max(0.008, 0.03 * min(x, y))
     low = 0.74 * height
     return [
-        frustum((0.0, 0.0), (0.0, 0.03 * height), (0.6 * x, 0.6 * y), (0.55 * x, 0.55 * y), rgb),
-        frustum((0.0, 0.0), (0.03 * height, low), (pole, pole), (pole, pole), rgb, 6),
-        frustum((0.0, 0.0), (low, height), (x, y), (0.68 * x, 0.68 * y), _LINEN),
+        frustum((0.0, 0.03 * height), (0.6 * x, 0.6 * y), (0.55 * x, 0.55 * y), rgb),
+        frustum((0.03 * height, low), (pole, pole), (pole, pole), rgb, 6),
+        frustum((low, height), (x, y), (0.68 * x, 0.68 * y), _LINEN),
     ]
 
 
@@ -110,8 +108,7 @@ def container(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     dark = shade(rgb, 0.9)
     return [
         box((-x, x), (-y, y), (0.0, t), shade(rgb, 0.8)),
-        box((-x, -x + t), (-y, y), z, rgb),
-        box((x - t, x), (-y, y), z, rgb),
+        *mirrored((x - t, x), (-y, y), z, rgb),
         box((-x + t, x - t), (-y, -y + t), z, dark),
         box((-x + t, x - t), (y - t, y), z, dark),
     ]
@@ -122,8 +119,8 @@ def bin_(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     x, y, height = asset.halves_m
     mouth = max(0.9 * height, height - 0.02)
     return [
-        frustum((0.0, 0.0), (0.0, mouth), (0.78 * x, 0.78 * y), (0.98 * x, 0.98 * y), rgb, 12),
-        frustum((0.0, 0.0), (mouth, height), (x, y), (x, y), shade(rgb, 0.6), 12),
+        frustum((0.0, mouth), (0.78 * x, 0.78 * y), (0.98 * x, 0.98 * y), rgb, 12),
+        frustum((mouth, height), (x, y), (x, y), shade(rgb, 0.6), 12),
     ]
 
 
@@ -132,8 +129,8 @@ def bowl(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     x, y, height = asset.halves_m
     low = 0.75 * height
     return [
-        frustum((0.0, 0.0), (0.0, low), (0.5 * x, 0.5 * y), (0.92 * x, 0.92 * y), rgb, 12),
-        frustum((0.0, 0.0), (low, height), (0.92 * x, 0.92 * y), (x, y), shade(rgb, 0.85), 12),
+        frustum((0.0, low), (0.5 * x, 0.5 * y), (0.92 * x, 0.92 * y), rgb, 12),
+        frustum((low, height), (0.92 * x, 0.92 * y), (x, y), shade(rgb, 0.85), 12),
     ]
 
 
@@ -142,7 +139,7 @@ def cup(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     x, y, height = asset.halves_m
     radius = min(x, y)
     shift = (-(x - radius), -(y - radius))
-    solids = [frustum(shift, (0.0, height), (0.8 * radius, 0.8 * radius), (radius, radius), rgb)]
+    solids = [frustum((0.0, height), (0.8 * radius, 0.8 * radius), (radius, radius), rgb, centre_m=shift)]
     if x - y > 0.01:
         grip = (x - 2 * (x - radius) - 0.01, x)
         solids.append(box(grip, (-0.007, 0.007), (0.25 * height, 0.8 * height), rgb))
@@ -157,9 +154,9 @@ def bottle(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     x, y, height = asset.halves_m
     neck = max(0.004, 0.32 * min(x, y))
     return [
-        frustum((0.0, 0.0), (0.0, 0.6 * height), (x, y), (x, y), rgb),
-        frustum((0.0, 0.0), (0.6 * height, 0.76 * height), (x, y), (neck, neck), rgb),
-        frustum((0.0, 0.0), (0.76 * height, height), (neck, neck), (neck, neck), shade(rgb, 0.7), 8),
+        frustum((0.0, 0.6 * height), (x, y), (x, y), rgb),
+        frustum((0.6 * height, 0.76 * height), (x, y), (neck, neck), rgb),
+        frustum((0.76 * height, height), (neck, neck), (neck, neck), shade(rgb, 0.7), 8),
     ]
 
 
@@ -167,9 +164,9 @@ def vase(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A belly that narrows to a mouth."""
     x, y, height = asset.halves_m
     return [
-        frustum((0.0, 0.0), (0.0, 0.45 * height), (0.5 * x, 0.5 * y), (x, y), rgb),
-        frustum((0.0, 0.0), (0.45 * height, 0.85 * height), (x, y), (0.4 * x, 0.4 * y), rgb),
-        frustum((0.0, 0.0), (0.85 * height, height), (0.4 * x, 0.4 * y), (0.55 * x, 0.55 * y), rgb),
+        frustum((0.0, 0.45 * height), (0.5 * x, 0.5 * y), (x, y), rgb),
+        frustum((0.45 * height, 0.85 * height), (x, y), (0.4 * x, 0.4 * y), rgb),
+        frustum((0.85 * height, height), (0.4 * x, 0.4 * y), (0.55 * x, 0.55 * y), rgb),
     ]
 
 
@@ -179,7 +176,7 @@ def pan(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     radius = min(x, y)
     if max(x, y) < 1.2 * radius:
         grip = box((-x, x), (-0.02, 0.02), (0.7 * height, 0.85 * height), shade(rgb, 0.6))
-        return [frustum((0.0, 0.0), (0.0, height), (0.8 * x, 0.9 * y), (0.85 * x, 0.95 * y), rgb, 12), grip]
+        return [frustum((0.0, height), (0.8 * x, 0.9 * y), (0.85 * x, 0.95 * y), rgb, 12), grip]
     along_y = y > x
     far = max(x, y)
     centre = (0.0, -(far - radius)) if along_y else (-(far - radius), 0.0)
@@ -187,7 +184,7 @@ def pan(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     across = (-0.012, 0.012)
     grip = (across, reach) if along_y else (reach, across)
     return [
-        frustum(centre, (0.0, height), (0.85 * radius, 0.85 * radius), (radius, radius), rgb, 12),
+        frustum((0.0, height), (0.85 * radius, 0.85 * radius), (radius, radius), rgb, 12, centre),
         box(grip[0], grip[1], (0.5 * height, 0.9 * height), _DARK),
     ]
 
@@ -195,16 +192,10 @@ def pan(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 def dispenser(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A bottle with a pump or trigger on top."""
     x, y, height = asset.halves_m
+    pump = (0.3 * x, 0.3 * y)
     return [
-        frustum((0.0, 0.0), (0.0, 0.68 * height), (x, 0.75 * y), (0.9 * x, 0.7 * y), rgb),
-        frustum(
-            (0.0, 0.0),
-            (0.68 * height, 0.86 * height),
-            (0.3 * x, 0.3 * y),
-            (0.3 * x, 0.3 * y),
-            shade(rgb, 0.7),
-            6,
-        ),
+        frustum((0.0, 0.68 * height), (x, 0.75 * y), (0.9 * x, 0.7 * y), rgb),
+        frustum((0.68 * height, 0.86 * height), pump, pump, shade(rgb, 0.7), 6),
         box((-0.3 * x, 0.3 * x), (-0.3 * y, y), (0.86 * height, height), shade(rgb, 0.7)),
     ]
 
@@ -222,10 +213,8 @@ def appliance(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 def toaster(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """A rounded block with two slots."""
     x, y, height = asset.halves_m
-    slots = [
-        box((k * 0.4 * x - 0.012, k * 0.4 * x + 0.012), (-0.7 * y, 0.7 * y), (0.96 * height, height), _DARK)
-        for k in (-1, 1)
-    ]
+    slot = (0.4 * x - 0.012, 0.4 * x + 0.012)
+    slots = mirrored(slot, (-0.7 * y, 0.7 * y), (0.96 * height, height), _DARK)
     return [box((-x, x), (-y, y), (0.0, 0.96 * height), rgb), *slots]
 
 
@@ -243,7 +232,7 @@ def kettle(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     """Body, spout and handle."""
     x, y, height = asset.halves_m
     return [
-        frustum((0.0, 0.0), (0.0, 0.75 * height), (0.9 * x, 0.8 * y), (0.55 * x, 0.5 * y), rgb),
+        frustum((0.0, 0.75 * height), (0.9 * x, 0.8 * y), (0.55 * x, 0.5 * y), rgb),
         box((-0.015, 0.015), (0.45 * y, y), (0.5 * height, 0.68 * height), _STEEL),
         box((-0.015, 0.015), (-0.6 * y, 0.5 * y), (0.9 * height, height), _DARK),
         box((-0.015, 0.015), (-0.6 * y, -0.4 * y), (0.7 * height, 0.9 * height), _DARK),
@@ -292,6 +281,5 @@ def basket_bed(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
     return [
         box((-x, x), (-y, y), (0.0, 0.45 * height), rgb),
         box((-x, x), (-y, -y + t), (0.45 * height, height), shade(rgb, 0.8)),
-        box((-x, -x + t), (-y + t, y), (0.45 * height, height), shade(rgb, 0.8)),
-        box((x - t, x), (-y + t, y), (0.45 * height, height), shade(rgb, 0.8)),
+        *mirrored((x - t, x), (-y + t, y), (0.45 * height, height), shade(rgb, 0.8)),
     ]

@@ -67,13 +67,20 @@ def _circle(sides: int) -> F64:
     return corners / np.abs(corners).max(0)
 
 
+def mirrored(
+    x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], rgb: Rgb
+) -> list[ColouredSolid]:
+    """A box by its intervals and its mirror image on the left, which comes first."""
+    return [box((-x[1], -x[0]), y, z, rgb), box(x, y, z, rgb)]
+
+
 def frustum(
-    centre_m: tuple[float, float],
     z: tuple[float, float],
     bottom_m: tuple[float, float],
     top_m: tuple[float, float],
     rgb: Rgb,
     sides: int = 10,
+    centre_m: tuple[float, float] = (0.0, 0.0),
 ) -> ColouredSolid:
     """A (tapered, elliptic) column from the radii (x, y) at its bottom to those at its top."""
     circle = _circle(sides)

@@ -107,70 +107,54 @@ def _document(plan: FloorPlan, objects: list[dict[str, Any]], rng: np.random.Gen
     rooms: list[dict[str, Any]] = []
     for room, floor in zip(plan.rooms, floors, strict=True):
         x0, y0, x1, y1 = room.rect
-        ring = [(x0, y0), (x0, y1), (x1, y1), (x1, y0)]
-        polygon = [{"x": x, "y": 0.0, "z": y} for x, y in ring]
-        rooms.append(
-            {
-                "id": room.room_id,
-                "roomType": room.room_type,
-                "floorPolygon": polygon,
-                "floorMaterial": {"name": floor},
-            }
-        )
+        polygon = [_point(x, 0.0, y) for x, y in ((x0, y0), (x0, y1), (x1, y1), (x1, y0))]
+        names = {"id": room.room_id, "roomType": room.room_type}
+        rooms.append({**names, "floorPolygon": polygon, "floorMaterial": {"name": floor}})
     walls: list[dict[str, Any]] = []
-    for stretch in plan.stretches:
-        walls.append(_wall(_wall_id(plan, stretch), stretch, paints[stretch.room]))
-        if stretch.neighbour is None:
-            walls.append(_wall(_other_side_id(plan, stretch), _reverse(stretch), "Eggshell"))
+    for s in plan.stretches:
+        inside = f"room|{s.room}"
+        walls.append(_wall(_wall_id(s), inside, s.start_m, s.end_m, paints[s.room]))
+        if s.neighbour is None:
+            walls.append(_wall(_other_side_id(s), "exterior", s.end_m, s.start_m, "Eggshell"))
     return {
         "metadata": {"schema": "1.0.0", "generator": GENERATOR_VERSION},
         "rooms": rooms,
         "walls": walls,
-        "doors": [_opening(plan, o, k) for k, o in enumerate(plan.openings) if o.is_door],
-        "windows": [_opening(plan, o, k) for k, o in enumerate(plan.openings) if not o.is_door],
+        "doors": [_opening(o, k) for k, o in enumerate(plan.openings) if o.is_door],
+        "windows": [_opening(o, k) for k, o in enumerate(plan.openings) if not o.is_door],
         "objects": objects,
     }
 
 
-def _wall_id(plan: FloorPlan, s: Stretch) -> str:
+def _point(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+def _wall_id(s: Stretch) -> str:
     return f"wall|{s.room}|" + "|".join(f"{v:.2f}" for v in (*s.start_m, *s.end_m))
 
 
-def _other_side_id(plan: FloorPlan, s: Stretch) -> str:
+def _other_side_id(s: Stretch) -> str:
     if s.neighbour is None:
         return "wall|exterior|" + "|".join(f"{v:.2f}" for v in (*s.end_m, *s.start_m))
-    twin = next(
-        t for t in plan.stretches if t.room == s.neighbour and t.start_m == s.end_m and t.end_m == s.start_m
-    )
-    return _wall_id(plan, twin)
+    return _wall_id(Stretch(s.neighbour, s.end_m, s.start_m, s.room))
 
 
-def _reverse(s: Stretch) -> Stretch:
-    return Stretch(s.room, s.end_m, s.start_m, s.neighbour)
+def _wall(
+    wall_id: str, room_id: str, start_m: tuple[float, float], end_m: tuple[float, float], paint: str
+) -> dict[str, Any]:
+    corners = [_point(x, height_m, y) for height_m in (0.0, WALL_HEIGHT_M) for x, y in (start_m, end_m)]
+    return {"id": wall_id, "roomId": room_id, "polygon": corners, "material": {"name": paint}}
 
 
-def _wall(wall_id: str, s: Stretch, paint: str) -> dict[str, Any]:
-    low = [{"x": p[0], "y": 0.0, "z": p[1]} for p in (s.start_m, s.end_m)]
-    high = [{**p, "y": WALL_HEIGHT_M} for p in low]
-    return {
-        "id": wall_id,
-        "roomId": f"room|{s.room}" if "exterior" not in wall_id else "exterior",
-        "polygon": [*low, *high],
-        "material": {"name": paint},
-    }
-
-
-def _opening(plan: FloorPlan, o: Opening, number: int) -> dict[str, Any]:
+def _opening(o: Opening, number: int) -> dict[str, Any]:
     s = o.stretch
-    room1 = s.room if s.neighbour is None else s.neighbour
+    corners = [_point(along, height, 0.0) for along, height in zip(o.along_m, o.height_m, strict=True)]
     return {
         "id": f"{'door' if o.is_door else 'window'}|{number}",
         "room0": f"room|{s.room}",
-        "room1": f"room|{room1}",
-        "wall0": _wall_id(plan, s),
-        "wall1": _other_side_id(plan, s),
-        "holePolygon": [
-            {"x": o.along_m[0], "y": o.height_m[0], "z": 0.0},
-            {"x": o.along_m[1], "y": o.height_m[1], "z": 0.0},
-        ],
+        "room1": f"room|{s.room if s.neighbour is None else s.neighbour}",
+        "wall0": _wall_id(s),
+        "wall1": _other_side_id(s),
+        "holePolygon": corners,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,8 @@ _SMALL: dict[str, tuple[str, ...]] = {
 }
 _CLUTTER_GAP_M = 0.04
 _EDGE_M = 0.03
+
+Placed = tuple[Spot, dict[str, Any]]  # furniture, and its entry in the house document
 
 
 @dataclass(eq=False)
@@ -48,7 +50,7 @@ class Furnisher:
 
     def place(
         self, spots: list[Spot], front_m: float = 0.0, is_tall: bool = False, is_partner: bool = False
-    ) -> tuple[Spot, dict[str, Any]] | None:
+    ) -> Placed | None:
         """The first spot that fits, taken and entered; None where none does."""
         for spot in spots:
             if self.layout.fits(spot, is_partner, is_tall):
@@ -56,30 +58,23 @@ class Furnisher:
                 return spot, self.add(spot)
         return None
 
-    def at_wall(
-        self, kind: str, front_m: float = 0.0, is_tall: bool = False
-    ) -> tuple[Spot, dict[str, Any]] | None:
+    def at_wall(self, kind: str, front_m: float = 0.0, is_tall: bool = False) -> Placed | None:
         """A variant of the type with its back at a wall."""
         return self.place(self.layout.wall_spots(self.one_of(kind), self.rng), front_m, is_tall)
 
     def put_on(
-        self, below: tuple[Spot, dict[str, Any]], asset: Asset, right_m: float, front_m: float
+        self, below: Placed, asset: Asset, right_m: float, front_m: float, height_m: float | None = None
     ) -> None:
-        """Stand an asset on furniture, at a point of the furniture's frame."""
+        """Stand an asset on furniture, at a point of the furniture's frame; None is the height of its top."""
         spot, entry = below
-        xy = spot.local(right_m, front_m)
+        base_m = top_height_m(spot.asset) if height_m is None else height_m
         children: list[dict[str, Any]] = entry["children"]
         child_id = f"{entry['id']}|{len(children)}"
-        children.append(_entry(child_id, asset, xy, top_height_m(spot.asset), spot.yaw_deg))
+        children.append(_entry(child_id, asset, spot.local(right_m, front_m), base_m, spot.yaw_deg))
 
-    def clutter(
-        self,
-        below: tuple[Spot, dict[str, Any]],
-        most: int,
-        taken: list[tuple[float, float, float]] | None = None,
-    ) -> None:
+    def clutter(self, below: Placed, most: int, taken: Sequence[tuple[float, float, float]] = ()) -> None:
         """Up to `most` small things on furniture; `taken` are circles (right, front, radius) on it."""
-        circles = list(taken or [])
+        circles = list(taken)
         kinds = _SMALL[self.layout.room.room_type]
         rectangles = top_rectangles(below[0].asset)
         for _ in range(int(self.rng.integers(1, most + 1))):
@@ -96,17 +91,13 @@ class Furnisher:
                 circles.append((right, front, radius))
                 self.put_on(below, asset, right, front)
 
-    def add_pillows(self, spot: Spot, entry: dict[str, Any]) -> None:
+    def add_pillows(self, sofa: Placed) -> None:
         """A pillow in each corner of a sofa, now and then."""
+        asset = sofa[0].asset
         for side in (-1.0, 1.0):
             if self.rng.random() < 0.6:
-                pillow = self.one_of("Pillow")
-                xy = spot.local(side * 0.25 * spot.asset.size_m[0], 0.05)
-                children: list[dict[str, Any]] = entry["children"]
-                name = f"{entry['id']}|{len(children)}"
-                children.append(
-                    _entry(name, pillow, xy, seat_height_m(spot.asset, SOFA_SEAT_SHARE), spot.yaw_deg)
-                )
+                seat_m = seat_height_m(asset, SOFA_SEAT_SHARE)
+                self.put_on(sofa, self.one_of("Pillow"), side * 0.25 * asset.size_m[0], 0.05, seat_m)
 
     def decorate(self) -> None:
         """A picture, a plant and a lamp, where they fit."""
@@ -158,7 +149,7 @@ def kitchen(f: Furnisher) -> None:
     f.at_wall("GarbageCan")
 
 
-def _equip(f: Furnisher, run: tuple[Spot, dict[str, Any]]) -> None:
+def _equip(f: Furnisher, run: Placed) -> None:
     """Sink, appliances and small things on a counter, and cupboards over its back run."""
     spot, _ = run
     back = top_rectangles(spot.asset)[0]
@@ -257,7 +248,7 @@ def _television_corner(f: Furnisher) -> bool:
         below = (spot, f.add(spot))
         f.put_on(below, f.one_of("Television"), 0.0, -0.02)
         f.layout.take(seat)
-        f.add_pillows(seat, f.add(seat))
+        f.add_pillows((seat, f.add(seat)))
         between = spot.local(0.0, away - sofa.size_m[1] / 2 - 0.4 - coffee.size_m[1] / 2)
         table = f.place([spot_at(coffee, *between, spot.yaw_deg)], is_partner=True)
         if table is not None:
@@ -296,11 +287,11 @@ def work_place(f: Furnisher) -> None:
         return
     spot = desk[0]
     width, depth, _ = spot.asset.size_m
-    taken: list[tuple[float, float, float]] = []
-    if f.rng.random() < 0.6:
-        f.put_on(desk, f.one_of("DeskLamp"), -width / 2 + 0.18, -depth / 2 + 0.18)
-        taken.append((-width / 2 + 0.18, -depth / 2 + 0.18, 0.16))
-    f.clutter(desk, 3, taken)
+    corner = (-width / 2 + 0.18, -depth / 2 + 0.18)
+    has_lamp = f.rng.random() < 0.6
+    if has_lamp:
+        f.put_on(desk, f.one_of("DeskLamp"), *corner)
+    f.clutter(desk, 3, [(*corner, 0.16)] if has_lamp else ())
     chair = f.one_of("Chair")
     xy = spot.local(-0.1 * width, depth / 2 + chair.size_m[1] / 2 + 0.05)
     f.place([spot_at(chair, *xy, spot.yaw_deg + 180.0)], is_partner=True)
