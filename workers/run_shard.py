@@ -28,8 +28,8 @@ from datagen.workers.labels import load_label_source
 from datagen.workers.labels.source import LabelSource
 from datagen.workers.rendering.frame import Camera
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
-from datagen.workers.scenes.scene import Scene, SettledScene
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_candidates, reconstruct_scene
+from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import World
 
 Columns = dict[str, np.ndarray[Any, Any]]
@@ -43,16 +43,6 @@ class ShardResult:
     sample: Columns
     clock: StageClock
     redraws: dict[str, int]
-
-
-@dataclass(frozen=True, eq=False)
-class _UnlabelledScene:
-    """A scene before labelling: its stage, and the rows that do not depend on labels."""
-
-    scene: SettledScene
-    candidates: SceneCandidates
-    record: Mapping[str, Any]
-    redraws: Mapping[str, int]
 
 
 def run_shard(
@@ -74,19 +64,18 @@ def run_shard(
     clock, redraws = StageClock(), Counter[str]()
     scene_rows: list[Mapping[str, Any]] = []
     sample_blocks: list[Columns] = []
-    scenes = (
-        (_generate(world, index, clock) for index in scene_indices)
-        if stored is None
-        else (
-            _reconstruct(world, index, rows, clock) for index, rows in zip(scene_indices, stored, strict=True)
-        )
-    )
-    for unlabelled in scenes:
-        labelled = source.label(unlabelled.scene, unlabelled.candidates, spec, clock)
-        common = candidate_columns(unlabelled.scene.index, unlabelled.candidates, spec_hash, source)
-        scene_rows.append(unlabelled.record)
-        sample_blocks.append(common | labelled)
-        redraws.update(unlabelled.redraws)
+    rows_of = [None] * len(scene_indices) if stored is None else stored
+    for index, rows in zip(scene_indices, rows_of, strict=True):
+        if rows is None:
+            scene, candidates = generate_scene(world, index, clock)
+            redraws.update(scene.redraws)
+            record = scene_row(scene)
+        else:
+            scene = _stored_scene(world, index, rows, clock)
+            candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
+        labelled = source.label(scene, candidates, spec, clock)
+        scene_rows.append(record)
+        sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
 
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
@@ -99,18 +88,13 @@ def run_shard(
     return ShardResult(scene_columns, sample_columns, clock, dict(redraws))
 
 
-def _generate(world: World, index: int, clock: StageClock) -> _UnlabelledScene:
-    scene, candidates = generate_scene(world, index, clock)
-    return _UnlabelledScene(scene, candidates, scene_row(scene), scene.redraws)
-
-
-def _reconstruct(world: World, index: int, rows: SceneRows, clock: StageClock) -> _UnlabelledScene:
+def _stored_scene(world: World, index: int, rows: SceneRows, clock: StageClock) -> ReconstructedScene:
     with clock.stage("draw"):
         scene = reconstruct_scene(world, rows.record)
     if scene.index != index:
         problem = f"scene {scene.index} is stored where scene {index} belongs"
         raise InputError("stored scenes", "scene_index", problem, "Make the run that stores them again")
-    return _UnlabelledScene(scene, reconstruct_candidates(rows.samples, scene), rows.record, {})
+    return scene
 
 
 def scene_row(scene: Scene) -> dict[str, Any]:

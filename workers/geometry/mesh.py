@@ -36,6 +36,12 @@ class Mesh:
         return Mesh(vertices_m.astype(np.float32), self.faces, self.face_rgb, self.texture)
 
 
+def face_normals(corners_m: F32) -> F32:
+    """Unit normals (F, 3) of faces given by their corners (F, 3, 3); zero for a face without area."""
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
 def concatenate(meshes: list[Mesh]) -> Mesh:
     """One untextured mesh with the faces of all, in order; textures become flat face colours."""
     if not meshes:

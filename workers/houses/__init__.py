@@ -16,8 +16,7 @@ HOUSE_SOURCES: dict[str, str] = {
 
 def open_houses(ref: str) -> HouseSource:
     """The source that a reference names: `builtin`, `procthor:DIR` or `ai2thor:DIR`."""
-    source: HouseSource = open_source(HOUSE_SOURCES, ref, "--houses")
-    return source
+    return open_source(HOUSE_SOURCES, ref, "--houses")
 
 
 __all__ = ["HOUSE_SOURCES", "HouseSource", "ids_of_split", "open_houses", "split_of"]

@@ -34,7 +34,7 @@ def face_components(faces: npt.NDArray[np.int32], vertex_count: int) -> npt.NDAr
 
 
 def convex_parts(mesh: Mesh) -> tuple[F32, ...]:
-    """Convex hulls of the connected components; the smallest are joined to keep within 32 parts."""
+    """Convex hulls of the connected components, the 32 largest at most."""
     labels = face_components(mesh.faces, len(mesh.vertices_m))
     groups = [np.unique(mesh.faces[labels == k]) for k in range(min(int(labels.max()) + 1, 4096))]
     points = [mesh.vertices_m[g].astype(np.float64) for g in groups]

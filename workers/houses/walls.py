@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,6 +49,13 @@ class Hole:
     along_m: tuple[float, float]
     height_m: tuple[float, float]
     is_closed: bool = False
+
+
+class _Slab(NamedTuple):
+    """A prism and the colour of its left side, its third wall."""
+
+    solid: ColouredSolid
+    left_rgb: Rgb
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +108,7 @@ def _bodies_on_line(
     spans = [tuple(sorted((line.along(w.start_m), line.along(w.end_m)))) for w in walls]
     forward = [line.along(w.end_m) > line.along(w.start_m) for w in walls]
     holes: list[tuple[float, float, float, float]] = []
-    leaves: list[ColouredSolid] = []
+    leaves: list[_Slab] = []
     for wall, ahead in zip(walls, forward, strict=True):
         for hole in by_wall.get(wall.wall_id, ()):
             sign = 1.0 if ahead else -1.0
@@ -110,7 +118,7 @@ def _bodies_on_line(
                 leaves.append(_slab(line, s0, s1, hole.height_m, _DOOR_RGB, _DOOR_RGB))
     cuts = _distinct([s for span in spans for s in span] + [s for h in holes for s in h[:2]])
     bodies: list[StaticBody] = []
-    solids: list[ColouredSolid] = []
+    solids: list[_Slab] = []
     start, last = 0.0, None
     for a, b in zip(cuts, [*cuts[1:], np.inf], strict=True):
         key = _structure(a, b, walls, spans, forward, holes) if np.isfinite(b) else None
@@ -160,32 +168,23 @@ def _solid_ranges(height_m: float, gaps: tuple[tuple[float, float], ...]) -> lis
     return ranges
 
 
-def _slab(line: _Line, s0: float, s1: float, z: tuple[float, float], left: Rgb, right: Rgb) -> ColouredSolid:
+def _slab(line: _Line, s0: float, s1: float, z: tuple[float, float], left: Rgb, right: Rgb) -> _Slab:
     half = WALL_THICKNESS_M / 2
     across = np.array([-line.direction[1], line.direction[0]])  # to the left of the line
     a, b = line.origin + s0 * line.direction, line.origin + s1 * line.direction
     ring = np.array([a - half * across, b - half * across, b + half * across, a + half * across])
     low = np.column_stack([ring, np.full(4, z[0])])
     high = np.column_stack([ring, np.full(4, z[1])])
-    solid = prism(low, high, right)
-    return solid if left == right else TwoSided(solid.vertices_m, solid.faces, right, left)
+    return _Slab(prism(low, high, right), left)
 
 
-@dataclass(frozen=True, eq=False)
-class TwoSided(ColouredSolid):
-    """A slab whose left side (its third wall) has another colour than the rest."""
-
-    left_rgb: Rgb = _PLAIN
-
-
-def _body(body_id: str, object_type: str, solids: list[ColouredSolid]) -> StaticBody:
-    mesh, parts_m = join(solids)
+def _body(body_id: str, object_type: str, slabs: list[_Slab]) -> StaticBody:
+    mesh, parts_m = join([slab.solid for slab in slabs])
     row = 0
-    for solid in solids:
-        if isinstance(solid, TwoSided):
-            # A prism of four sides lists its wall triangles first: side k has rows k and k + 4.
-            mesh.face_rgb[[row + 2, row + 6]] = solid.left_rgb
-        row += len(solid.faces)
+    for slab in slabs:
+        # A prism of four sides lists its wall triangles first: side k has rows k and k + 4.
+        mesh.face_rgb[[row + 2, row + 6]] = slab.left_rgb
+        row += len(slab.solid.faces)
     return StaticBody(body_id, "wall", object_type, "", "", mesh, parts_m)
 
 

@@ -20,5 +20,4 @@ def open_objects(ref: str) -> ObjectSource:
 
     Raises InputError for an unknown kind, naming the valid ones, and as the source itself does.
     """
-    source: ObjectSource = open_source(OBJECT_SOURCES, ref, "--objects")
-    return source
+    return open_source(OBJECT_SOURCES, ref, "--objects")

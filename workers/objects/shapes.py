@@ -22,6 +22,7 @@ Indices = npt.NDArray[np.int64]
 # From face centres (F, 3) and outward unit normals (F, 3) to colours (F, 3).
 Paint = Callable[[F64, F64], npt.NDArray[np.generic]]
 Profile = Sequence[tuple[float, float]]
+_TUBE_SIDES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +142,7 @@ def vessel(outer_m: Profile, inner_m: Profile, paint: Paint, segments: int = 20)
     return _painted(vertices, faces, cells, parts, paint)
 
 
-def tube(
-    centres_m: F64, radii_m: F64, paint: Paint, segments: int = 12, flat: float = 1.0
-) -> ParametricSolid:
+def tube(centres_m: F64, radii_m: F64, paint: Paint, flat: float = 1.0) -> ParametricSolid:
     """A bent bar: circles of `radii_m` (N,) around `centres_m` (N, 3), across the path.
 
     The path lies in a plane; `flat` is the section's size across that plane over its size in it.
@@ -153,7 +152,7 @@ def tube(
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     normal = _plane_normal(centres_m)
     across = np.cross(normal, tangents)
-    angles = np.arange(segments) * (2 * np.pi / segments)
+    angles = np.arange(_TUBE_SIDES) * (2 * np.pi / _TUBE_SIDES)
     rings: F64 = (
         centres_m[:, None]
         + radii_m[:, None, None] * np.cos(angles)[None, :, None] * across[:, None]

@@ -140,9 +140,8 @@ class RoomLayout:
         x0, y0, x1, y1 = self.inner
         xs = np.arange(x0 + _CELL_M / 2, x1, _CELL_M)
         ys = np.arange(y0 + _CELL_M / 2, y1, _CELL_M)
-        near_wall = _BODY_RADIUS_M
-        free_x = (xs > x0 + near_wall) & (xs < x1 - near_wall)
-        free_y = (ys > y0 + near_wall) & (ys < y1 - near_wall)
+        free_x = (xs > x0 + _BODY_RADIUS_M) & (xs < x1 - _BODY_RADIUS_M)
+        free_y = (ys > y0 + _BODY_RADIUS_M) & (ys < y1 - _BODY_RADIUS_M)
         free = free_x[:, None] & free_y[None]
         for a0, b0, a1, b1 in [*self.solid, *extra]:
             in_x = (xs > a0 - _BODY_RADIUS_M) & (xs < a1 + _BODY_RADIUS_M)

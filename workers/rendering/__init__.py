@@ -14,5 +14,4 @@ RENDERERS: dict[str, str] = {
 
 def load_renderer(name: str) -> Renderer:
     """The renderer of that name. Raises InputError where it is unknown or cannot be imported."""
-    renderer: Renderer = entry(RENDERERS, name, "--renderer")
-    return renderer
+    return entry(RENDERERS, name, "--renderer")

@@ -24,9 +24,3 @@ def face_texture(mesh: Mesh) -> tuple[F32, U8]:
     row, column = np.divmod(index.ravel(), _PALETTE_WIDTH)
     uv = np.stack([(column + 0.5) / _PALETTE_WIDTH, 1 - (row + 0.5) / height], axis=1).astype(np.float32)
     return np.repeat(uv[:, None], 3, axis=1), image.reshape(height, _PALETTE_WIDTH, 3)
-
-
-def face_normals(corners_m: F32) -> F32:
-    """Unit normals (F, 3) of faces given by their corners (F, 3, 3); zero for a face without area."""
-    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)

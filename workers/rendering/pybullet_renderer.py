@@ -11,9 +11,9 @@ import pybullet
 from PIL import Image
 
 from datagen.schemas.errors import InputError
-from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate
+from datagen.workers.geometry.mesh import F32, F64, U8, Mesh, concatenate, face_normals
 from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
-from datagen.workers.rendering.face_texture import face_normals, face_texture
+from datagen.workers.rendering.face_texture import face_texture
 from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 
 # What is nearer or farther is not drawn. A near plane far off keeps depth sharp.

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from datagen.workers.geometry.mesh import F32, F64, I32, Mesh, concatenate
+from datagen.workers.geometry.mesh import F32, F64, I32, Mesh, concatenate, face_normals
 from datagen.workers.houses.house import House
 from datagen.workers.objects.model import ObjectModel
 
@@ -50,9 +50,7 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
         np.ascontiguousarray(mesh.vertices_m, np.float32),
         np.ascontiguousarray(mesh.faces, np.int32),
     )
-    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    normals = face_normals(mesh.vertices_m[mesh.faces])
     low, high = mesh.vertices_m.min(0), mesh.vertices_m.max(0)
     corners_m = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
     rays = RayMesh(mesh, hierarchy, normals.astype(np.float32), corners_m)

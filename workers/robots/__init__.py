@@ -39,21 +39,18 @@ def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     for a URDF or a mesh that cannot be used.
     """
     description = _description(name)
+    own = description.extension is None
     low, high = description.limits.reach_m
-    if reach_m is None and description.extension is not None:
-        raise InputError(
-            "--robot", name, "is scaled to a reach, but none is given", _within("reach", low, high)
-        )
+    problem = "is scaled to a reach, but none is given" if reach_m is None and not own else ""
     if reach_m is not None and not low - _STEP_M <= reach_m <= high + _STEP_M:
-        raise InputError(
-            "--robot", name, f"a reach of {reach_m} m is outside its range", _within("reach", low, high)
-        )
+        problem = f"a reach of {reach_m} m is outside its range"
+    if problem:
+        raise InputError("--robot", name, problem, _within("reach", low, high))
     bottom, top = description.limits.base_height_m or (0.0, math.inf)
     # Stored heights are float32, which may lie just outside.
     if not bottom - _STEP_M <= base_height_m <= min(top + _STEP_M, _HIGHEST_MOUNT_M):
         fix = _within("base height", bottom, top)
         raise InputError("--robot", name, f"a base height of {base_height_m} m is outside its range", fix)
-    own = description.extension is None
     return _mounted(name, None if own else reach_m, min(max(base_height_m, bottom), top))
 
 

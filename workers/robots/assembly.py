@@ -61,7 +61,8 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
     if description.lift:
         held[description.lift.joint] = lift_m
     heads = (description.root_link, *(tree.joint(name).child for name in description.arm_joints))
-    stops = {*description.arm_joints, *_joint_names_above(tree, description.hand.palm_link)}
+    hand_mount = tree.joint_above(description.hand.palm_link)
+    stops = {*description.arm_joints, *([hand_mount.name] if hand_mount else [])}
     for name in description.shapeless:
         tree.links[name] = replace(tree.link(name), collisions=(), visuals=())
     clusters = [_cluster(tree, head, stops, held) for head in heads]
@@ -127,11 +128,6 @@ def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float])
             found[joint.child] = (tree.link(joint.child), T)
             waiting.append(joint.child)
     return found
-
-
-def _joint_names_above(tree: UrdfTree, link: str) -> tuple[str, ...]:
-    joint = tree.joint_above(link) if link in tree.links else None
-    return (joint.name,) if joint else ()
 
 
 def _joints(
