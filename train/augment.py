@@ -15,13 +15,10 @@ from dataclasses import dataclass, replace
 from math import cos, pi, sin
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.train.batching import View
-
-F64 = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from datagen.train.inputs import F64, Bools
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def _sight_lines(view: View) -> tuple[F64, F64]:
     return camera_m, view.points_m[: view.n_points] - camera_m
 
 
-def _with_rows(view: View, kept: Mask) -> View:
+def _with_rows(view: View, kept: Bools) -> View:
     """The cloud with only these points (n,), in order, padded with zeros."""
     rows = np.flatnonzero(kept)
     if len(rows) == view.n_points:

@@ -10,7 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.inputs import (
+    F32,
+    F64,
+    I64,
+    U8,
+    Array,
+    Batch,
+    Bools,
+    CandidateInputs,
+    Clouds,
+    Ints,
+    RobotInputs,
+)
 
 Rows = npt.NDArray[np.intp]
 
@@ -42,19 +54,19 @@ class View:
 
     scene: StoredScene
     rows: Rows  # (k,)
-    points_m: npt.NDArray[np.float32]  # (P, 3), target frame
-    rgb: npt.NDArray[np.uint8]  # (P, 3)
-    target_mask: npt.NDArray[np.bool_]  # (P,)
+    points_m: F32  # (P, 3), target frame
+    rgb: U8  # (P, 3)
+    target_mask: Bools  # (P,)
     n_points: int
-    base_xy_m: npt.NDArray[np.float64]  # (k, 2), target frame
+    base_xy_m: F64  # (k, 2), target frame
 
 
 def stored_scenes(
     place: str,
     columns: Mapping[str, Array],
     dims: Mapping[str, str],
-    bounds: npt.NDArray[np.int64],
-    rows: npt.NDArray[np.int64],
+    bounds: I64,
+    rows: I64,
 ) -> list[StoredScene]:
     """The wanted scenes of a shard. InputError where samples of one robot have different robot values."""
     robots = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), columns["robot_index"]
@@ -98,9 +110,7 @@ def stored_view(scene: StoredScene, rows: Rows) -> View:
     )
 
 
-def candidate_rows(
-    robot_index: npt.NDArray[np.integer[Any]], per_robot: int | None, rng: np.random.Generator
-) -> Rows:
+def candidate_rows(robot_index: Ints, per_robot: int | None, rng: np.random.Generator) -> Rows:
     """Rows of the candidates by ascending robot; of each robot at most `per_robot`, at random.
 
     Candidates of one robot keep their stored order.

@@ -8,7 +8,6 @@ from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from datagen.schemas.concurrent_map import concurrent_map
@@ -24,7 +23,7 @@ from datagen.train.batching import (
     stored_view,
 )
 from datagen.train.epoch_plan import EpochPlan, batches_of, plan_epoch
-from datagen.train.inputs import Array, Batch
+from datagen.train.inputs import I64, Array, Batch
 from datagen.train.reader import JOIN_FIELDS, load_shard
 from datagen.train.run_parts import open_parts
 from datagen.train.scene_table import TABLE_FIELDS, PartSummary, read_scene_table
@@ -194,7 +193,7 @@ class SampleStream:
             finally:
                 loaded.close()
 
-    def _reads(self, plan: EpochPlan, batches: range) -> list[tuple[int, npt.NDArray[np.int64]]]:
+    def _reads(self, plan: EpochPlan, batches: range) -> list[tuple[int, I64]]:
         """(shard, its scenes that are wanted) of these batches, buffer by buffer."""
         wanted = np.repeat(np.isin(np.arange(len(plan.cuts) - 1), batches), np.diff(plan.cuts))
         scenes, buffer = plan.order[wanted], plan.buffer[wanted]
@@ -204,7 +203,7 @@ class SampleStream:
         starts = np.flatnonzero(np.diff(shards, prepend=-1))
         return [(int(shards[i]), some) for i, some in zip(starts, np.split(scenes, starts[1:]), strict=True)]
 
-    def _load(self, wanted: tuple[int, npt.NDArray[np.int64]]) -> dict[int, StoredScene]:
+    def _load(self, wanted: tuple[int, I64]) -> dict[int, StoredScene]:
         shard, scenes = wanted
         place, arrays = self._shards[shard]
         columns, bounds = load_shard(place, arrays)

@@ -9,23 +9,21 @@ the labels. What is left to search are mu and tau, and alpha where it is asked f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.evaluation.bootstrap import Estimate, resample_weights, summed
-from datagen.train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from datagen.train.evaluation.metrics import accuracy, balanced_accuracy, confusion
+from datagen.train.inputs import F32, F64, I64, Array, Bools
 from datagen.workers.labels.distance_visibility_score import effective_distance, heuristic, visibility_score
 
 Form = Literal["planar", "planar-over-reach", "mount-over-reach"]
 Objective = Literal["balanced", "accuracy"]
-F32 = npt.NDArray[np.float32]
-I64 = npt.NDArray[np.int64]
 
 FORMS: tuple[Form, ...] = get_args(Form)
 FOLDS = 5
@@ -49,7 +47,7 @@ class Trials:
     """N labelled candidates of S scenes, each with at least one."""
 
     scene: I64  # (N,) into `house`
-    house: npt.NDArray[Any]  # (S,) text
+    house: Array  # (S,) text
     distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
     arm_reach_m: F32  # (N,)
@@ -67,15 +65,8 @@ class Trials:
     def at(self, rows: Bools) -> Trials:
         """Some of the candidates (N,), with the scenes that they belong to."""
         scenes, scene = np.unique(self.scene[rows], return_inverse=True)
-        return Trials(
-            scene=scene,
-            house=self.house[scenes],
-            distance_m=self.distance_m[rows],
-            mount_distance_m=self.mount_distance_m[rows],
-            arm_reach_m=self.arm_reach_m[rows],
-            visibility=self.visibility[rows],
-            label=self.label[rows],
-        )
+        cut = {f.name: getattr(self, f.name)[rows] for f in fields(self)[2:]}
+        return Trials(scene, self.house[scenes], **cut)
 
     def said(self, params: HeuristicParams) -> Bools:
         """The rule's labels (N,), by the code of the label source."""

@@ -20,6 +20,12 @@ from datagen.schemas.errors import InputError
 
 A = TypeVar("A")  # np.ndarray or torch.Tensor
 Array = npt.NDArray[Any]
+Bools = npt.NDArray[np.bool_]
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.integer[Any]]
+U8 = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +87,6 @@ class Batch(Generic[A]):
 
     def __len__(self) -> int:
         return len(self.sample_id)
-
-
-def mount_distance_m(
-    clouds: Clouds[Array], robots: RobotInputs[Array], candidates: CandidateInputs[Array]
-) -> npt.NDArray[np.float64]:
-    """Distance (N,) from each candidate's arm mount (x, y, base height) to the target's centre."""
-    planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64), axis=1)
-    rise_m = clouds.target_height_m[robots.cloud_row] - robots.base_height_m.astype(np.float64)
-    return np.hypot(planar_m, rise_m[candidates.robot_row])
 
 
 def column(batch: Batch[Array], name: str) -> Array:

@@ -13,18 +13,11 @@ seen, nothing hides: neither the backs of other things, nor what is outside the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from datagen.train.inputs import Array, CandidateInputs, Clouds, RobotInputs
-
-F32 = npt.NDArray[np.float32]
-F64 = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.integer[Any]]
+from datagen.train.inputs import F32, F64, Array, Bools, CandidateInputs, Clouds, Ints, RobotInputs
 
 _CELLS = 16  # of a window, each way
 _TARGET_POINTS = 128  # that stand for the target's observed side

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.shard_reading import ShardPlace, StoredArray
+from datagen.train.inputs import I64, Array
 from datagen.train.run_parts import open_parts
 
-Array = npt.NDArray[Any]
 Columns = dict[str, Array]
 
 SCENE_FIELDS = ("points_m", "rgb", "target_mask", "n_points", "target_center_m")
@@ -79,7 +77,7 @@ class SampleReader:
             yield {"scene_row": scene_row, **{name: native(columns[name]) for name in self._fields}}
 
 
-def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Columns, npt.NDArray[np.int64]]:
+def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Columns, I64]:
     """A shard's columns, and the bounds (scenes + 1,) of each scene's samples, which lie together.
 
     `arrays` must include JOIN_FIELDS. InputError where the samples do not follow their scenes.

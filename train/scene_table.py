@@ -10,13 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
+from datagen.train.inputs import I64, Ints
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
 from datagen.train.run_parts import RunPart, refuse_twins
-
-I64 = npt.NDArray[np.int64]
 
 TABLE_FIELDS = (
     *JOIN_FIELDS,
@@ -117,7 +115,7 @@ def read_scene_table(
     )
 
 
-def _taken(robot_index: npt.NDArray[np.integer], per_robot: int | None) -> int:
+def _taken(robot_index: Ints, per_robot: int | None) -> int:
     if per_robot is None:
         return len(robot_index)
     _, counts = np.unique(robot_index, return_counts=True)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, is_clear
+from datagen.train.inputs import F64, Array, Batch, is_clear
 
 if TYPE_CHECKING:
     from datagen.train.models import Model
@@ -28,7 +27,7 @@ class Scorer(Protocol):
     @property
     def threshold(self) -> float: ...
 
-    def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
+    def score(self, batch: Batch[Array]) -> F64:
         """Scores (N,) of a batch's candidates; higher is better."""
         ...
 
@@ -46,7 +45,7 @@ class ModelScorer:
     threshold: float = 0.5
     only_clear: bool = False
 
-    def score(self, batch: Batch[Array]) -> npt.NDArray[np.float64]:
+    def score(self, batch: Batch[Array]) -> F64:
         """Probabilities (N,); the model itself goes through its candidates in parts that memory allows.
 
         InputError where it has to know what is clear and the batch was read without `base_is_clear`.
@@ -68,7 +67,7 @@ class ModelScorer:
         return np.where(is_clear(batch) | np.isnan(chance), chance, 0.0) if self.only_clear else chance
 
 
-def scored(scorer: Scorer, batch: Batch[Array]) -> npt.NDArray[np.float64]:
+def scored(scorer: Scorer, batch: Batch[Array]) -> F64:
     """Scores (N,) of a batch. InputError names a sample whose score is missing or not a finite number."""
     score = np.asarray(scorer.score(batch), np.float64)
     if score.shape != (len(batch),) or not np.isfinite(score).all():

@@ -17,8 +17,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.train.augment import Augmentation, ColourJitter, PointDropout, Rotation, SensorNoise
+from datagen.train.baselines.baseline import mount_m
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import Array, Batch, mount_distance_m
+from datagen.train.inputs import Array, Batch
 from tests.train.stream_runs import HOUSES, ROBOT_FIELDS, make_stream_run, stream_rows
 
 N, SCENES, SHARDS = 113, 19, 7
@@ -119,7 +120,7 @@ def test_frames_of_a_real_run_are_those_that_a_batch_names(heuristic_run: Path):
     )
     (before,), (after,) = plain.epoch(0), noisy.epoch(0)
     assert len(before.robots) == 4 * len(before.clouds) == 48
-    distance_m = mount_distance_m(before.clouds, before.robots, before.candidates)
+    distance_m = mount_m(before)
     np.testing.assert_allclose(distance_m, before.extra["mount_distance_m"], atol=1e-5)
     for row, n in enumerate(before.clouds.n_points):
         T = before.extra["T_world_camera"][row]

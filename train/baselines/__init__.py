@@ -7,14 +7,12 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.specification import HeuristicParams
-from datagen.train.baselines.analytic import Analytic
 from datagen.train.baselines.baseline import FIELDS, Baseline
-from datagen.train.baselines.detection import ThresholdDetector, ViewDetector
+from datagen.train.baselines.detection import ThresholdDetector
 from datagen.train.baselines.detector import ZeroShotDetector
 from datagen.train.baselines.distance import DistanceBand
-from datagen.train.baselines.proximity import Proximity
+from datagen.train.baselines.rules import Analytic, Proximity, Threshold
 from datagen.train.baselines.scalars import Scalars
-from datagen.train.baselines.threshold import Threshold
 from datagen.train.inputs import Array, Batch
 
 # By the name on the command line. `threshold-detector` uses estimated visibility without --detector.
@@ -45,7 +43,7 @@ def make_baselines(
     made: list[Baseline] = []
     for name in names:
         if name == "threshold-detector" and detector is not None:
-            made.append(ThresholdDetector(ViewDetector(ZeroShotDetector(detector)), threshold=0.1))
+            made.append(ThresholdDetector(ZeroShotDetector(detector), threshold=0.1))
         elif name == "analytic" and heuristic is not None:
             made.append(Analytic(heuristic))
         elif name == "scalars":

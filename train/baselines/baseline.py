@@ -7,15 +7,11 @@ from typing import Any, Protocol, Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import Array, Batch, is_clear, mount_distance_m
+from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
 from datagen.train.observed_visibility import observed_visibility
 from datagen.train.scorers import Scorer
-
-F64 = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 # Further columns of a batch that baselines need.
 FIELDS = ("base_is_clear", "base_clearance_m", "object_name")
@@ -61,8 +57,10 @@ def planar_distance_m(batch: Batch[Array]) -> F64:
 
 
 def mount_m(batch: Batch[Array]) -> F64:
-    """Distance (N,) from each arm's mount to the target's centre (m)."""
-    return mount_distance_m(batch.clouds, batch.robots, batch.candidates)
+    """Distance (N,) from each candidate's arm mount (x, y, base height) to the target's centre (m)."""
+    robots = batch.robots
+    rise_m = batch.clouds.target_height_m[robots.cloud_row] - robots.base_height_m.astype(np.float64)
+    return np.hypot(planar_distance_m(batch), rise_m[batch.candidates.robot_row])
 
 
 def reach_m(batch: Batch[Array]) -> F64:

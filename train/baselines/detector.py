@@ -5,23 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any
 
 from datagen.schemas.errors import InputError
+from datagen.train.inputs import F64, U8
 from datagen.workers.extras import how_to_get
-
-U8 = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
     """K boxes of one image."""
 
-    boxes_px: npt.NDArray[np.float64]  # (K, 4) left, top, right, bottom
-    scores: npt.NDArray[np.float64]  # (K,) in [0, 1]
+    boxes_px: F64  # (K, 4) left, top, right, bottom
+    scores: F64  # (K,) in [0, 1]
 
     def best_at_middle(self, shape: Sequence[int]) -> float:
         """The highest score of the boxes around the centre of an image (H, W), or 0."""
@@ -29,14 +25,6 @@ class Detections:
         left, top, right, bottom = self.boxes_px.reshape(-1, 4).T
         holds = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
         return float(self.scores[holds].max(initial=0.0))
-
-
-class Detector(Protocol):
-    """Detects objects named by a text."""
-
-    def detect(self, frames: U8, label: str) -> list[Detections]:
-        """Detections in each of the frames (B, H, W, 3)."""
-        ...
 
 
 class ZeroShotDetector:

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from datagen.train.baselines.baseline import (
-    F64,
-    RULED_OUT,
-    Bools,
-    labels,
-    mount_m,
-    planar_distance_m,
-    reach_m,
-)
-from datagen.train.inputs import Array, Batch, is_clear
+from datagen.train.baselines.baseline import RULED_OUT, labels, mount_m, planar_distance_m, reach_m
+from datagen.train.inputs import F64, Array, Batch, Bools, is_clear
 
 Kind = Literal["planar", "planar-over-reach", "mount-over-reach"]
-KINDS: tuple[Kind, ...] = ("planar", "planar-over-reach", "mount-over-reach")
+KINDS: tuple[Kind, ...] = get_args(Kind)
 _EDGES = 101
 
 
@@ -35,9 +27,8 @@ class DistanceBand:
     kind: Kind = "planar"
     low: float = float("nan")
     high: float = float("nan")
-
-    name: str = field(default="distance", init=False)
-    threshold: float = field(default=0.0, init=False)
+    name = "distance"
+    threshold = 0.0
 
     @property
     def needs_fit(self) -> bool:
@@ -52,11 +43,10 @@ class DistanceBand:
         """The kind and band with the best balanced accuracy; edges are quantiles of d."""
         label = labels(batches, self.name)
         clear = np.concatenate([is_clear(b) for b in batches])
-        found: dict[Kind, tuple[float, float, float]] = {}
-        for kind in KINDS:
-            found[kind] = _best_band(np.concatenate([_distance(b, kind) for b in batches]), label, clear)
-        kind = max(KINDS, key=lambda kind: found[kind][0])
-        return replace(self, kind=kind, low=found[kind][1], high=found[kind][2])
+        distances = {kind: np.concatenate([_distance(b, kind) for b in batches]) for kind in KINDS}
+        bands = {kind: _best_band(d, label, clear) for kind, d in distances.items()}
+        kind = max(KINDS, key=lambda kind: bands[kind][0])
+        return replace(self, kind=kind, low=bands[kind][1], high=bands[kind][2])
 
     def state(self) -> dict[str, Any]:
         return {"kind": self.kind, "low": self.low, "high": self.high}

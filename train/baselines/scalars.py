@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from datagen.schemas.errors import InputError
-from datagen.train.baselines.baseline import F64, labels, mount_m, observed_rho, planar_distance_m, reach_m
-from datagen.train.inputs import Array, Batch, column, is_clear
+from datagen.train.baselines.baseline import labels, mount_m, observed_rho, planar_distance_m, reach_m
+from datagen.train.inputs import F64, Array, Batch, column, is_clear
 
 FEATURES = (
     *("distance_m", "mount_distance_m", "reach_m", "distance_over_reach", "mount_over_reach"),
@@ -31,9 +32,8 @@ class Scalars:
     seed: int = 0
     steps: int = 3000
     layers: tuple[Layer, ...] = ()  # the first takes the features as they are
-
-    name: str = field(default="scalars", init=False)
-    threshold: float = field(default=0.5, init=False)
+    name = "scalars"
+    threshold = 0.5
 
     @property
     def needs_fit(self) -> bool:
@@ -73,19 +73,11 @@ def features(batch: Batch[Array]) -> F64:
     cloud = batch.robots.cloud_row[robot]
     height_m = batch.clouds.target_height_m[cloud].astype(np.float64)
     planar, mount, reach = planar_distance_m(batch), mount_m(batch), reach_m(batch)
-    return np.column_stack(
-        [
-            *(planar, mount, reach, planar / reach, mount / reach),
-            height_m - batch.robots.base_height_m[robot],
-            batch.robots.camera_height_m[robot] - height_m,
-            *(
-                height_m,
-                batch.clouds.target_radius_m[cloud],
-                observed_rho(batch),
-                column(batch, "base_clearance_m"),
-            ),
-        ]
-    )
+    rise = height_m - batch.robots.base_height_m[robot]
+    camera_rise = batch.robots.camera_height_m[robot] - height_m
+    radius, clearance = batch.clouds.target_radius_m[cloud], column(batch, "base_clearance_m")
+    distances = (planar, mount, reach, planar / reach, mount / reach)
+    return np.column_stack([*distances, rise, camera_rise, height_m, radius, observed_rho(batch), clearance])
 
 
 def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]:
@@ -100,13 +92,9 @@ def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]
     draw = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        net = nn.Sequential(
-            nn.Linear(rows.shape[1], _WIDTH),
-            nn.ReLU(),
-            nn.Linear(_WIDTH, _WIDTH),
-            nn.ReLU(),
-            nn.Linear(_WIDTH, 1),
-        )
+        sizes = (rows.shape[1], _WIDTH, _WIDTH, 1)
+        first, second, last = (nn.Linear(*widths) for widths in pairwise(sizes))
+    net = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
     optimiser = torch.optim.AdamW(net.parameters(), lr=_RATE, weight_decay=_DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
@@ -116,7 +104,7 @@ def _fitted(rows: F64, label: Array, seed: int, steps: int) -> tuple[Layer, ...]
         loss.backward()
         optimiser.step()
         schedule.step()
-    linear = [m for m in net if isinstance(m, nn.Linear)]
+    linear = (first, second, last)
     layers = [(m.weight.detach().double().numpy(), m.bias.detach().double().numpy()) for m in linear]
     # The normalisation of features is folded into the first layer.
     weights = layers[0][0] / scale

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from datagen.train.evaluation.metrics import F64, Bools, Ints
+from datagen.train.inputs import F64, Bools, Ints
 
 LEVEL = 0.95
 _BLOCK = 64

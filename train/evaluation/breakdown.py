@@ -9,7 +9,8 @@ import numpy as np
 
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.train.evaluation.columns import Columns
-from datagen.train.evaluation.metrics import F64, Bools, accuracy, balanced_accuracy, confusion
+from datagen.train.evaluation.metrics import accuracy, balanced_accuracy, confusion
+from datagen.train.inputs import F64, Bools
 from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
 RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)

@@ -8,15 +8,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
-from datagen.train.evaluation.metrics import F64, Bools
-from datagen.train.inputs import Array, Batch
+from datagen.train.inputs import F32, F64, I64, U8, Array, Batch, Bools
 from datagen.train.scorers import Scorer, scored
 from datagen.workers.bases.candidate_sets import in_set
-
-F32 = npt.NDArray[np.float32]
 
 # Further columns of a batch that the evaluation needs.
 EXTRA = (
@@ -30,11 +26,11 @@ _EXAMPLE_POINTS = 1024
 class Columns:
     """N candidates of S scenes. `scene` and `robot` number both through all runs."""
 
-    scene: npt.NDArray[np.int64]  # (N,)
-    robot: npt.NDArray[np.int64]  # (N,)
+    scene: I64  # (N,)
+    robot: I64  # (N,)
     label: Bools  # (N,)
     is_clear: Bools  # (N,)
-    outcome: npt.NDArray[np.uint8]  # (N,) codes of OUTCOMES
+    outcome: U8  # (N,) codes of OUTCOMES
     base_xy_m: F32  # (N, 2), target frame
     distance_m: F32  # (N,)
     mount_distance_m: F32  # (N,)
@@ -44,7 +40,7 @@ class Columns:
     house: Array  # (S,) text
     target: Array  # (S,) text
     target_digest: Array  # (S,) text
-    run: npt.NDArray[np.int64]  # (S,) which of the places
+    run: I64  # (S,) which of the places
     is_grid: Bools  # (S,) whether all cells of a grid are there, for one robot
 
     def __len__(self) -> int:
@@ -95,7 +91,7 @@ class Example:
 
     scene: int
     points_m: F32  # (P, 3), target frame
-    rgb: npt.NDArray[np.uint8]  # (P, 3)
+    rgb: U8  # (P, 3)
     target_mask: Bools  # (P,)
 
 

@@ -31,7 +31,7 @@ from datagen.train.evaluation.comparisons import (
     said_of,
 )
 from datagen.train.evaluation.grids import picks, select
-from datagen.train.evaluation.metrics import F64, Bools
+from datagen.train.inputs import F64, Bools
 
 _CURVE_POINTS = 200
 # In order of the report, which has differences for each.

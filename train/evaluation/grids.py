@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from datagen.train.evaluation.metrics import F64, Bools, Ints, average_precision
+from datagen.train.evaluation.metrics import average_precision
+from datagen.train.inputs import F64, Bools, Ints
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:

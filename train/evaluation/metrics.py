@@ -6,14 +6,10 @@ A decision is 0 or 1, or 1/k for each of k candidates with the same best score.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Bools = npt.NDArray[np.bool_]
-F64 = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.integer[Any]]
+from datagen.train.inputs import F64, I64, Bools, Ints
 
 N_BINS = 10
 
@@ -103,7 +99,7 @@ def average_precision(true: Bools, score: F64) -> float:
 class Reliability:
     """Bins (K,) of predictions: count, mean prediction, observed rate."""
 
-    count: npt.NDArray[np.int64]
+    count: I64
     said: F64
     true: F64
 

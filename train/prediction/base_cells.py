@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from datagen.schemas.specification import CandidateParams
-from datagen.train.prediction.files import Bools
+from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.fusing import SeenPoints
 from datagen.train.prediction.ground import depth_error_m, floor_points
 from datagen.workers.bases.candidates import grid_offsets
 from datagen.workers.bases.clearance import STEP_M
-from datagen.workers.geometry.mesh import F32, F64
 
 CLEAR, BLOCKED, UNSEEN = STATES = ("clear", "blocked", "unseen")
 # Of the floor under a base, the share that must have been seen for nothing to stand there unseen.
@@ -43,7 +41,7 @@ class BaseCells:
     """N base positions around the target, with what stands there."""
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
-    state: npt.NDArray[np.int64]  # (N,), index into STATES
+    state: I64  # (N,), index into STATES
     floor_seen: F64  # (N,), share of the floor under the base that was seen
 
 
@@ -92,7 +90,7 @@ def facing_yaw(offset_m: F32) -> F64:
     return np.arctan2(-offset_m[:, 1].astype(np.float64), -offset_m[:, 0].astype(np.float64))
 
 
-def _counts(points_m: F32, base_xy: F64, radius_m: float) -> npt.NDArray[np.int64]:
+def _counts(points_m: F32, base_xy: F64, radius_m: float) -> I64:
     """Points (N, 3) within the radius of each base, seen from above."""
     if not len(points_m):
         return np.zeros(len(base_xy), np.int64)

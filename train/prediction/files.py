@@ -7,12 +7,11 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
-from datagen.workers.geometry.mesh import F32, F64, U8
+from datagen.train.inputs import F32, F64, U8, Bools
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.json_document import JsonNode, parse_json
 
@@ -26,8 +25,6 @@ _POSE_ROUNDING = 1e-3
 _EXTENT_M = 1000.0
 # Farther than this no depth camera measures; it is what saturated values look like.
 MAX_DEPTH_M = 20.0
-
-Bools = npt.NDArray[np.bool_]
 
 
 def read_rgb(path: Path) -> U8:

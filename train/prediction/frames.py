@@ -10,9 +10,9 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
+from datagen.train.inputs import F32, F64, I64, U8, Bools
 from datagen.train.prediction.files import (
     MAX_PIXELS,
-    Bools,
     checked_pose,
     read_depth,
     read_intrinsics,
@@ -23,7 +23,6 @@ from datagen.train.prediction.files import (
 )
 from datagen.train.prediction.npz import read_arrays
 from datagen.train.prediction.ply import read_ply
-from datagen.workers.geometry.mesh import F32, F64, U8
 
 DEPTH_SCALE_M = 0.001
 # Of a folder that holds one frame.
@@ -39,7 +38,7 @@ class Pinhole:
     cx_px: float
     cy_px: float
 
-    def points(self, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], depth_m: F32) -> F32:
+    def points(self, u: I64, v: I64, depth_m: F32) -> F32:
         """Points (N, 3) in the camera's frame, of pixels (N,) with their depths (N,)."""
         x, y = (u - self.cx_px) / self.fx_px, (v - self.cy_px) / self.fy_px
         return (np.stack([x, y, np.ones(len(u))], axis=1) * depth_m[:, None]).astype(np.float32)
@@ -59,7 +58,7 @@ class RgbdImage:
         """Share of pixels without depth."""
         return float((self.depth_m == 0).mean())
 
-    def points(self, pixels: npt.NDArray[np.int64], depth_m: F32 | None = None) -> F32:
+    def points(self, pixels: I64, depth_m: F32 | None = None) -> F32:
         """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.schemas.specification import ObservationParams
-from datagen.train.prediction.files import Bools
+from datagen.train.inputs import F32, F64, U8, Bools
 from datagen.train.prediction.frames import SensorFrame
-from datagen.workers.geometry.mesh import F32, F64, U8
 from datagen.workers.rendering.cloud import Cloud, stored_cloud
 
 VOXEL_M = 0.005

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.files import Bools
+from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.frames import SensorFrame
-from datagen.workers.geometry.mesh import F32, F64
 
 _SAMPLE = 20_000  # points that are looked at
 _MODES, _VOTERS = 200, 2500  # normals that are tried as the way up, and those that vote
@@ -161,7 +159,7 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
     return up, height_m, ", and ".join(doubts) or None
 
 
-def _normals(frame: SensorFrame, rows: npt.NDArray[np.int64]) -> F64:
+def _normals(frame: SensorFrame, rows: I64) -> F64:
     """Unit normals (N, 3), turned to the camera, at some of a frame's points, in its camera's frame."""
     if frame.image is not None:
         flat = np.flatnonzero(frame.image.depth_m.ravel() > 0)[rows]
@@ -193,11 +191,11 @@ def _way_up(normals: F64, rng: np.random.Generator) -> F64 | None:
     return up
 
 
-def _levels(points: F64, normals: F64, up: F64) -> list[npt.NDArray[np.int64]]:
+def _levels(points: F64, normals: F64, up: F64) -> list[I64]:
     """Rows of the points (N, 3) on each of the largest level surfaces: where level points gather."""
     level = np.flatnonzero(normals @ up > _LIES_LEVEL)
     z, error_m = points[level] @ up, depth_error_m(points[level, 2])
-    found, free = list[npt.NDArray[np.int64]](), np.ones(len(level), np.bool_)
+    found, free = list[I64](), np.ones(len(level), np.bool_)
     if not len(level):
         return found
     edges = np.arange(z.min() - _BIN_M, z.max() + 2 * _BIN_M, _BIN_M)
@@ -215,7 +213,7 @@ def _levels(points: F64, normals: F64, up: F64) -> list[npt.NDArray[np.int64]]:
     return found
 
 
-def _common_up(points: F64, levels: Sequence[npt.NDArray[np.int64]], up: F64) -> F64:
+def _common_up(points: F64, levels: Sequence[I64], up: F64) -> F64:
     """The normal (3,) that level surfaces share, by least squares over all, each at its own height."""
     turn = level_pose(up, 0.0)[:3, :3]
     rows, wanted = list[F64](), list[F64]()

@@ -6,14 +6,13 @@ import io
 import math
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
+from datagen.train.inputs import Array
 from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES, MAX_PIXELS
 
 NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
@@ -24,10 +23,10 @@ _FIX = (
 )
 
 
-def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+def read_arrays(path: Path) -> dict[str, Array]:
     """Those of `NAMES` that the archive holds. InputError for objects, bombs and what is no archive."""
     data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
-    found: dict[str, npt.NDArray[Any]] = {}
+    found: dict[str, Array] = {}
     try:
         # Every record of the zip's directory begins with these bytes; counted before a list is made of them.
         if data.count(b"PK\1\2") > _MAX_RECORDS:
@@ -47,7 +46,7 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     return found
 
 
-def _array(path: Path, name: str, data: bytes) -> npt.NDArray[Any]:
+def _array(path: Path, name: str, data: bytes) -> Array:
     """One array of numbers; its header is held against its bytes before anything of its size is made."""
     if len(data) > _MAX_ARRAY_BYTES:
         raise InputError(path, name, f"unpacks to more than {_MAX_ARRAY_BYTES:,} bytes", _FIX)

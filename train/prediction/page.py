@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import plotly.graph_objects as go
 
 from datagen.schemas.specification import CandidateParams
 from datagen.schemas.styles import BEST, SCORE_COLOURS, TARGET
 from datagen.train.html_page import html_facts, html_figure, html_page
+from datagen.train.inputs import I64
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.pictures import shown_rows
 from datagen.train.prediction.predict import Prediction
@@ -49,7 +49,7 @@ def page_of(prediction: Prediction) -> str:
     )
 
 
-def _cloud(prediction: Prediction, rows: npt.NDArray[np.int64]) -> go.Scatter3d:
+def _cloud(prediction: Prediction, rows: I64) -> go.Scatter3d:
     points, rgb = prediction.seen.points_m[rows], prediction.seen.rgb[rows].copy()
     rgb[prediction.seen.on_target[rows]] = _TARGET_RGB
     colours = [f"rgb({r},{g},{b})" for r, g, b in rgb.tolist()]

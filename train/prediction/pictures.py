@@ -16,10 +16,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from datagen.schemas.specification import CandidateParams
 from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
+from datagen.train.inputs import F64
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNSEEN
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
-from datagen.workers.geometry.mesh import F64
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
 _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
-from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES, Bools
-from datagen.workers.geometry.mesh import F32, U8
+from datagen.train.inputs import F32, F64, U8, Bools
+from datagen.train.prediction.files import FILE_FIX, MAX_FILE_BYTES
 
 MAX_POINTS = 20_000_000
 _MAX_ASCII_POINTS = 2_000_000  # parsed as text they take a hundred times their memory
@@ -131,7 +131,7 @@ def _ascii(path: Path, body: memoryview, count: int, properties: list[tuple[str,
     return {name: _as_declared(table[:, k], kind) for k, (name, kind) in enumerate(properties)}
 
 
-def _as_declared(values: npt.NDArray[np.float64], kind: str) -> npt.NDArray[np.generic]:
+def _as_declared(values: F64, kind: str) -> npt.NDArray[np.generic]:
     """Bytes where the header says so: whether a colour of 1 is black or full depends on it."""
     return np.clip(np.nan_to_num(values), 0, 255).astype(np.uint8) if kind == "u1" else values
 

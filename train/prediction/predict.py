@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
-from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.inputs import F64, I64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.base_cells import (
     BLOCKED,
     CLEAR,
@@ -29,7 +28,6 @@ from datagen.train.prediction.ground import Ground, find_ground
 from datagen.train.prediction.region_growing import grow_mask
 from datagen.train.prediction.target import Filled, TargetBox, fill_target, locate
 from datagen.train.scorers import ModelScorer, Scorer, scored
-from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
 
@@ -79,7 +77,7 @@ class Prediction:
         """The same in the first frame's camera."""
         return inverse(self.grounds[0].T_world_camera) @ self.T_world_base(row)
 
-    def rows(self, state: str) -> npt.NDArray[np.int64]:
+    def rows(self, state: str) -> I64:
         """The places of one state, best first."""
         rows = np.flatnonzero(self.places.state == STATES.index(state))
         return rows[np.argsort(-self.score[rows], kind="stable")]

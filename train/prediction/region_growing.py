@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.files import Bools
+from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.frames import RgbdImage
 from datagen.train.prediction.ground import depth_error_m
 from datagen.train.prediction.target import from_nearest
-from datagen.workers.geometry.mesh import F32, F64
 
 _GROWS_M = 0.24  # from the clicked point
 # Growth that comes so near to that distance has run out over a surface.
@@ -78,7 +76,7 @@ def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
     return height_m + 0.004 + 3 * 1.48 * float(np.median(near))
 
 
-def _pieces(mask: Bools) -> npt.NDArray[np.int64]:
+def _pieces(mask: Bools) -> I64:
     """Number (H, W) of the connected piece that each pixel belongs to, 0 outside."""
     labels = np.zeros(mask.shape, np.int64)
     ndimage.label(mask, output=labels)

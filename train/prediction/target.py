@@ -8,9 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.files import Bools
+from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.frames import SensorFrame
-from datagen.workers.geometry.mesh import F32, F64
 
 # Nothing that a gripper takes is wider: points farther from the middle of a target belong to other things.
 _LARGEST_M = 0.30

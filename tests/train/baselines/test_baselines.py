@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import HeuristicParams
 from datagen.train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
-from datagen.train.baselines.analytic import Analytic
 from datagen.train.baselines.baseline import best_cut, is_feasible, observed_rho, planar_distance_m
 from datagen.train.baselines.detection import ThresholdDetector, spoken_name
 from datagen.train.baselines.distance import DistanceBand
-from datagen.train.baselines.proximity import Proximity
+from datagen.train.baselines.rules import Analytic, Proximity
 from datagen.train.baselines.scalars import FEATURES, Scalars, features
 from datagen.train.dataset import SampleStream
 from datagen.train.inputs import is_clear

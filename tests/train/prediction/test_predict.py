@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from datagen.schemas.specification import CandidateParams
-from datagen.train.baselines.analytic import Analytic
+from datagen.train.baselines.rules import Analytic
 from datagen.train.inputs import Array, Batch
 from datagen.train.prediction import RobotSize, load_scorer, predict, read_place
 from datagen.train.prediction.base_cells import STATES
