@@ -1,13 +1,13 @@
 """Estimate rho from the observed cloud: a small z-buffer from each candidate's camera.
 
-The window is that of the true rho (`workers/rendering/visibility.py`): it looks at the target's centre and
-touches its bounding sphere. Points are few (of a table about one every 3 cm), so each stands for a disc in
-the tangent plane of its neighbours, as large as they are far (surface splatting, Zwicker et al. 2001): a
-table seen at a grazing angle stays thin, and does not hide what stands on it.
+The window is that of the true rho (`workers/rendering/visibility.py`): it is centred on the target and
+touches its bounding sphere. Points are sparse (on a table about one every 3 cm), so each is a disc in the
+tangent plane of its neighbours, as large as they are far (surface splatting, Zwicker et al. 2001): a table
+seen at a grazing angle stays thin and does not hide the objects on it.
 
-The target's unobserved back is its observed points taken a second time, turned by half a turn about the
-vertical axis through its centre; exact for boxes and for all that is turned on a lathe. Where no point was
-seen, nothing hides: neither the backs of other things, nor what is outside the cloud.
+The target's unobserved back is a copy of its observed points, rotated by 180 degrees about the vertical axis
+through its centre; exact for boxes and solids of revolution. Unobserved surfaces hide nothing: neither the
+backs of other objects, nor objects outside the cloud.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ from scipy.spatial import KDTree
 from datagen.train.inputs import F32, F64, Array, Bools, CandidateInputs, Clouds, Ints, RobotInputs
 
 _CELLS = 16  # of a window, each way
-_TARGET_POINTS = 128  # that stand for the target's observed side
+_TARGET_POINTS = 128  # of the target's observed side
 # A disc reaches about half as far as the eighth neighbour, so that discs just close a surface.
 _NEIGHBOURS = 8
 _DISC_SHARE = 0.55
 _LARGEST_DISC_M = 0.06
 _MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
-_NEAREST_M = 0.02  # to an eye; points before it are the robot's own
-_PARTY = 32  # eyes that look at the target from about one side are dealt with together
-_AT_ONCE = 1 << 13  # pairs of eye and point: bounds memory, and stays in the cache
+_NEAREST_M = 0.02  # to an eye; nearer points are the robot's own
+_AT_ONCE = 1 << 16  # pairs of eye and point: bounds memory, and stays in the cache
 
 
 def observed_visibility(
@@ -38,15 +37,22 @@ def observed_visibility(
 
     0 where no point of the target was observed, and where the camera is inside the target's sphere.
     """
-    rho = np.zeros(len(candidates))
-    cloud_row = robots.cloud_row[candidates.robot_row]
-    eyes_m = eyes(clouds, robots, candidates)
+    valid = np.arange(clouds.points_m.shape[1]) < clouds.n_points[:, None]
+    cloud_row, eyes_m = robots.cloud_row[candidates.robot_row], eyes(clouds, robots, candidates)
+    return visible_shares(
+        clouds.points_m, clouds.target_mask, valid, clouds.target_radius_m, cloud_row, eyes_m
+    )
+
+
+def visible_shares(
+    points_m: F32, target_mask: Bools, valid: Bools, radius_m: F32, cloud_row: Ints, eyes_m: F32
+) -> F64:
+    """`visible_share` (N,) from eyes (N, 3) on the clouds (S, P, 3) that `cloud_row` (N,) names."""
+    rho = np.zeros(len(eyes_m))
     for row in np.unique(cloud_row):
-        n = int(clouds.n_points[row])
-        points_m, mask = clouds.points_m[row, :n], clouds.target_mask[row, :n]
         rows = np.flatnonzero(cloud_row == row)
-        radius_m = float(clouds.target_radius_m[row])
-        rho[rows] = visible_share(points_m[~mask], points_m[mask], radius_m, eyes_m[rows])
+        cloud_m, mask = points_m[row][valid[row]], target_mask[row][valid[row]]
+        rho[rows] = visible_share(cloud_m[~mask], cloud_m[mask], float(radius_m[row]), eyes_m[rows])
     return rho
 
 
@@ -58,10 +64,10 @@ def eyes(clouds: Clouds[Array], robots: RobotInputs[Array], candidates: Candidat
 
 
 def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) -> F64:
-    """Share (N,) of the target's cells, seen from each eye (N, 3), before which nothing else lies.
+    """Share (N,) of the target's cells that nothing hides, seen from each eye (N, 3).
 
-    Points of other things (M, 3) and of the target (T, 3), the latter in an order of which any prefix
-    covers it, and eyes, all in the target's frame. `radius_m` is that of the sphere that holds the target.
+    Points of other objects (M, 3) and of the target (T, 3), the latter in farthest-point order, and eyes are
+    in the target's frame. `radius_m` is the radius of the target's bounding sphere.
     """
     share = np.zeros(len(eyes_m))
     finite = np.isfinite(target_m).all(1)
@@ -81,48 +87,26 @@ def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) ->
 
 
 def _hidden(views: Views, others_m: F32, front_m: F32) -> Bools:
-    """In which cells (N, cells, cells) something lies clearly before what is there at `front_m`."""
+    """Cells (N, cells, cells) in which something is clearly nearer to the eye than `front_m`."""
     hidden = np.zeros(front_m.size, np.bool_)
     limit_m = np.where(front_m > -np.inf, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
     nearest_m = limit_m.min((1, 2))
-    parties = [rows for rows in _parties(views.towards) if np.isfinite(nearest_m[rows]).any()]
-    beside = [views.beside(others_m, rows, _LARGEST_DISC_M) for rows in parties]
-    asked = np.zeros(len(others_m), np.bool_)
-    for rows, points in zip(parties, beside, strict=True):
-        _, point = views.before(others_m[points], _LARGEST_DISC_M, rows, nearest_m[rows])
-        asked[points[point]] = True
-    discs, disc_of = fit_discs(others_m, asked), np.cumsum(asked) - 1
-    pairs, n_pairs = list[tuple[Ints, Ints]](), 0
-    for rows, points in zip(parties, beside, strict=True):
-        near = disc_of[points[asked[points]]] if len(discs) else np.zeros(0, np.int64)
-        eye, disc = views.before(discs.centre_m[near], discs.radius_m[near], rows, nearest_m[rows])
-        pairs.append((rows[eye], near[disc]))
-        n_pairs += len(eye)
-        if n_pairs >= _AT_ONCE or rows is parties[-1]:
-            eye, disc = (np.concatenate(part) for part in zip(*pairs, strict=True))
-            for k in range(0, n_pairs, _AT_ONCE):
-                views.hide(discs, eye[k : k + _AT_ONCE], disc[k : k + _AT_ONCE], limit_m.reshape(-1), hidden)
-            pairs, n_pairs = [], 0
+    step = max(1, _AT_ONCE // max(len(others_m), 1))
+    parts = [slice(start, start + step) for start in range(0, len(front_m), step)]
+    largest = Discs(others_m, others_m, np.full(len(others_m), _LARGEST_DISC_M, np.float32))
+    asked = np.zeros(len(others_m), np.bool_)  # whose disc could be before a target
+    for rows in parts:
+        asked[views.before(largest, rows, nearest_m[rows])[1]] = True
+    discs = fit_discs(others_m, asked)
+    for rows in parts:
+        eye, disc = views.before(discs, rows, nearest_m[rows])
+        views.hide(discs, rows.start + eye, disc, limit_m.reshape(-1), hidden)
     return hidden.reshape(front_m.shape)
-
-
-def _parties(towards: F32) -> list[Ints]:
-    """Rows of directions (N, 3), split at the middle of their widest axis until each party is small."""
-    parties, open_ = list[Ints](), [np.arange(len(towards))]
-    while open_:
-        rows = open_.pop()
-        if len(rows) <= _PARTY:
-            parties.append(rows)
-            continue
-        some = towards[rows]
-        order = rows[np.argsort(some[:, int(np.ptp(some, axis=0).argmax())], kind="stable")]
-        open_ += [order[: len(order) // 2], order[len(order) // 2 :]]
-    return parties
 
 
 @dataclass(frozen=True, eq=False)
 class Discs:
-    """Small pieces of surface around points: where, which way, how large."""
+    """Small pieces of surface around points."""
 
     centre_m: F32  # (M, 3)
     normal: F32  # (M, 3)
@@ -134,7 +118,7 @@ class Discs:
 
 def fit_discs(points_m: F32, asked: Bools) -> Discs:
     """A disc for each asked point (M,), in the plane of its neighbours and as large as they are far."""
-    if len(points_m) <= _NEIGHBOURS or not asked.any():  # too few to tell a surface
+    if len(points_m) <= _NEIGHBOURS or not asked.any():  # too few for a surface
         return Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
     centre_m = points_m[asked]
     distance_m, row = KDTree(points_m).query(centre_m, _NEIGHBOURS + 1)
@@ -161,38 +145,21 @@ class Views:
         self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), of the window at the target's centre
         self.per_depth = 2 / _CELLS * self.half_m / self.distance_m  # (N,), of a cell's width, by depth
 
-    def beside(self, points_m: F32, rows: Ints, slack_m: float) -> Ints:
-        """Points that may lie between the target and any of some eyes, or within slack_m of that; or more.
-
-        All lie in a cone around the eyes' common direction, widened by how wide a window's pyramid gets.
+    def before(self, discs: Discs, rows: slice, nearest_m: F32) -> tuple[Ints, Ints]:
+        """Pairs of eye (an index into `rows`) and disc where the disc reaches into the cone around the eye's
+        window, nearer to the eye than nearest_m (len(rows),).
         """
-        middle = self.towards[rows].mean(0)
-        middle /= max(float(np.linalg.norm(middle)), 1e-6)
-        spread = float(np.arccos(np.clip(self.towards[rows] @ middle, -1, 1).min()))
-        behind_m = float(self.half_m[rows].max()) + _MARGIN_M + slack_m
-        slope = np.sqrt(2) * self.half_m[rows] / self.distance_m[rows]
-        wide_m = float((slope * (self.distance_m[rows] + behind_m)).max()) + slack_m
-        far_m = np.sqrt(np.einsum("ij,ij->i", points_m, points_m))
-        close = far_m <= np.hypot(wide_m, behind_m)
-        angle = spread + np.arcsin(np.minimum(wide_m / np.maximum(far_m, 1e-6), 1)) + 1e-3
-        return np.flatnonzero(close | (points_m @ middle >= far_m * np.cos(np.minimum(angle, np.pi))))
-
-    def before(self, points_m: F32, slack_m: F32 | float, rows: Ints, nearest_m: F32) -> tuple[Ints, Ints]:
-        """Pairs of eye (an index into `rows`) and point that lies in the cone around the eye's window, or
-        within its slack_m (M,) of it, nearer to the eye than nearest_m (len(rows),).
-        """
-        along_m = self.towards[rows] @ points_m.T
+        along_m = self.towards[rows] @ discs.centre_m.T
         ahead_m = self.distance_m[rows, None] - along_m
         slope = np.sqrt(2.0, dtype=np.float32) * self.half_m[rows] / self.distance_m[rows]
-        limit_m = slope[:, None] * ahead_m + slack_m
-        inside = np.einsum("ij,ij->i", points_m, points_m) - along_m * along_m <= limit_m * limit_m
-        inside &= ahead_m > _NEAREST_M
-        inside &= along_m + slack_m > nearest_m[:, None]
-        eye, point = np.nonzero(inside)
-        return eye, point
+        limit_m = slope[:, None] * ahead_m + discs.radius_m
+        inside = np.einsum("ij,ij->i", discs.centre_m, discs.centre_m) - along_m**2 <= limit_m**2
+        inside &= (ahead_m > _NEAREST_M) & (along_m + discs.radius_m > nearest_m[:, None])
+        eye, disc = np.nonzero(inside)
+        return eye, disc
 
     def nearest_m(self, points_m: F32) -> F32:
-        """How far towards the eye the nearest point of each cell (N, cells, cells) is, or -inf."""
+        """Depth towards the eye of the nearest point of each cell (N, cells, cells), or -inf."""
         depths = np.full((len(self.distance_m), _CELLS, _CELLS), -np.inf, np.float32)
         step = max(1, _AT_ONCE // max(len(points_m), 1))
         for start in range(0, len(depths), step):
@@ -211,8 +178,8 @@ class Views:
     def hide(self, discs: Discs, eye: Ints, disc: Ints, limit_m: F32, hidden: Bools) -> None:
         """Set the cells of `hidden` (N * cells * cells,) in which a pair's disc is nearer than limit_m.
 
-        A disc is seen as an ellipse: in each row of cells it covers those from one root of a quadratic
-        equation to the other. One seen from its edge is one cell thick.
+        A disc projects to an ellipse: in each row of cells it covers those between the roots of a quadratic
+        equation. Edge-on it is one cell thick.
         """
         centre_m, towards = discs.centre_m[disc], self.towards[eye]
         along_m = np.einsum("ij,ij->i", centre_m, towards)
@@ -262,17 +229,17 @@ def _spread(low: Ints, high: Ints) -> tuple[Ints, Ints]:
 
 
 def closed(depths_m: F32) -> F32:
-    """Gaps between points filled from the cells beside them; the outline does not grow."""
+    """Depths with the gaps between points filled from adjacent cells; the outline does not grow."""
     padded = np.pad(depths_m, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     grown = np.maximum.reduce([padded[:, 1:-1, 1:-1], *_beside(padded)])
-    # Cells outside the window hold back nothing: the target may touch its border.
+    # Cells outside the window count as full: the target may touch its border.
     full = np.pad(grown > -np.inf, ((0, 0), (1, 1), (1, 1)), constant_values=True)
     inside = np.logical_and.reduce([full[:, 1:-1, 1:-1], *_beside(full)])
     return np.where((depths_m > -np.inf) | inside, grown, -np.inf).astype(np.float32)
 
 
 def majority(hidden: Bools, on_target: Bools) -> Bools:
-    """Hidden where most of the target's cells around a cell are: holes between points close, specks go."""
+    """Majority filter over the target's cells (3 x 3): closes holes between points, removes specks."""
     counts: list[Array] = []
     for cells in (hidden, on_target):
         padded = np.pad(cells.astype(np.int8), ((0, 0), (1, 1), (1, 1)))

@@ -30,16 +30,6 @@ class Crop:
     valid: Tensor  # (R, K) bool
     target_rise_m: Tensor  # (R,) float32, of the target's centre above the mount
 
-    def take(self, robot_row: Tensor) -> Crop:
-        """The crops of the given robots."""
-        return Crop(
-            self.points_m[robot_row],
-            self.rgb[robot_row],
-            self.target_mask[robot_row],
-            self.valid[robot_row],
-            self.target_rise_m[robot_row],
-        )
-
 
 def crop_clouds(clouds: Clouds[Tensor], robots: RobotInputs[Tensor], n_points: int) -> Crop:
     """The first `n_points` stored points of each robot's cloud within `arm_reach_m` of the target, in 3D.

@@ -5,7 +5,7 @@ Axes: x from the base to the target, y left, z up; origin at the target's centre
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -30,10 +30,6 @@ class Frames:
     camera_rise_m: Tensor  # (...) of the camera above the target's centre
     arm_reach_m: Tensor  # (...)
     target_radius_m: Tensor  # (...)
-
-    def take(self, rows: Tensor) -> Frames:
-        """Those of the given rows."""
-        return Frames(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def steering(self) -> Tensor:
         """(..., 4): the frame's axis, and the axis of twice its angle."""

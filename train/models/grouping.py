@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
 
 
 def first_true(mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -54,3 +59,9 @@ def gather_rows(values: Tensor, rows: Tensor) -> Tensor:
     """Rows (B, ...) of values (B, M, F), as (B, ..., F)."""
     flat = rows.flatten(1)
     return values.gather(1, flat[..., None].expand(-1, -1, values.shape[2])).unflatten(1, rows.shape[1:])
+
+
+def take_rows(table: T, rows: Tensor) -> T:
+    """A dataclass of tensors, or of such dataclasses, with these rows of each tensor."""
+    values: list[Any] = [getattr(table, f.name) for f in fields(table)]  # type: ignore[arg-type]
+    return type(table)(*(take_rows(v, rows) if is_dataclass(v) else v[rows] for v in values))

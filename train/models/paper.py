@@ -19,7 +19,7 @@ Ours, where the paper is silent:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -29,8 +29,7 @@ from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import Crop, crop_clouds
-from datagen.train.models.grouping import ball_query, farthest_points, gather_rows
-from datagen.train.models.layers import PointMlp, empty_logits
+from datagen.train.models.grouping import ball_query, farthest_points, gather_rows, take_rows
 from datagen.train.models.model import Model, ModelConfig, read_config
 
 CANDIDATE_POINTS = 50
@@ -66,10 +65,30 @@ class _Groups:
     near_found: Tensor  # (R, J1 - 1)
     wide: Tensor  # (R, J2 - 1, k2) rows of `first` around the first J2 - 1 of them
 
-    def take(self, robot_row: Tensor) -> _Groups:
-        """Those of the given robots."""
-        tensors = (self.first, self.first_valid, self.near, self.near_found, self.wide)
-        return _Groups(self.crop.take(robot_row), *(t[robot_row] for t in tensors))
+
+class PointMlp(nn.Module):
+    """The same linear layers with BatchNorm and ReLU for every row (..., F) -> (..., widths[-1])."""
+
+    def __init__(self, width_in: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for width in widths:
+            # BatchNorm has a bias of its own.
+            layers += [nn.Linear(width_in, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
+            width_in = width
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Features of rows."""
+        flat = rows.flatten(0, -2)
+        alone = self.training and len(flat) == 1
+        if alone:
+            # One row has no spread to be normalised by: what was seen before serves.
+            self.layers.eval()
+        features = self.layers(flat)
+        if alone:
+            self.layers.train()
+        return features.unflatten(0, rows.shape[:-1])
 
 
 class PaperModel(Model):
@@ -101,12 +120,12 @@ class PaperModel(Model):
     ) -> Tensor:
         """Logits (N, 2)."""
         if not len(candidates):
-            return empty_logits(candidates.base_xy_m)
+            return candidates.base_xy_m.new_zeros((0, 2))
         with torch.no_grad():
             groups = self._group(crop_clouds(clouds, robots, self.sizes.n_points))
         chunk = len(candidates) if self.training else _CHUNK
         logits = [
-            self._score(groups.take(candidates.robot_row[rows]), candidates.base_xy_m[rows])
+            self._score(take_rows(groups, candidates.robot_row[rows]), candidates.base_xy_m[rows])
             for rows in _slices(len(candidates), chunk)
         ]
         return torch.cat(logits).float()

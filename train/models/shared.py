@@ -19,7 +19,7 @@ The computation is the same in training and in evaluation (LayerNorm, no BatchNo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -37,9 +37,8 @@ from datagen.train.models.frames import (
     pair_features,
     target_features,
 )
-from datagen.train.models.layers import empty_logits, mlp
+from datagen.train.models.grouping import take_rows
 from datagen.train.models.model import Model, ModelConfig, read_config
-from datagen.train.models.tiles import tiles
 from datagen.train.models.tokens import (
     N_KINDS,
     TARGET_NUMBERS,
@@ -50,7 +49,7 @@ from datagen.train.models.tokens import (
     token_sizes,
     tokens_of,
 )
-from datagen.train.observed_visibility import visible_share
+from datagen.train.observed_visibility import visible_shares
 
 # Candidates that are worked on together: their tokens stay in a core's cache. A GPU wants more at once.
 _TILE_CPU, _TILE_CUDA = 64, 4096
@@ -86,6 +85,15 @@ class SharedConfig(ModelConfig):
     camera: Literal["given", "unknown"] = "given"
     observed_visibility: bool = False
     mirrored: bool = True
+
+
+def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:
+    """Linear layers with LayerNorm and ReLU between them; the last one is linear alone."""
+    layers: list[nn.Module] = []
+    for width in widths:
+        layers += [nn.Linear(width_in, width), nn.LayerNorm(width), nn.ReLU()]
+        width_in = width
+    return nn.Sequential(*layers, nn.Linear(width_in, width_out))
 
 
 class SharedModel(Model):
@@ -133,7 +141,7 @@ class SharedModel(Model):
     ) -> Tensor:
         """Logits (N, 2)."""
         if not len(candidates):
-            return empty_logits(candidates.base_xy_m)
+            return candidates.base_xy_m.new_zeros((0, 2))
         return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
@@ -156,7 +164,7 @@ class SharedModel(Model):
             parts = [frames.scalars(), target]
             if self.sizes.observed_visibility:
                 crop = crop_clouds(clouds, robots, _VISIBILITY_POINTS)
-                parts.append(_visibility(frames, crop, candidates))
+                parts.append(_visibility(frames, tokens, crop, candidates))
             scalars = torch.cat(parts, dim=1)
         same, left = self._steered(tokens)
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
@@ -165,7 +173,7 @@ class SharedModel(Model):
             self._pool(
                 same[robot],
                 left[robot],
-                frames.take(rows),
+                take_rows(frames, rows),
                 condition[rows],
                 condition_left[rows],
                 tokens.centres_m[robot],
@@ -247,24 +255,37 @@ class SharedModel(Model):
         return torch.cat(parts, dim=2)
 
 
+def tiles(robot_row: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
+    """Robots (r,) and rows (r, c) of candidates of each, r c <= size; together they hold every row once.
+
+    `robot_row` (N,) names the candidates' robots. What a robot has is cut into pieces of at most `size`,
+    and pieces of equal length lie together, so that nothing is padded.
+    """
+    order = torch.argsort(robot_row, stable=True)
+    robots, counts = torch.unique_consecutive(robot_row[order], return_counts=True)
+    pieces: dict[int, list[tuple[int, Tensor]]] = {}
+    for robot, rows in zip(robots.tolist(), order.split(counts.tolist()), strict=True):
+        for piece in rows.split(size):
+            pieces.setdefault(len(piece), []).append((robot, piece))
+    cut: list[tuple[Tensor, Tensor]] = []
+    for length, equal in pieces.items():
+        together = size // length
+        for start in range(0, len(equal), together):
+            some = equal[start : start + together]
+            chosen = torch.tensor([robot for robot, _ in some], device=robot_row.device)
+            cut.append((chosen, torch.stack([rows for _, rows in some])))
+    return cut
+
+
 def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:
     """(r, c, J, W) of steering (r, c, n) and (r, n, J, W)."""
     return torch.bmm(steering, of_tokens.flatten(2)).unflatten(2, of_tokens.shape[2:])
 
 
-def _visibility(frames: Frames, crop: Crop, candidates: CandidateInputs[Tensor]) -> Tensor:
-    """(N, 3): estimated rho, and it stretched near 0 and near 1, where the paper's score is steep."""
-    eyes_m = torch.cat([candidates.base_xy_m, frames.camera_rise_m[:, None]], dim=1).cpu().numpy()
-    radius_m = frames.target_radius_m.cpu().numpy()
-    robot_row = candidates.robot_row.cpu().numpy()
-    points_m = target_frame_points(crop).cpu().numpy()
-    mask, valid = crop.target_mask.cpu().numpy(), crop.valid.cpu().numpy()
-    rho = np.zeros(len(robot_row), np.float32)
-    for robot in np.unique(robot_row):
-        mine = np.flatnonzero(robot_row == robot)
-        others = points_m[robot][valid[robot] & ~mask[robot]]
-        rho[mine] = visible_share(
-            others, points_m[robot][mask[robot]], float(radius_m[mine[0]]), eyes_m[mine]
-        )
-    share = torch.from_numpy(rho).to(candidates.base_xy_m.device)
+def _visibility(frames: Frames, tokens: Tokens, crop: Crop, candidates: CandidateInputs[Tensor]) -> Tensor:
+    """(N, 3): estimated rho, and rho stretched near 0 and near 1, where the paper's score is steep."""
+    eyes_m = torch.cat([candidates.base_xy_m, frames.camera_rise_m[:, None]], dim=1)
+    inputs = (target_frame_points(crop), crop.target_mask, crop.valid, tokens.target_radius_m)
+    rho = visible_shares(*(t.cpu().numpy() for t in (*inputs, candidates.robot_row, eyes_m)))
+    share = torch.from_numpy(rho.astype(np.float32)).to(candidates.base_xy_m.device)
     return torch.stack([share, (share / 0.04).clamp(max=1), (share - 0.8).clamp(min=0) / 0.2], dim=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from datagen.train.models.crop import crop_clouds
-from datagen.train.models.grouping import ball_query
+from datagen.train.models.grouping import ball_query, take_rows
 from datagen.train.models.paper import CANDIDATE_POINTS, PaperModel
 from tests.train.models.made_batches import drawn_tables, small_model
 
@@ -16,7 +16,7 @@ def test_groups_are_those_of_the_cloud_with_fifty_points_after_it():
     assert isinstance(model, PaperModel)
     clouds, candidates, robots = drawn_tables(7, candidates=12)
     clouds.n_points[1] = 15  # fewer than there are centroids
-    groups = model._group(crop_clouds(clouds, robots, 96)).take(candidates.robot_row)
+    groups = take_rows(model._group(crop_clouds(clouds, robots, 96)), candidates.robot_row)
     clump = torch.nn.functional.pad(candidates.base_xy_m, (0, 1))[:, None]
     centres, rows = model._first_groups(groups, clump)
     assert torch.equal(centres[:, :1], clump)
