@@ -90,15 +90,12 @@ class SampleStream:
         _refuse_below("buffer_shards", buffer_shards, 1)
         _refuse_below("candidates_per_robot", 1 if candidates_per_robot is None else candidates_per_robot, 1)
         _refuse_below("seed", seed, 0)
-        if not 0 <= rank < world:
-            raise InputError("training data", "rank", f"{rank} of {world}", "Number ranks from 0")
         self.scenes_per_batch = scenes_per_batch
         self.candidates_per_robot = candidates_per_robot
         self.seed = seed
         self.buffer_shards = buffer_shards
         self.augment = augment
         self.shuffle = shuffle
-        self.rank, self.world = rank, world
 
         needs = augment.fields if augment else ()
         names = list(dict.fromkeys([*_CORE, *extra, *needs]))
@@ -107,9 +104,18 @@ class SampleStream:
         self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
         self._scenes = read_scene_table(parts, candidates_per_robot, houses)
+        self.use_rank(rank, world)
+
+    def use_rank(self, rank: int, world: int) -> None:
+        """Give the batches of one of `world` ranks. InputError where there are fewer scenes than ranks."""
+        if not 0 <= rank < world:
+            raise InputError("training data", "rank", f"{rank} of {world}", "Number ranks from 0")
         if len(self._scenes) < world:
             problem = f"has {len(self._scenes)} scenes for {world} processes"
-            raise InputError(parts[0].place, "", problem, "Name more runs, or train on fewer processes")
+            raise InputError(
+                self.parts[0].part.place, "", problem, "Name more runs, or train on fewer processes"
+            )
+        self.rank, self.world = rank, world
 
     @property
     def batches_per_epoch(self) -> int:

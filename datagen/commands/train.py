@@ -184,7 +184,7 @@ def train_model(
         raise InputError("datagen train", "RUN", "is missing", "Name one or more run folders")
     each = share_cores(processes, threads)
     from datagen.train.training.checkpoints import read_checkpoint
-    from datagen.train.training.devices import choose_device
+    from datagen.train.training.launching import choose_device
     from datagen.train.training.options import STAGES, Options
     from datagen.train.training.training_setup import TrainingJob
 

@@ -9,7 +9,7 @@ from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMAS, Field, Table
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.shard_files import TABLES
-from datagen.train.sealed import is_sealed_store, open_sealed
+from datagen.train.run_parts import is_sealed_store, open_sealed
 
 Paths = Sequence[str | Path]
 

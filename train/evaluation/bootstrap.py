@@ -14,7 +14,6 @@ import numpy.typing as npt
 from datagen.train.inputs import F64, Bools, Ints
 
 LEVEL = 0.95
-_BLOCK = 64
 
 Weights = npt.NDArray[np.uint16]
 
@@ -33,47 +32,23 @@ def summed(weights: Weights, per_scene: F64) -> F64:
 
 
 def resampled_area_under_roc(weights: Weights, true: Bools, score: F64, scene: Ints) -> F64:
-    """The area under the ROC curve (B,) of each resample; nan in those of one class.
-
-    It is a sum over pairs of scenes: how many positives of the one stand above negatives of the other, ties
-    counting half. Positives are sorted once and the negatives of a scene at a time are looked up in
-    them; of the pairs a block of columns is held.
-    """
-    b, n_scenes = weights.shape
-    w = weights.astype(np.float64)
-    order = np.argsort(score[true], kind="stable")
-    positive_score, positive_scene = score[true][order], scene[true][order]
-    by_scene = np.argsort(scene[~true], kind="stable")
-    negative_score = score[~true][by_scene]
-    n_negative = np.bincount(scene[~true], minlength=n_scenes)
-    starts = np.concatenate([[0], np.cumsum(n_negative)])
-    above = np.zeros(b)
-    for first in range(0, n_scenes, _BLOCK):
-        columns = range(first, min(first + _BLOCK, n_scenes))
-        pairs = np.zeros((n_scenes, len(columns)))
-        for k, j in enumerate(columns):
-            negatives = negative_score[starts[j] : starts[j + 1]]
-            if len(negatives) and len(positive_score):
-                beaten = _beaten(positive_score, negatives)
-                pairs[:, k] = np.bincount(positive_scene, beaten, n_scenes)
-        above += np.sum((w @ pairs) * w[:, first : first + len(columns)], axis=1)
-    of = (w @ np.bincount(scene[true], minlength=n_scenes)) * (w @ n_negative)
-    return np.divide(above, of, out=np.full(b, np.nan), where=of > 0)
-
-
-def _beaten(positives: F64, negatives: F64) -> F64:
-    """How many negatives each of the sorted positives (P,) stands above, ties counting half."""
-    n = len(positives)
-    sides = (np.searchsorted(positives, negatives, side) for side in ("left", "right"))
-    steps = sum(np.bincount(rows, minlength=n + 1)[:n] for rows in sides)
-    return np.cumsum(steps) / 2
+    """The area under the ROC curve (B,) of each resample, ties counting half; nan in those of one class."""
+    _, rank = np.unique(score, return_inverse=True)
+    found = np.full(len(weights), np.nan)
+    for k, of_scene in enumerate(weights.astype(np.float64)):
+        weight = of_scene[scene]
+        positive, negative = (np.bincount(rank, weight * rows) for rows in (true, ~true))
+        pairs = positive.sum() * negative.sum()
+        if pairs:
+            found[k] = positive @ (np.cumsum(negative) - negative / 2) / pairs
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A value with its resampled values (B,).
 
-    `trials` is how many scenes a share is of, where it is one of scenes that each say yes or no.
+    `trials` is the number of scenes of a share of scenes, where each scene counts as 0 or 1.
     """
 
     value: float
@@ -83,16 +58,15 @@ class Estimate:
     def interval(self) -> tuple[float, float]:
         """The percentile interval of `LEVEL`; nan without defined resamples.
 
-        Where all scenes of a share say yes, or all no, so does every resample, which is no certainty: then it
-        is the exact interval of a share (Clopper and Pearson 1934).
+        Of a share that is 0 or 1 in every resample: the exact interval (Clopper and Pearson 1934).
         """
-        said = self.resamples[np.isfinite(self.resamples)]
-        if not len(said) or not np.isfinite(self.value):
+        defined = self.resamples[np.isfinite(self.resamples)]
+        if not len(defined) or not np.isfinite(self.value):
             return float("nan"), float("nan")
         if self.trials and self.value in (0, 1):
             bound = ((1 - LEVEL) / 2) ** (1 / self.trials)
             return (bound, 1.0) if self.value else (0.0, 1 - bound)
-        low, high = np.quantile(said, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        low, high = np.quantile(defined, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return float(low), float(high)
 
     def minus(self, other: Estimate) -> Estimate:

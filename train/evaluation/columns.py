@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -58,23 +58,17 @@ class Columns:
 
     def at(self, rows: Bools) -> Columns:
         """Some of the candidates (N,); the scenes and their numbers stay."""
-        cut = {name: getattr(self, name)[rows] for name in _ROWS}
-        return Columns(
-            **cut,
-            scores={name: score[rows] for name, score in self.scores.items()},
-            **{name: getattr(self, name) for name in _SCENE_COLUMNS},
-        )
+        return self._cut(rows, np.ones(self.n_scenes, np.bool_))
 
     def of_scenes(self, kept: Bools) -> Columns:
         """Some of the scenes (S,) with all their rows, renumbered."""
-        rows = kept[self.scene]
-        cut = {name: getattr(self, name)[rows] for name in _ROWS}
-        cut["scene"] = (np.cumsum(kept) - 1)[cut["scene"]]
-        return Columns(
-            **cut,
-            scores={name: score[rows] for name, score in self.scores.items()},
-            **{name: getattr(self, name)[kept] for name in _SCENE_COLUMNS},
-        )
+        cut = self._cut(kept[self.scene], kept)
+        return replace(cut, scene=(np.cumsum(kept) - 1)[cut.scene])
+
+    def _cut(self, rows: Bools, scenes: Bools) -> Columns:
+        cut = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scores"}
+        cut = {name: values[scenes if name in _SCENE_COLUMNS else rows] for name, values in cut.items()}
+        return Columns(**cut, scores={name: score[rows] for name, score in self.scores.items()})
 
     def is_in(self, candidates: str) -> Bools:
         """Mask (N,) of the candidates in a set of `CANDIDATE_SETS`."""
@@ -82,7 +76,6 @@ class Columns:
 
 
 _SCENE_COLUMNS = ("house", "target", "target_digest", "run", "is_grid")
-_ROWS = tuple(f.name for f in fields(Columns) if f.name not in (*_SCENE_COLUMNS, "scores"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +106,13 @@ def gather(
 ) -> Gathered:
     """Score every candidate of every place by every scorer, a batch at a time.
 
-    Scorers come by the names that they are to have. A place is (cells of its whole grids, or 0 where it
-    has none; batches with `EXTRA`). Examples are drawn evenly from the scenes with whole grids and a
-    positive. `seen` is called with each batch's scenes. InputError where a score is no number, and where a
-    scene comes twice.
+    Scorers are given by name. A place is (cells of its whole grids, or 0 where it has none; batches with
+    `EXTRA`). Examples are drawn uniformly from the scenes with whole grids and a positive. `seen` is called
+    with the number of each batch's scenes. InputError where a score is not finite or a scene occurs twice.
     """
     parts: list[dict[str, Any]] = []
     seconds = dict.fromkeys(scorers, 0.0)
-    kept = _Reservoir(n_examples, rng)
+    examples: list[tuple[float, Example]] = []  # with a random number: the first of that order are kept
     known: set[bytes] = set()
     n_scenes = n_robots = 0
     for run, (cells, batches) in enumerate(places):
@@ -133,13 +125,16 @@ def gather(
             scenes = len(batch.clouds)
             part |= _scenes(batch, run, cells)
             _refuse_twice(batch, part["scene"] - n_scenes, known)
-            kept.offer(batch, part, n_scenes)
+            positives = np.bincount(part["scene"] - n_scenes, part["label"], scenes)
+            for row in np.flatnonzero(part["is_grid"] & (positives > 0)):
+                examples.append((rng.random(), _example(batch, int(row), n_scenes)))
+            examples = sorted(examples, key=lambda drawn: drawn[0])[:n_examples]
             parts.append(part)
             n_scenes, n_robots = n_scenes + scenes, n_robots + len(batch.robots)
             seen(scenes)
     joined = {name: np.concatenate([p.pop(name) for p in parts]) for name in list(parts[0])}
     scores = {name: joined.pop(f"score {name}") for name in scorers}
-    return Gathered(Columns(**joined, scores=scores), tuple(kept.examples), seconds)
+    return Gathered(Columns(**joined, scores=scores), tuple(example for _, example in examples), seconds)
 
 
 def _rows(batch: Batch[Array], first_scene: int, first_robot: int) -> dict[str, Array]:
@@ -175,24 +170,6 @@ def _refuse_twice(batch: Batch[Array], scene_row: Array, known: set[bytes]) -> N
         if name in known:
             raise InputError("RUN", "sample_id", f"{name.hex()} occurs twice", "Name every run once")
         known.add(name)
-
-
-class _Reservoir:
-    """A uniform random sample of the given scenes."""
-
-    def __init__(self, wanted: int, rng: np.random.Generator) -> None:
-        self._wanted, self._rng, self._offered = wanted, rng, 0
-        self.examples: list[Example] = []
-
-    def offer(self, batch: Batch[Array], part: Mapping[str, Array], first_scene: int) -> None:
-        positives = np.bincount(part["scene"] - first_scene, part["label"], len(batch.clouds))
-        for row in np.flatnonzero(part["is_grid"] & (positives > 0)):
-            self._offered += 1
-            place = len(self.examples)
-            if place == self._wanted:
-                place = int(self._rng.integers(self._offered))
-            if place < self._wanted:
-                self.examples[place : place + 1] = [_example(batch, int(row), first_scene)]
 
 
 def _example(batch: Batch[Array], row: int, first_scene: int) -> Example:

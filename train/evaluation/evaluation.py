@@ -5,13 +5,14 @@ Values are None where undefined; intervals come from `datagen.train.evaluation.b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.outcomes import OUTCOMES
 from datagen.train.evaluation import metrics
 from datagen.train.evaluation.bootstrap import (
     Estimate,
@@ -20,7 +21,6 @@ from datagen.train.evaluation.bootstrap import (
     resampled_area_under_roc,
     summed,
 )
-from datagen.train.evaluation.breakdown import breakdown, groups_of
 from datagen.train.evaluation.columns import Columns
 from datagen.train.evaluation.comparisons import (
     NO_TRAINING,
@@ -32,11 +32,14 @@ from datagen.train.evaluation.comparisons import (
 )
 from datagen.train.evaluation.grids import picks, select
 from datagen.train.inputs import F64, Bools
+from datagen.workers.bases.candidate_sets import DISTANCE_EDGES_M, VISIBILITY_EDGES, Edges, Floats, bands
 
 _CURVE_POINTS = 200
 # In order of the report, which has differences for each.
 METRICS = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick", "mean_average_precision")
 GRID_METRICS = ("good", "mean_average_precision")
+_OF_CONFUSIONS = {"accuracy": metrics.accuracy, "balanced_accuracy": metrics.balanced_accuracy}
+_RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,6 @@ def evaluate_set(
         raise InputError("--candidates", candidates, problem, "Evaluate a run with labels of both kinds")
     said = {m.name: m.says(columns.scores[m.name], columns) for m in methods}
     estimates = {m.name: _estimates(columns, m, said[m.name], weights) for m in methods}
-    groups = groups_of(columns, trained_objects)
     return {
         "candidates": candidates,
         "count": n,
@@ -103,35 +105,37 @@ def evaluate_set(
         "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, METRICS),
         "curves": {m.name: _curves(columns.label, columns.scores[m.name]) for m in methods},
         "breakdown": [
-            {**row, "methods": {k: _plain(v) for k, v in row["methods"].items()}}
-            for row in breakdown(groups, columns.label, said)
+            {
+                "by": heading,
+                "group": name,
+                "count": int(rows.sum()),
+                "positives": int(columns.label[rows].sum()),
+                "methods": {name: _accuracies(said[name][rows], columns.label[rows]) for name in said},
+            }
+            for heading, members in groups_of(columns, trained_objects).items()
+            for name, rows in members
         ],
     }
 
 
 def _estimates(columns: Columns, method: Method, said: F64, weights: Weights) -> dict[str, Estimate]:
     score, true = columns.scores[method.name], columns.label
-    found: dict[str, Estimate] = {}
 
-    def counted(rows: Bools) -> tuple[F64, F64]:
+    def estimate(metric: Callable[[F64], F64], rows: Bools) -> Estimate:
         per_scene = metrics.confusion(said[rows], true[rows], columns.scene[rows], columns.n_scenes)
-        return per_scene.sum(axis=0), summed(weights, per_scene)
+        return Estimate(float(metric(per_scene.sum(axis=0))), metric(summed(weights, per_scene)))
 
-    whole, drawn = counted(np.ones(len(columns), np.bool_))
-    found["accuracy"] = Estimate(float(metrics.accuracy(whole)), metrics.accuracy(drawn))
-    found["balanced_accuracy"] = Estimate(
-        float(metrics.balanced_accuracy(whole)), metrics.balanced_accuracy(drawn)
-    )
-    found["area_under_roc"] = Estimate(
-        metrics.area_under_roc(true, score), resampled_area_under_roc(weights, true, score, columns.scene)
-    )
+    everywhere, in_reach = np.ones(len(columns), np.bool_), columns.is_reachable
+    area = metrics.area_under_roc(true, score)
     picked = _picked(columns, method, weights)
-    found["best_pick"] = picked["good"]
-    found["mean_average_precision"] = picked["mean_average_precision"]
-    for name, rows in (("in_reach", columns.is_reachable), ("out_of_reach", ~columns.is_reachable)):
-        whole, drawn = counted(rows)
-        found[f"accuracy_{name}"] = Estimate(float(metrics.accuracy(whole)), metrics.accuracy(drawn))
-    return found
+    return {
+        **{name: estimate(metric, everywhere) for name, metric in _OF_CONFUSIONS.items()},
+        "area_under_roc": Estimate(area, resampled_area_under_roc(weights, true, score, columns.scene)),
+        "best_pick": picked["good"],
+        "mean_average_precision": picked["mean_average_precision"],
+        "accuracy_in_reach": estimate(metrics.accuracy, in_reach),
+        "accuracy_out_of_reach": estimate(metrics.accuracy, ~in_reach),
+    }
 
 
 def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights) -> dict[str, Any]:
@@ -212,5 +216,32 @@ def _class_counts(columns: Columns, rows: Bools) -> dict[str, int]:
     return {"count": int(rows.sum()), "positives": int(columns.label[rows].sum())}
 
 
-def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: finite(value) for name, value in values.items()}
+def _accuracies(said: F64, true: Bools) -> dict[str, float | None]:
+    counts = metrics.confusion(said, true, np.zeros(len(true), np.int64), 1)[0]
+    return {name: finite(float(metric(counts))) for name, metric in _OF_CONFUSIONS.items()}
+
+
+def groups_of(columns: Columns, trained_objects: Collection[str]) -> dict[str, list[tuple[str, Bools]]]:
+    """Groups of candidates for the breakdown: heading -> names with masks (N,); none is empty."""
+    ratio = columns.mount_distance_m.astype(np.float64) / columns.reach_m
+    seen = np.isin(columns.target_digest.astype(str), np.array(sorted(trained_objects), str))
+    target = columns.target.astype(str)
+    return {
+        "object": [(name, (target == name)[columns.scene]) for name in np.unique(target[columns.scene])],
+        "distance (m)": _named_bands(columns.distance_m, DISTANCE_EDGES_M),
+        "mount distance / reach": _named_bands(ratio, _RATIO_EDGES),
+        "visibility": _named_bands(columns.visibility, VISIBILITY_EDGES),
+        "outcome": [
+            (name, rows) for code, name in enumerate(OUTCOMES) if (rows := columns.outcome == code).any()
+        ],
+        **({"object trained on": _yes_no(seen[columns.scene])} if trained_objects else {}),
+    }
+
+
+def _named_bands(values: Floats, edges: Edges) -> list[tuple[str, Bools]]:
+    found = bands(values, edges)
+    return [(f"{low:g} on" if high is None else f"{low:g} to {high:g}", rows) for low, high, rows in found]
+
+
+def _yes_no(rows: Bools) -> list[tuple[str, Bools]]:
+    return [(name, part) for name, part in (("yes", rows), ("no", ~rows)) if part.any()]

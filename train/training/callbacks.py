@@ -1,12 +1,12 @@
-"""Callbacks of the training loop: steps and epochs as they end, and their curves for TensorBoard."""
+"""Callbacks of the training loop: steps and epochs on the terminal, and as curves for TensorBoard."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.progress import Pace, Progress, clock_text, whole
 from datagen.workers.extras import how_to_get
 
 
@@ -34,23 +34,51 @@ class TrainingCallback(Protocol):
         ...
 
 
-class CallbackList:
-    """Several callbacks as one."""
+class TrainingProgress:
+    """Shows loss, samples a second, time left and the loader's share of the last minute; a line an epoch.
 
-    def __init__(self, callbacks: Sequence[TrainingCallback]) -> None:
-        self._callbacks = tuple(callbacks)
+    `place` is where the training is kept.
+    """
+
+    def __init__(self, shown: Progress, place: str) -> None:
+        self._shown, self._place = shown, place
+        self._spent_s = self._samples = self._waited_s = self._steps = 0.0
+        self._pace = Pace(lambda: self._spent_s)
 
     def step(self, step: TrainingStep) -> None:
-        for callback in self._callbacks:
-            callback.step(step)
+        self._spent_s, self._steps = self._spent_s + step.step_s, self._steps + 1
+        self._samples, self._waited_s = self._samples + step.samples, self._waited_s + step.wait_s
+        self._pace.see(self._samples, self._waited_s, self._steps)
+        self._shown.update("steps", step.step, step.steps, lambda: self._figures(step))
 
     def epoch(self, record: dict[str, Any]) -> None:
-        for callback in self._callbacks:
-            callback.epoch(record)
+        numbers = "".join(
+            f"  {name} {record[field]:.4f}"
+            for name, field in (("balanced", "val_balanced_accuracy"), ("AUC", "val_auc"))
+            if record[field] is not None
+        )
+        text = (
+            f"epoch {record['epoch']:3d}  loss {record['loss']:.4f}  validation {record['val_loss']:.4f}  "
+            f"accuracy {record['val_accuracy']:.4f}{numbers}{'  best' if record['best'] else ''}"
+        )
+        self._shown.say("epoch", {"out": self._place, **record, **self._speed(4)}, text)
+
+    def _speed(self, rate_digits: int) -> dict[str, float]:
+        samples_per_s = round(self._pace.per_s(0), rate_digits)
+        return {"samples_per_s": samples_per_s, "loader_share": round(self._pace.per_s(1), 4)}
+
+    def _figures(self, step: TrainingStep) -> tuple[str, dict[str, object]]:
+        speed, left_s = self._speed(1), self._pace.left_s(step.steps - step.step, 2)
+        text = (
+            f"loss {step.loss:.4f}  {speed['samples_per_s']:,.0f} samples/s  "
+            f"{clock_text(left_s)} left  data {speed['loader_share']:.0%}"
+        )
+        values = {"epoch": step.epoch, "step": step.step, "steps": step.steps, "loss": round(step.loss, 5)}
+        return text, {"out": self._place, **values, **speed, "left_s": whole(left_s)}
 
 
 class TensorBoardCallback:
-    """Curves for TensorBoardCallback. A resumed training replaces those beyond `step`."""
+    """Curves for TensorBoard. A resumed training replaces those beyond `step`."""
 
     def __init__(self, folder: str, step: int = 0) -> None:
         try:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NoReturn, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ class Training:
 def run_training(
     training: Training,
     save: Callable[[], None],
-    callback: TrainingCallback,
+    callbacks: Sequence[TrainingCallback] = (),
     stopping: Callable[[], bool] = lambda: False,
     save_every_s: float = 300.0,
 ) -> bool:
@@ -87,18 +87,21 @@ def run_training(
     training.model.train()
     kept_s = time.monotonic()
     while not at.finished:
-        clock.wait_begins()
+        wait_began_s = time.perf_counter()
         for batch in training.train.epoch(at.epoch, at.batch):
-            clock.wait_ends()
+            clock.waited_from(wait_began_s)
             seen, stop = _step(training, logits_of, batch, clock, stopping())
-            callback.step(seen)
+            for callback in callbacks:
+                callback.step(seen)
             if stop or time.monotonic() - kept_s >= save_every_s:
                 save()
                 kept_s = time.monotonic()
             if stop:
                 return False
-            clock.wait_begins()
-        _end_epoch(training, clock, callback)
+            wait_began_s = time.perf_counter()
+        record = _end_epoch(training, clock)
+        for callback in callbacks:
+            callback.epoch(record)
         save()
     return True
 
@@ -140,8 +143,8 @@ def _step(
     return TrainingStep(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
 
 
-def _end_epoch(training: Training, clock: _Clock, callback: TrainingCallback) -> None:
-    """Validate, keep the best weights, and decide whether to continue."""
+def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
+    """Validate, keep the best weights, and decide whether to continue; the row for callbacks."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
     weight, loss, hits, samples = at.sums
@@ -161,12 +164,10 @@ def _end_epoch(training: Training, clock: _Clock, callback: TrainingCallback) ->
     worse_for = at.epoch - (at.best_epoch or 0)
     at.finished = at.epoch >= options.epochs or worse_for >= options.patience
     wall_s, cpu_s, _ = clock.lap()
-    spent = torch.tensor(
-        [wall_s / training.ranks.world, cpu_s], dtype=torch.float64, device=training.model.device
-    )
+    spent = torch.tensor([wall_s, cpu_s], dtype=torch.float64, device=training.model.device)
     wall_s, cpu_s = training.ranks.total(spent).tolist()
-    _pay(at, wall_s, cpu_s, 0.0)
-    callback.epoch({**record, "best": best})
+    _pay(at, wall_s / training.ranks.world, cpu_s, 0.0)
+    return {**record, "best": best}
 
 
 def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:
@@ -196,18 +197,10 @@ class _Clock:
     """Wall and CPU seconds of this process since the last lap, and how many it waited for batches."""
 
     def __init__(self) -> None:
-        self._wall_s, self._cpu_s, self._wait_s, self._began_s = (
-            time.perf_counter(),
-            time.process_time(),
-            0.0,
-            0.0,
-        )
+        self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
 
-    def wait_begins(self) -> None:
-        self._began_s = time.perf_counter()
-
-    def wait_ends(self) -> None:
-        self._wait_s += time.perf_counter() - self._began_s
+    def waited_from(self, began_s: float) -> None:
+        self._wait_s += time.perf_counter() - began_s
 
     def lap(self) -> tuple[float, float, float]:
         """Wall, CPU and waiting seconds; all begin again."""

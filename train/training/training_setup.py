@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +18,8 @@ from datagen.schemas.progress import Progress
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.models import Model, build_model
-from datagen.train.splits import HouseShare, HouseSide, refuse_one_class, refuse_shared_houses, split_by_house
-from datagen.train.training.callbacks import CallbackList, TensorBoardCallback, TrainingCallback
+from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
+from datagen.train.training.callbacks import TensorBoardCallback, TrainingCallback, TrainingProgress
 from datagen.train.training.checkpoints import (
     Checkpoint,
     CheckpointHead,
@@ -29,7 +29,6 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from datagen.train.training.display import TrainingProgress
 from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from datagen.train.training.options import STAGES, Options
@@ -71,9 +70,8 @@ def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> b
         at = training.position
         if ranks.leads and job.tensorboard and not at.finished:
             callbacks.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
-        callback = CallbackList(callbacks)
         return run_training(
-            training, lambda: save_checkpoint(job.out, training, head), callback, stopping, job.save_every_s
+            training, lambda: save_checkpoint(job.out, training, head), callbacks, stopping, job.save_every_s
         )
 
 
@@ -153,24 +151,17 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
     sizes["allow_incomplete"] = job.allow_incomplete
     drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
     if job.val_runs:
-        train, val = (
-            SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share)),
-            SampleStream(job.val_runs, **sizes, shuffle=False),
-        )
+        train = SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share))
+        val = SampleStream(job.val_runs, **sizes, shuffle=False)
     else:
         train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
     refuse_shared_houses(train, val)
-    if ranks.world == 1:
-        return train, val
-    sides = (None, None) if job.val_runs else (HouseSide(held_out=False), HouseSide(held_out=True))
-    ours = HouseShare(options.house_share, sides[0])
-    shared: dict[str, Any] = {"rank": ranks.rank, "world": ranks.world, **sizes}
-    train = SampleStream(job.runs, houses=ours, **shared, **drawn)
+    train.use_rank(ranks.rank, ranks.world)
     # Of fewer scenes than processes each process judges all; `validate` counts a sample once.
     if val.n_scenes >= ranks.world:
-        val = SampleStream(job.val_runs or job.runs, houses=sides[1], **shared, shuffle=False)
+        val.use_rank(ranks.rank, ranks.world)
     return train, val
 
 
@@ -216,9 +207,10 @@ def _head(
     job: TrainingJob, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
 ) -> CheckpointHead:
     data = tuple(train.origin())
-    house_ids = _all(train.house_ids(), began.house_ids if began else ())
-    # Also those by which --init was chosen: what came of it knows them too.
-    val_house_ids = val.house_ids().union(began.val_house_ids if began else ())
+    # With those of --init, also the houses by which it was chosen: its weights depend on them too.
+    house_ids = train.house_ids().union(began.house_ids if began else ())
+    object_digests = train.object_digests().union(began.object_digests if began else ())
+    val_house_ids = val.house_ids().union(began.val_house_ids if began else ()) - house_ids
     return CheckpointHead(
         model=model.name,
         model_config=model.config,
@@ -226,18 +218,14 @@ def _head(
         options=job.options.document(),
         data=data,
         val_data=tuple(val.origin()),
-        house_ids=house_ids,
-        object_digests=_all(train.object_digests(), began.object_digests if began else ()),
-        val_house_ids=tuple(sorted(val_house_ids.difference(house_ids))),
+        house_ids=tuple(sorted(house_ids)),
+        object_digests=tuple(sorted(object_digests)),
+        val_house_ids=tuple(sorted(val_house_ids)),
         cost={"label_cpu_s": sum(float((origin.get("cost") or {}).get("cpu_s", 0.0)) for origin in data)},
         versions={"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         history=(),
         init={"digest": began.digest, "stage": began.stage, "cost": began.cost} if began else None,
     )
-
-
-def _all(ours: Iterable[str], theirs: Iterable[str]) -> tuple[str, ...]:
-    return tuple(sorted({*ours, *theirs}))
 
 
 def refuse_other_training(place: str, there: CheckpointHead, here: CheckpointHead) -> None:

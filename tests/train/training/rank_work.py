@@ -13,7 +13,6 @@ import torch
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
-from datagen.train.training.callbacks import CallbackList
 from datagen.train.training.loop import run_training
 from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
@@ -26,9 +25,7 @@ def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool])
     """
     torch.set_num_threads(1)
     training, head = prepare_training(job, ranks)
-    assert run_training(
-        training, lambda: save_checkpoint(job.out, training, head), CallbackList([]), stopping
-    )
+    assert run_training(training, lambda: save_checkpoint(job.out, training, head), stopping=stopping)
     samples = [batch.sample_id for batch in training.train.epoch(0)]
     told = {"weights": training.model.state_dict(), "ids": torch.from_numpy(np.concatenate(samples))}
     torch.save(told, f"{job.out}.{ranks.rank}")

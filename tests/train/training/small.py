@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from datagen.train.training.callbacks import CallbackList, TrainingStep
+from datagen.train.training.callbacks import TrainingStep
 from datagen.train.training.loop import run_training
 from datagen.train.training.options import Options
 from datagen.train.training.ranks import Ranks
@@ -54,9 +54,6 @@ class Recorder:
     def epoch(self, record: dict[str, Any]) -> None:
         self.epochs.append(record)
 
-    def close(self) -> None:
-        pass
-
 
 def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Recorder]:
     """Go on with a job, as the verb does, until it ends or Ctrl-C comes during the given step."""
@@ -66,9 +63,7 @@ def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Record
     def stopping() -> bool:
         return step is not None and training.position.step + 1 >= step
 
-    done = run_training(
-        training, lambda: save_checkpoint(job.out, training, head), CallbackList([seen]), stopping
-    )
+    done = run_training(training, lambda: save_checkpoint(job.out, training, head), [seen], stopping)
     return done, seen
 
 

@@ -13,8 +13,7 @@ from rich.console import Console
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import Progress
-from datagen.train.training.callbacks import TensorBoardCallback, TrainingStep
-from datagen.train.training.display import TrainingProgress
+from datagen.train.training.callbacks import TensorBoardCallback, TrainingProgress, TrainingStep
 from tests.cluster.simulated import FakeClock
 
 RECORD: dict[str, Any] = {

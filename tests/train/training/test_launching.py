@@ -23,7 +23,7 @@ from datagen.train.training.loop import run_training
 from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import TrainingJob, prepare_training
 from tests.train.training.rank_work import Union, told_by, train_and_tell
-from tests.train.training.small import TINY, Recorder, equal, job_of
+from tests.train.training.small import TINY, equal, job_of
 
 # Without dropout, whose draws are each rank's own.
 STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
@@ -54,7 +54,7 @@ def test_two_processes_train_like_one_on_both_their_batches_and_end_together(
     ]
     alone, _ = prepare_training(still_job(heuristic_run, tmp_path / "new.ckpt"), Ranks())
     union = Union([r.train for r in ranks])
-    assert run_training(dataclasses.replace(alone, train=union), lambda: None, Recorder())
+    assert run_training(dataclasses.replace(alone, train=union), lambda: None)
     for name, value in alone.model.state_dict().items():
         np.testing.assert_allclose(value, told[0]["weights"][name], rtol=1e-3, atol=1e-5, err_msg=name)
     one, two = alone.position.history[0], kept.head.history[0]

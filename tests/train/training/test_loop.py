@@ -116,7 +116,7 @@ def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_
     seen = Recorder()
     with pytest.raises(InputError, match="loss: is not finite") as error:
         run_training(
-            dataclasses.replace(training, train=spoilt), lambda: kept.append(training.position.step), seen
+            dataclasses.replace(training, train=spoilt), lambda: kept.append(training.position.step), [seen]
         )
     assert error.value.place == "training, epoch 2, batch 2"
     assert f"for 5 samples: {', '.join(spoilt.ids[:4])}, ..." in error.value.problem
@@ -131,7 +131,7 @@ def test_a_gradient_that_is_no_number_ends_it_too(heuristic_run: Path, tmp_path:
     first.register_hook(lambda gradient: gradient * float("nan"))
     before = {k: v.clone() for k, v in training.model.state_dict().items()}
     with pytest.raises(InputError, match="gradient: is not finite for "):
-        run_training(training, lambda: None, Recorder())
+        run_training(training, lambda: None)
     assert equal(training.model.state_dict(), before)
 
 
