@@ -11,8 +11,9 @@ order, so that a prefix is still well spread, with random points earlier. Noise 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from math import cos, pi, sin
+from typing import Any
 
 import numpy as np
 
@@ -21,18 +22,32 @@ from datagen.train.batching import View
 from datagen.train.inputs import F64, Bools
 
 
+def _up_to(most: float, default: float) -> Any:
+    return field(default=default, metadata={"most": most})
+
+
 @dataclass(frozen=True)
-class SensorNoise:
+class _Effect:
+    """Numbers from 0 to the `most` of their field."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value, most = getattr(self, f.name), f.metadata["most"]
+            if not 0 <= value <= most:
+                raise InputError(
+                    "augmentation", f.name, f"{value} is not between 0 and {most:.4g}", "Correct it"
+                )
+
+
+@dataclass(frozen=True)
+class SensorNoise(_Effect):
     """Depth noise: points move along the camera's ray by a normal error of std_at_1m_m * depth^2 (metres).
 
     This is the error of a stereo camera: sigma_z = depth^2 sigma_d / (fx baseline) (Khoshelham and Elberink
     2012, Sensors 12(2), eq. 10). The default is 0.08 px over 5 cm at fx = 615 px.
     """
 
-    std_at_1m_m: float = 0.0026
-
-    def __post_init__(self) -> None:
-        _refuse_outside("std_at_1m_m", self.std_at_1m_m, 1)
+    std_at_1m_m: float = _up_to(1, 0.0026)
 
     def apply(self, view: View, rng: np.random.Generator) -> View:
         n = view.n_points
@@ -46,21 +61,16 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class DepthHoles:
+class DepthHoles(_Effect):
     """Round holes in the depth image: all points in one are removed.
 
     0 to `most` holes around points of the cloud, with half-angles up to `largest_rad` from the camera. A hole
     that would leave less than `target_kept` of the target's points, or none, is skipped.
     """
 
-    most: int = 4
-    largest_rad: float = 0.05
-    target_kept: float = 0.5
-
-    def __post_init__(self) -> None:
-        _refuse_outside("most", self.most, 1000)
-        _refuse_outside("largest_rad", self.largest_rad, pi / 2)
-        _refuse_outside("target_kept", self.target_kept, 1)
+    most: int = _up_to(1000, 4)
+    largest_rad: float = _up_to(pi / 2, 0.05)
+    target_kept: float = _up_to(1, 0.5)
 
     def apply(self, view: View, rng: np.random.Generator) -> View:
         n = view.n_points
@@ -78,13 +88,10 @@ class DepthHoles:
 
 
 @dataclass(frozen=True)
-class PointDropout:
+class PointDropout(_Effect):
     """A share of the points, uniform in [0, largest_share], is removed; one target point is always kept."""
 
-    largest_share: float = 0.3
-
-    def __post_init__(self) -> None:
-        _refuse_outside("largest_share", self.largest_share, 1)
+    largest_share: float = _up_to(1, 0.3)
 
     def apply(self, view: View, rng: np.random.Generator) -> View:
         n = view.n_points
@@ -96,15 +103,11 @@ class PointDropout:
 
 
 @dataclass(frozen=True)
-class ColourJitter:
+class ColourJitter(_Effect):
     """Colours are multiplied by a common gain and one per channel, uniform in 1 +- these shares."""
 
-    brightness: float = 0.2
-    channel: float = 0.1
-
-    def __post_init__(self) -> None:
-        _refuse_outside("brightness", self.brightness, 1)
-        _refuse_outside("channel", self.channel, 1)
+    brightness: float = _up_to(1, 0.2)
+    channel: float = _up_to(1, 0.1)
 
     def apply(self, view: View, rng: np.random.Generator) -> View:
         gain = (1 + self.brightness * rng.uniform(-1, 1)) * (1 + self.channel * rng.uniform(-1, 1, 3))
@@ -113,16 +116,13 @@ class ColourJitter:
 
 
 @dataclass(frozen=True)
-class Rotation:
+class Rotation(_Effect):
     """Rotation of cloud and candidates about the vertical axis through the target.
 
     The angle is uniform in [-largest_rad, largest_rad].
     """
 
-    largest_rad: float = pi
-
-    def __post_init__(self) -> None:
-        _refuse_outside("largest_rad", self.largest_rad, pi)
+    largest_rad: float = _up_to(pi, pi)
 
     def apply(self, view: View, rng: np.random.Generator) -> View:
         angle = rng.uniform(-self.largest_rad, self.largest_rad)
@@ -174,8 +174,3 @@ def _with_rows(view: View, kept: Bools) -> View:
     for name, values in cloud.items():
         moved[name][: len(rows)] = values[rows]
     return replace(view, n_points=len(rows), **moved)
-
-
-def _refuse_outside(field: str, value: float, most: float) -> None:
-    if not 0 <= value <= most:
-        raise InputError("augmentation", field, f"{value} is not between 0 and {most:.4g}", "Correct it")

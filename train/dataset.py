@@ -111,10 +111,8 @@ class SampleStream:
         if not 0 <= rank < world:
             raise InputError("training data", "rank", f"{rank} of {world}", "Number ranks from 0")
         if len(self._scenes) < world:
-            problem = f"has {len(self._scenes)} scenes for {world} processes"
-            raise InputError(
-                self.parts[0].part.place, "", problem, "Name more runs, or train on fewer processes"
-            )
+            place, problem = self.parts[0].part.place, f"has {len(self._scenes)} scenes for {world} processes"
+            raise InputError(place, "", problem, "Name more runs, or train on fewer processes")
         self.rank, self.world = rank, world
 
     @property

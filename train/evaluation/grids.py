@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from datagen.train.evaluation.metrics import average_precision
 from datagen.train.inputs import F64, Bools, Ints
@@ -28,29 +29,13 @@ def picks(score: F64, group: Ints, allowed: Bools) -> F64:
     return share
 
 
-def nearest_positive_m(base_xy_m: npt.NDArray[np.floating], true: Bools, group: Ints, asked: Bools) -> F64:
-    """Distance (N,) on the floor from each asked candidate to the nearest positive of its group.
-
-    nan for others, and where a group has no positive.
-    """
-    found = np.full(len(true), np.nan)
-    asked_rows, positive_rows = np.flatnonzero(asked), np.flatnonzero(true)
-    positives = positive_rows[np.argsort(group[positive_rows], kind="stable")]
-    starts = np.searchsorted(group[positives], group[asked_rows], "left")
-    ends = np.searchsorted(group[positives], group[asked_rows], "right")
-    xy = base_xy_m.astype(np.float64)
-    for row, start, end in zip(asked_rows, starts, ends, strict=True):
-        if end > start:
-            found[row] = np.linalg.norm(xy[positives[start:end]] - xy[row], axis=1).min()
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What a method picked in each of G groups: its share of good picks, and how far the others missed.
+    """A method's choice in each of G groups.
 
-    `missed_m` is the mean distance of the wrong picks, 0 where none was wrong. `precision` is the average
-    precision of the allowed candidates in the order of their scores.
+    `good` is the share of positives among the best-scored candidates; `missed_m` the mean distance on the
+    floor of the others to the nearest positive, 0 without others; `precision` the average precision of the
+    allowed candidates in the order of their scores.
     """
 
     group: npt.NDArray[np.intp]  # (G,) those with an allowed candidate and a positive
@@ -63,25 +48,17 @@ def select(
     score: F64, true: Bools, base_xy_m: npt.NDArray[np.floating], group: Ints, allowed: Bools
 ) -> Selection:
     """The picks among allowed candidates (N,), over groups that have a positive among them."""
-    n_groups = int(group.max(initial=-1)) + 1
-    true = true & allowed
-    counted = np.flatnonzero(np.bincount(group[true], minlength=n_groups))
-    share = picks(score, group, allowed & np.isin(group, counted))
-    picked = share > 0
-    wrong = picked & ~true
-    miss_m = np.where(wrong, nearest_positive_m(base_xy_m, true, group, wrong), 0.0)
-    # All picks of a group have the same share, so that counts give exact ones.
-    n, n_wrong = (np.bincount(group[rows], minlength=n_groups)[counted] for rows in (picked, wrong))
-    sums_m = np.bincount(group, miss_m, n_groups)[counted]
-    precision = np.array(
-        [average_precision(true[rows], score[rows]) for rows in _rows_of(group, allowed, counted)]
-    )
-    return Selection(counted, (n - n_wrong) / n, sums_m / np.maximum(n_wrong, 1), precision)
-
-
-def _rows_of(group: Ints, allowed: Bools, groups: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
-    """The allowed candidates of each of these groups."""
     rows = np.flatnonzero(allowed)
     rows = rows[np.argsort(group[rows], kind="stable")]
-    starts, ends = (np.searchsorted(group[rows], groups, side) for side in ("left", "right"))
-    return [rows[start:end] for start, end in zip(starts, ends, strict=True)]
+    found: list[tuple[float, ...]] = []
+    for members in np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1):
+        good, scores = true[members], score[members]
+        if not good.any():
+            continue
+        top = scores == scores.max()
+        xy, missed = base_xy_m[members], top & ~good
+        gaps_m = KDTree(xy[good]).query(xy[missed])[0] if missed.any() else np.zeros(1)
+        precision = average_precision(good, scores)
+        found.append((float(group[members[0]]), good[top].mean(), gaps_m.mean(), precision))
+    columns = np.array(found, np.float64).reshape(-1, 4).T
+    return Selection(columns[0].astype(np.intp), *columns[1:])

@@ -16,7 +16,7 @@ from datagen.workers.bases.candidates import grid_offsets
 from datagen.workers.bases.clearance import STEP_M
 
 CLEAR, BLOCKED, UNSEEN = STATES = ("clear", "blocked", "unseen")
-# Of the floor under a base, the share that must have been seen for nothing to stand there unseen.
+# Share of the floor under a base that must have been seen for the base to be clear.
 SEEN_SHARE = 0.8
 # One stray pixel of a stereo camera is no obstacle.
 _LEAST_POINTS = 3
@@ -46,7 +46,7 @@ class BaseCells:
 
 
 def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> BaseCells:
-    """The grid around the target, each place blocked, clear or unseen.
+    """The grid around the target, each cell blocked, clear or unseen.
 
     Blocked where observed points lie within the base's radius between the floor and a board's thickness
     above the mount, or within the mast's from there to the camera; otherwise unseen where too little of its
@@ -55,14 +55,13 @@ def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Can
     offsets = grid_offsets(params)
     base_xy = center_m[:2] + offsets
     z = seen.points_m[:, 2]
-    eyes = seen.eyes_m
-    gap_m = np.min([np.linalg.norm(seen.points_m - eye, axis=1) for eye in eyes], axis=0)
-    is_floor = np.any([floor_points(seen.points_m, eye) for eye in eyes], axis=0)
+    gap_m = np.min([np.linalg.norm(seen.points_m - eye, axis=1) for eye in seen.eyes_m], axis=0)
+    is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
     low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, params.base_radius_m)
-    high = _counts(seen.points_m[above & (z >= mount) & (z < top)], base_xy, params.mast_radius_m)
     tops = seen.points_m[above & (z >= mount) & (z < top)]
+    high = _counts(tops, base_xy, params.mast_radius_m)
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
     share = _floor_share(seen.points_m[is_floor], base_xy, params.base_radius_m)
     state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
@@ -71,18 +70,14 @@ def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Can
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:
-    """Share of the disc around the target, from above, in which anything at all was measured.
+    """Share of the disc around the target, from above, in which anything was measured.
 
     `cloud_m` (N, 3) has the target's centre as origin.
     """
-    n = int(np.ceil(radius_m / 0.05))
-    cells = np.floor(cloud_m[:, :2] / 0.05).astype(np.int64) + n
-    inside = ((cells >= 0) & (cells < 2 * n)).all(axis=1)
-    hit = np.zeros((2 * n, 2 * n), np.bool_)
-    hit[cells[inside, 0], cells[inside, 1]] = True
-    centres = (np.arange(2 * n) + 0.5 - n) * 0.05
-    disc = np.hypot(*np.meshgrid(centres, centres)) <= radius_m
-    return float(hit[disc].mean())
+    n, cell_m = int(np.ceil(radius_m / 0.05)), 0.05
+    hit = _occupied(cloud_m, np.full(2, -n * cell_m), cell_m, (2 * n, 2 * n))
+    centres = (np.arange(2 * n) + 0.5 - n) * cell_m
+    return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
 
 def facing_yaw(offset_m: F32) -> F64:
@@ -92,8 +87,6 @@ def facing_yaw(offset_m: F32) -> F64:
 
 def _counts(points_m: F32, base_xy: F64, radius_m: float) -> I64:
     """Points (N, 3) within the radius of each base, seen from above."""
-    if not len(points_m):
-        return np.zeros(len(base_xy), np.int64)
     near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < _AROUND_M
     if not near.any():
         return np.zeros(len(base_xy), np.int64)
@@ -101,27 +94,29 @@ def _counts(points_m: F32, base_xy: F64, radius_m: float) -> I64:
     return np.asarray(counts, np.int64)
 
 
+def _occupied(points_m: F32, low: F64, cell_m: float, size: tuple[int, int]) -> Bools:
+    """Cells (size) of a grid on the floor, from corner `low` (2,), with a point (N, 3) above or in them."""
+    cells = np.floor((points_m[:, :2] - low) / cell_m).astype(np.int64)
+    cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
+    hit = np.zeros(size, np.bool_)
+    hit[cells[:, 0], cells[:, 1]] = True
+    return hit
+
+
 def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
-    """Which bases (N,) stand in a gap of a surface above the mount: what stands there hides part of it."""
+    """Bases (N,) in a gap of a surface above the mount: the object that casts the gap is there."""
     n = int(2 * _AROUND_M / _CELL_M)
     low = base_xy.mean(axis=0) - _AROUND_M
-    cells = np.floor((tops_m[:, :2] - low) / _CELL_M).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < n)).all(axis=1)]
-    hit = np.zeros((n, n), np.bool_)
-    hit[cells[:, 0], cells[:, 1]] = True
-    closed = np.asarray(ndimage.binary_closing(hit, iterations=_GAP_CELLS), np.bool_)
+    closed = ndimage.binary_closing(_occupied(tops_m, low, _CELL_M, (n, n)), iterations=_GAP_CELLS)
     rows = np.clip(np.floor((base_xy - low) / _CELL_M).astype(np.int64), 0, n - 1)
-    return closed[rows[:, 0], rows[:, 1]]
+    return np.asarray(closed, np.bool_)[rows[:, 0], rows[:, 1]]
 
 
 def _floor_share(floor_m: F32, base_xy: F64, radius_m: float) -> F64:
     """Share (N,) of the cells under each base in which floor was seen."""
     low = base_xy.min(axis=0) - radius_m - _CELL_M
     size = np.ceil((base_xy.max(axis=0) + radius_m + _CELL_M - low) / _CELL_M).astype(np.int64) + 1
-    cells = np.floor((floor_m[:, :2] - low) / _CELL_M).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
-    seen: Bools = np.zeros(tuple(size), np.bool_)
-    seen[cells[:, 0], cells[:, 1]] = True
+    seen = _occupied(floor_m, low, _CELL_M, (int(size[0]), int(size[1])))
     # Far away, rows of pixels are farther apart than cells are wide.
     seen |= np.asarray(ndimage.binary_closing(seen), np.bool_)
     n = int(np.ceil(radius_m / _CELL_M))

@@ -1,17 +1,20 @@
-"""Read untrusted images and small JSON documents of a frame."""
+"""Read the untrusted files of a frame: images, small JSON documents, .npz archives of bounded size."""
 
 from __future__ import annotations
 
 import io
+import math
 import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from datagen.schemas.archives import DAMAGED_ARRAY, DAMAGED_ZIP, open_member
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
-from datagen.train.inputs import F32, F64, U8, Bools
+from datagen.train.inputs import F32, F64, U8, Array, Bools
 from datagen.workers.geometry.transforms import is_pose
 from datagen.workers.json_document import JsonNode, parse_json
 
@@ -25,6 +28,18 @@ _POSE_ROUNDING = 1e-3
 _EXTENT_M = 1000.0
 # Farther than this no depth camera measures; it is what saturated values look like.
 MAX_DEPTH_M = 20.0
+# The least and largest value of each.
+_INTRINSICS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("fx", "fy"), (1.0, 1e5)),
+    **dict.fromkeys(("cx", "cy"), (-1e5, 1e5)),
+    **dict.fromkeys(("width", "height"), (2, MAX_SIDE_PX)),
+}
+NAMES = ("rgb", "depth", "intrinsics", "mask", "T_world_camera")
+_MAX_ARRAY_BYTES = 4 * MAX_PIXELS
+_MAX_RECORDS = 10_000
+_NPZ_FIX = (
+    "Write it with numpy.savez: depth, rgb, intrinsics (fx, fy, cx, cy), and if you like mask, T_world_camera"
+)
 
 
 def read_rgb(path: Path) -> U8:
@@ -59,17 +74,14 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float, int, int]:
     Pixels are those of the file: cameras and OpenCV put the centre of the first pixel at 0.
     """
     node = _document(path)
-    names = {"fx": ("fx",), "fy": ("fy",), "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
-    names |= {"width": ("width",), "height": ("height",)}
-    found = {key: next((n for k in keys if (n := node.find(k))), None) for key, keys in names.items()}
-    missing = [" or ".join(names[key]) for key, value in found.items() if value is None]
+    names = {**{name: (name,) for name in _INTRINSICS}, "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
+    found = {key: n for key, keys in names.items() for k in reversed(keys) if (n := node.find(k))}
+    missing = [" or ".join(names[key]) for key in _INTRINSICS if key not in found]
     if missing:
         fix = "Write fx, fy, cx, cy, width and height, in pixels (ppx and ppy serve for cx and cy)"
         raise InputError(path, ", ".join(missing), "missing", fix)
-    fx, fy = (_of(found[k]).number(1.0, 1e5) for k in ("fx", "fy"))
-    cx, cy = (_of(found[k]).number(-1e5, 1e5) for k in ("cx", "cy"))
-    width, height = (int(_of(found[k]).number(2, MAX_SIDE_PX)) for k in ("width", "height"))
-    return fx, fy, cx, cy, width, height
+    fx, fy, cx, cy, width, height = (found[key].number(*bounds) for key, bounds in _INTRINSICS.items())
+    return fx, fy, cx, cy, int(width), int(height)
 
 
 def read_pose(path: Path) -> F64:
@@ -99,9 +111,48 @@ def checked_pose(T: F64, place: str) -> F64:
     return exact
 
 
-def _of(node: JsonNode | None) -> JsonNode:
-    assert node is not None
-    return node
+def read_arrays(path: Path) -> dict[str, Array]:
+    """Those of `NAMES` that the archive holds. InputError for objects, bombs and what is no archive."""
+    data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
+    found: dict[str, Array] = {}
+    try:
+        # Every record of the zip's directory begins with these bytes; counted before a list is made of them.
+        if data.count(b"PK\1\2") > _MAX_RECORDS:
+            raise ValueError("too many records")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            for name in NAMES:
+                if (info := archive.NameToInfo.get(f"{name}.npy")) is not None:
+                    with open_member(archive, info) as member:
+                        unpacked = member.read(_MAX_ARRAY_BYTES + 1)
+                    found[name] = _array(path, name, unpacked)
+    except InputError:
+        raise
+    except DAMAGED_ZIP as error:
+        raise InputError(path, "", f"is not a .npz archive ({type(error).__name__})", _NPZ_FIX) from None
+    if not found:
+        raise InputError(path, "", f"has none of {', '.join(NAMES)}", _NPZ_FIX)
+    return found
+
+
+def _array(path: Path, name: str, data: bytes) -> Array:
+    """One array of numbers; its header is held against its bytes before anything of its size is made."""
+    if len(data) > _MAX_ARRAY_BYTES:
+        raise InputError(path, name, f"unpacks to more than {_MAX_ARRAY_BYTES:,} bytes", _NPZ_FIX)
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, _, dtype = reader[version](file)
+    except DAMAGED_ARRAY as error:
+        raise InputError(path, name, f"is not an array ({type(error).__name__})", _NPZ_FIX) from None
+    if dtype.hasobject or dtype.kind not in "buif":
+        raise InputError(path, name, f"holds {dtype}, not numbers", _NPZ_FIX)
+    size = math.prod(shape) * dtype.itemsize
+    sound = all(type(length) is int and 0 <= length <= len(data) for length in shape)
+    if not sound or size != len(data) - file.tell():
+        raise InputError(path, name, f"has {len(data) - file.tell():,} of {size:,} bytes", _NPZ_FIX)
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _document(path: Path) -> JsonNode:

@@ -14,6 +14,7 @@ from datagen.train.inputs import F32, F64, I64, U8, Bools
 from datagen.train.prediction.files import (
     MAX_PIXELS,
     checked_pose,
+    read_arrays,
     read_depth,
     read_intrinsics,
     read_mask,
@@ -21,7 +22,6 @@ from datagen.train.prediction.files import (
     read_rgb,
     valid_depth,
 )
-from datagen.train.prediction.npz import read_arrays
 from datagen.train.prediction.ply import read_ply
 
 DEPTH_SCALE_M = 0.001

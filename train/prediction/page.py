@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import plotly.graph_objects as go
 
-from datagen.schemas.specification import CandidateParams
 from datagen.schemas.styles import BEST, SCORE_COLOURS, TARGET
 from datagen.train.html_page import html_facts, html_figure, html_page
 from datagen.train.inputs import I64
 from datagen.train.prediction.base_cells import STATES
-from datagen.train.prediction.pictures import shown_rows
+from datagen.train.prediction.pictures import robot_lines, shown_rows
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
 
@@ -26,9 +25,9 @@ _CAPTION = (
 
 def page_of(prediction: Prediction) -> str:
     """The page: facts, and the cloud with every base pose, its score under the pointer, the best in gold."""
-    half_m = float(np.abs(prediction.places.offset_m).max()) + 0.5
+    half_m = float(np.abs(prediction.cells.offset_m).max()) + 0.5
     rows = shown_rows(prediction, _MOST_POINTS, half_m)
-    figure = go.Figure(data=[_cloud(prediction, rows), *_places(prediction), *_best(prediction)])
+    figure = go.Figure(data=[_cloud(prediction, rows), *_base_poses(prediction), *_best(prediction)])
     figure.update_layout(
         margin={"l": 0, "r": 0, "b": 0, "t": 0},
         paper_bgcolor="#ffffff",
@@ -60,7 +59,7 @@ def _cloud(prediction: Prediction, rows: I64) -> go.Scatter3d:
     )
 
 
-def _places(prediction: Prediction) -> list[go.Scatter3d]:
+def _base_poses(prediction: Prediction) -> list[go.Scatter3d]:
     traces: list[go.Scatter3d] = []
     for state in STATES:
         rows = prediction.rows(state)
@@ -97,25 +96,13 @@ def _best(prediction: Prediction) -> list[go.Scatter3d]:
     row = prediction.best
     if row is None:
         return []
-    (x, y), yaw = prediction.base_xy_m[row], float(prediction.yaw_rad[row])
-    mount, top = prediction.robot.base_height_m, prediction.robot.camera_height_m
-    angle = np.linspace(0, 2 * np.pi, 49) + yaw
-    radius_m = CandidateParams().base_radius_m
-    ring = np.column_stack([x + radius_m * np.cos(angle), y + radius_m * np.sin(angle)])
-    tip = np.array([x + 0.35 * np.cos(yaw), y + 0.35 * np.sin(yaw), mount])
-    gap = np.full((1, 3), np.nan)
-    strokes = [
-        np.column_stack([ring, np.full(49, 0.01)]),
-        np.column_stack([ring, np.full(49, mount)]),
-        np.array([[x, y, 0.01], [x, y, max(mount, top)]]),
-        np.array([[x, y, mount], tip]),
-    ]
-    path = np.concatenate([part for stroke in strokes for part in (stroke, gap)])
-    values = [[None if np.isnan(v) else round(float(v), 4) for v in column] for column in path.T]
+    gap = np.full((1, 3), np.nan)  # ends a line
+    path = np.concatenate([part for line in robot_lines(prediction, row) for part in (line, gap)])
+    x, y, z = ([None if np.isnan(v) else round(float(v), 4) for v in column] for column in path.T)
     text = f"best, score {prediction.score[row]:.3f}"
     return [
         go.Scatter3d(
-            x=values[0], y=values[1], z=values[2], mode="lines", line={"color": BEST.colour, "width": 8},
+            x=x, y=y, z=z, mode="lines", line={"color": BEST.colour, "width": 8},
             name=text, hoverinfo="name", connectgaps=False,
         )
     ]  # fmt: skip

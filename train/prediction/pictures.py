@@ -54,15 +54,15 @@ def shown_rows(prediction: Prediction, most: int, around_m: float) -> np.ndarray
 
 def _draw_frame(axes: Axes, prediction: Prediction) -> None:
     axes.set_axis_off()
-    frame = next((f for f in prediction.frames if f.image is not None and f.image.mask is not None), None)
-    if frame is None or frame.image is None or frame.image.mask is None:
-        axes.text(0.5, 0.5, "a cloud without a picture", ha="center", transform=axes.transAxes)
-        return
-    draw_frame(axes, frame.image.rgb, frame.image.mask)
+    for frame in prediction.frames:
+        if frame.image is not None and frame.image.mask is not None:
+            draw_frame(axes, frame.image.rgb, frame.image.mask)
+            return
+    axes.text(0.5, 0.5, "a cloud without a picture", ha="center", transform=axes.transAxes)
 
 
 def _half_m(prediction: Prediction) -> float:
-    return float(np.abs(prediction.places.offset_m).max()) + 0.35
+    return float(np.abs(prediction.cells.offset_m).max()) + 0.35
 
 
 def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
@@ -90,19 +90,12 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
     target = prediction.seen.points_m[prediction.seen.on_target]
     axes.scatter(target[:, 0], target[:, 1], s=3, c=TARGET.colour, lw=0, zorder=4)
     legend.append(Patch(fc=TARGET.colour, label=TARGET.words))
-    camera: dict[str, Any] = {
-        "color": CAMERA.colour,
-        "edgecolors": CAMERA.edge,
-        "s": 150,
-        "lw": 0.8,
-        "zorder": 6,
-    }
+    camera: dict[str, Any] = {"color": CAMERA.colour, "edgecolors": CAMERA.edge, "s": 150, "lw": 0.8}
     half, centre = _half_m(prediction), prediction.center_m
     eyes = np.array([ground.T_world_camera[:2, 3] for ground in prediction.grounds])
     if (np.abs(eyes - centre[:2]) < half).all(axis=1).any():
-        legend.append(
-            axes.scatter(*eyes.T, marker=Path(np.array(CAMERA.marker)), label=CAMERA.words, **camera)
-        )
+        marker = Path(np.array(CAMERA.marker))
+        legend.append(axes.scatter(*eyes.T, marker=marker, label=CAMERA.words, zorder=6, **camera))
     if prediction.best is not None:
         xy, yaw = prediction.base_xy_m[prediction.best], prediction.yaw_rad[prediction.best]
         axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec="black", lw=5, zorder=7))
@@ -126,15 +119,15 @@ def _draw_perspective(axes: Any, prediction: Prediction) -> None:
     rows = shown_rows(prediction, _MOST_POINTS, half)
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.computed_zorder = False
-    tiles = [_square(xy, 0.92 * _side_m(prediction)) for xy in prediction.base_xy_m]
-    palette = colormaps[SCORE_COLOURS]
-    drawn = prediction.places.state != STATES.index(BLOCKED)
-    faces = [(*palette(float(s))[:3], 0.85) for s in prediction.score[drawn]]
-    kept = [tile for tile, keep in zip(tiles, drawn, strict=True) if keep]
-    if kept:
-        axes.add_collection3d(Poly3DCollection(kept, facecolors=faces, edgecolors="none", zorder=1))
+    drawn = np.flatnonzero(prediction.cells.state != STATES.index(BLOCKED))
+    tiles = [_square(xy, 0.92 * _side_m(prediction)) for xy in prediction.base_xy_m[drawn]]
+    faces = colormaps[SCORE_COLOURS](prediction.score[drawn], alpha=0.85)
+    if tiles:
+        axes.add_collection3d(Poly3DCollection(tiles, facecolors=faces, edgecolors="none", zorder=1))
     if prediction.best is not None:
-        _draw_robot(axes, prediction, prediction.best)
+        lines = robot_lines(prediction, prediction.best)
+        axes.add_collection3d(Line3DCollection(lines, colors="black", linewidths=3.4, zorder=5))
+        axes.add_collection3d(Line3DCollection(lines, colors=BEST.colour, linewidths=2.2, zorder=6))
     axes.scatter(*points.T, c=colours, s=2.2, lw=0, depthshade=False, zorder=3)
     target = prediction.seen.points_m[prediction.seen.on_target]
     axes.scatter(*target.T, c=TARGET.colour, s=3, lw=0, depthshade=False, zorder=4)
@@ -148,22 +141,23 @@ def _draw_perspective(axes: Any, prediction: Prediction) -> None:
     axes.locator_params(nbins=4)
 
 
-def _draw_robot(axes: Any, prediction: Prediction, row: int) -> None:
+def robot_lines(prediction: Prediction, row: int) -> list[F64]:
+    """Lines (K, 3) of the robot at a base pose: base and mount as circles, heading, and the camera's mast."""
     (x, y), yaw = prediction.base_xy_m[row], float(prediction.yaw_rad[row])
-    angle = np.linspace(0, 2 * np.pi, 49)
-    ring = np.stack([x + _BASE_RADIUS_M * np.cos(angle), y + _BASE_RADIUS_M * np.sin(angle)], axis=1)
+    angle = np.linspace(0, 2 * np.pi, 49) + yaw
+    ring = np.column_stack([x + _BASE_RADIUS_M * np.cos(angle), y + _BASE_RADIUS_M * np.sin(angle)])
     mount, top = prediction.robot.base_height_m, prediction.robot.camera_height_m
-    lines = [np.column_stack([ring, np.full(len(ring), z)]) for z in (0.01, mount)]
-    lines += [np.array([[*ring[k], 0.01], [*ring[k], mount]]) for k in range(0, 48, 8)]
-    lines.append(np.array([[x, y, mount], [x, y, max(top, mount)]]))
-    lines.append(np.array([[x, y, mount], [x + 0.35 * np.cos(yaw), y + 0.35 * np.sin(yaw), mount]]))
-    axes.add_collection3d(Line3DCollection(lines, colors="black", linewidths=3.4, zorder=5))
-    axes.add_collection3d(Line3DCollection(lines, colors=BEST.colour, linewidths=2.2, zorder=6))
+    return [
+        *(np.column_stack([ring, np.full(49, z)]) for z in (0.01, mount)),
+        *(np.array([[*ring[k], 0.01], [*ring[k], mount]]) for k in range(0, 48, 8)),
+        np.array([[x, y, 0.01], [x, y, max(top, mount)]]),
+        np.array([[x, y, mount], [x + 0.35 * np.cos(yaw), y + 0.35 * np.sin(yaw), mount]]),
+    ]
 
 
 def _side_m(prediction: Prediction) -> float:
-    """Distance of neighbouring grid places."""
-    axis = np.unique(prediction.places.offset_m[:, 0])
+    """Distance of neighbouring grid cells."""
+    axis = np.unique(prediction.cells.offset_m[:, 0])
     return float(axis[1] - axis[0])
 
 

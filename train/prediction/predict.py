@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +31,14 @@ from datagen.train.scorers import ModelScorer, Scorer, scored
 from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.rendering.cloud import Cloud
 
-# The margin is to this rank: neighbours of the best are nearly as good, and say nothing of doubt.
+# The margin is to this rank: neighbours of the best have nearly its score.
 _RANK = 10
 _SURE, _LIKELY = 0.8, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A scored grid of places around the target, and all that explains it. World: floor z = 0."""
+    """A scored grid of base poses around the target, with its explanation. World: floor z = 0."""
 
     scorer: str
     robot: RobotSize
@@ -48,7 +48,7 @@ class Prediction:
     target: TargetBox
     filled: Filled | None  # None where no mask was given or clicked
     cloud: Cloud
-    places: BaseCells
+    cells: BaseCells
     score: F64  # (N,)
     best: int | None  # the best of those that may be chosen; None where there is none
     notes: tuple[str, ...]
@@ -61,15 +61,15 @@ class Prediction:
     @property
     def base_xy_m(self) -> F64:
         """Base positions (N, 2)."""
-        return self.center_m[:2] + self.places.offset_m
+        return self.center_m[:2] + self.cells.offset_m
 
     @property
     def yaw_rad(self) -> F64:
         """Headings (N,) that face the target, counter-clockwise from x."""
-        return facing_yaw(self.places.offset_m)
+        return facing_yaw(self.cells.offset_m)
 
     def T_world_base(self, row: int) -> F64:
-        """Pose (4, 4) of the arm's mount for one place: at base height, x towards the target."""
+        """Pose (4, 4) of the arm's mount at one base pose: at base height, x towards the target."""
         x, y = self.base_xy_m[row]
         return yaw_pose(float(x), float(y), self.robot.base_height_m, float(self.yaw_rad[row]))
 
@@ -78,8 +78,8 @@ class Prediction:
         return inverse(self.grounds[0].T_world_camera) @ self.T_world_base(row)
 
     def rows(self, state: str) -> I64:
-        """The places of one state, best first."""
-        rows = np.flatnonzero(self.places.state == STATES.index(state))
+        """Rows of the base poses of one state, best first."""
+        rows = np.flatnonzero(self.cells.state == STATES.index(state))
         return rows[np.argsort(-self.score[rows], kind="stable")]
 
     @property
@@ -87,7 +87,7 @@ class Prediction:
         """Score of the best over that of the 10th of its kind; None where there are fewer."""
         if self.best is None:
             return None
-        rows = self.rows(STATES[int(self.places.state[self.best])])
+        rows = self.rows(STATES[int(self.cells.state[self.best])])
         return float(self.score[self.best] - self.score[rows[_RANK - 1]]) if len(rows) >= _RANK else None
 
     @property
@@ -118,7 +118,7 @@ class Prediction:
             return "doubtful: even the best base pose has a low score" + (
                 "; some whose floor is not visible score higher" if better else ""
             )
-        if self.places.state[self.best] == STATES.index(UNSEEN):
+        if self.cells.state[self.best] == STATES.index(UNSEEN):
             return "good if the floor there is free, which is not visible"
         doubt = any(ground.doubt is not None for ground in self.grounds)
         if score < _SURE or thin or doubt or self.crop_seen < 0.1:
@@ -181,24 +181,12 @@ def predict(
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
-    places = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
-    score = scored(scorer, _batch(cloud, target, robot, places))
-    best = _best(score, places, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
+    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
+    score = scored(scorer, _batch(cloud, target, robot, cells))
+    best = _best(score, cells, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
     notes = _notes(grounds, filled, cloud)
-    return Prediction(
-        scorer.name,
-        robot,
-        tuple(frames),
-        tuple(grounds),
-        seen,
-        target,
-        filled,
-        cloud,
-        places,
-        score,
-        best,
-        notes,
-    )
+    given = (scorer.name, robot, tuple(frames), tuple(grounds))
+    return Prediction(*given, seen, target, filled, cloud, cells, score, best, notes)
 
 
 def _grounds(
@@ -225,10 +213,8 @@ def _with_target(
         if image.mask is not None:
             raise InputError("--click", "", "is given with a mask", "Give one of --click and --mask")
         grown = replace(image, mask=grow_mask(image, click, grounds[0].T_world_camera))
-        return [
-            image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"}),
-            *frames[1:],
-        ]
+        clicked = image_frame(grown, first.T_world_camera, {"depth": first.place, "mask": "--click"})
+        return [clicked, *frames[1:]]
     if not any(frame.on_target is not None for frame in frames):
         fix = "Give --mask mask.png or --click u,v (of a .ply: a vertex property `target`, 1 on the target)"
         raise InputError(first.place, "target", "is not marked", fix)
@@ -262,9 +248,9 @@ def _grid(cells: int, half_width_m: float) -> CandidateParams:
     return CandidateParams(per_scene="grid", grid_cells=cells, grid_half_width_m=half_width_m)
 
 
-def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: BaseCells) -> Batch[Array]:
-    """The places as a scorer takes them; `base_is_clear` says what was seen to stand in the way."""
-    n = len(places.offset_m)
+def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) -> Batch[Array]:
+    """The base poses as input of a scorer; `base_is_clear` is false where a base pose is blocked."""
+    n = len(cells.offset_m)
 
     def one(value: float) -> Array:
         return np.array([value], np.float32)
@@ -278,21 +264,16 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, places: BaseCells)
             one(target.center_m[2]),
             one(target.radius_m),
         ),
-        RobotInputs(
-            np.zeros(1, np.int64),
-            one(robot.camera_height_m),
-            one(robot.base_height_m),
-            one(robot.arm_reach_m),
-        ),
-        CandidateInputs(np.zeros(n, np.int64), places.offset_m),
+        RobotInputs(np.zeros(1, np.int64), *map(one, astuple(robot))),
+        CandidateInputs(np.zeros(n, np.int64), cells.offset_m),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
-        {"base_is_clear": places.state != STATES.index(BLOCKED)},
+        {"base_is_clear": cells.state != STATES.index(BLOCKED)},
     )
 
 
-def _best(score: F64, places: BaseCells, allowed: Sequence[str]) -> int | None:
-    rows = np.flatnonzero(np.isin(places.state, [STATES.index(name) for name in allowed]))
+def _best(score: F64, cells: BaseCells, allowed: Sequence[str]) -> int | None:
+    rows = np.flatnonzero(np.isin(cells.state, [STATES.index(name) for name in allowed]))
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
 
 

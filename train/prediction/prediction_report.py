@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,8 @@ _OWN_AXES = (
 _GIVEN_AXES = "that of the given T_world_camera; z up, floor at z = 0"
 
 
-def world_axes(prediction: Prediction) -> str:
-    """What the world frame of the answer is."""
-    given = prediction.frames[0].T_world_camera is not None
-    return _GIVEN_AXES if given else _OWN_AXES
+def _world_axes(prediction: Prediction) -> str:
+    return _OWN_AXES if prediction.frames[0].T_world_camera is None else _GIVEN_AXES
 
 
 def told(prediction: Prediction) -> list[tuple[str, str]]:
@@ -28,10 +27,10 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
     if p.best is not None:
         x, y = p.base_xy_m[p.best]
         margin = "" if p.margin is None else f", {p.margin:.3f} above the 10th"
-        place = f"({x:.3f}, {y:.3f}) m, yaw {np.degrees(p.yaw_rad[p.best]):.1f} deg"
-        lines[0] = ("best", f"{place}, score {p.score[p.best]:.3f}{margin}")
+        pose = f"({x:.3f}, {y:.3f}) m, yaw {np.degrees(p.yaw_rad[p.best]):.1f} deg"
+        lines[0] = ("best", f"{pose}, score {p.score[p.best]:.3f}{margin}")
     counts = [f"{len(p.rows(state))} {state}" for state in STATES]
-    lines.append(("places", ", ".join(counts)))
+    lines.append(("poses", ", ".join(counts)))
     unseen = p.rows("unseen")
     if len(unseen):
         x, y = p.base_xy_m[unseen[0]]
@@ -49,33 +48,27 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
             f"camera {robot.camera_height_m:.2f} m, mount {robot.base_height_m:.2f} m, "
             f"reach {robot.arm_reach_m:.2f} m",
         ),
-        ("world", world_axes(p)),
+        ("world", _world_axes(p)),
     ]
     return lines + [("note", note) for note in p.notes]
 
 
 def document(prediction: Prediction) -> dict[str, Any]:
-    """The answer as plain values: every place with its score, and the best pose in camera and world frame."""
+    """The answer as plain values: all base poses with scores; the best also in the camera frame."""
     p = prediction
     floor = p.grounds[0]
     return {
         "scorer": p.scorer,
         "sure": p.sure,
         "notes": list(p.notes),
-        "world": world_axes(p),
+        "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),
         "best_unseen": None if not len(rows := p.rows("unseen")) else _pose(p, int(rows[0])),
         "margin_to_10th": p.margin,
-        "robot": {
-            "camera_height_m": p.robot.camera_height_m,
-            "base_height_m": p.robot.base_height_m,
-            "arm_reach_m": p.robot.arm_reach_m,
-        },
+        "robot": asdict(p.robot),
         "target": {
+            **asdict(p.target),
             "center_m": list(p.target.center_m),
-            "radius_m": p.target.radius_m,
-            "support_height_m": p.target.support_height_m,
-            "how": p.target.how,
             "points": p.target_points,
             "mask_pixels": None if p.filled is None else p.filled.mask_pixels,
             "filled_pixels": None if p.filled is None else p.filled.missing_pixels,
@@ -89,26 +82,26 @@ def document(prediction: Prediction) -> dict[str, Any]:
         },
         "cloud": {"points": p.cloud.n, "crop_seen": p.crop_seen, "missing_depth": p.missing_depth},
         "T_world_camera": [ground.T_world_camera.tolist() for ground in p.grounds],
-        "candidates": [_place(p, row) for row in range(len(p.score))],
+        "candidates": [_candidate(p, row) for row in range(len(p.score))],
     }
 
 
-def _place(p: Prediction, row: int) -> dict[str, Any]:
+def _candidate(p: Prediction, row: int) -> dict[str, Any]:
     x, y = p.base_xy_m[row]
     return {
         "x_m": float(x),
         "y_m": float(y),
         "yaw_rad": float(p.yaw_rad[row]),
         "score": float(p.score[row]),
-        "state": STATES[int(p.places.state[row])],
-        "floor_seen": float(p.places.floor_seen[row]),
+        "state": STATES[int(p.cells.state[row])],
+        "floor_seen": float(p.cells.floor_seen[row]),
     }
 
 
 def _pose(p: Prediction, row: int) -> dict[str, Any]:
     return {
         "index": row,
-        **_place(p, row),
+        **_candidate(p, row),
         "T_world_base": p.T_world_base(row).tolist(),
         "T_camera_base": p.T_camera_base(row).tolist(),
     }

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.train.prediction.npz import read_arrays
+from datagen.train.prediction.files import read_arrays
 
 DEPTH = np.arange(6, dtype=np.float32).reshape(2, 3)
 

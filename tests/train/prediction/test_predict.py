@@ -133,16 +133,16 @@ def test_scores_turn_with_the_world(
     after = of(scorer, sensor_frame(seen, T @ seen.camera.T_world_camera))
     np.testing.assert_allclose(after.center_m, (T @ [*before.center_m, 1])[:3], atol=1e-4)
     # The grid's places are turned into one another, and each takes its score along.
-    turned = before.places.offset_m @ T[:2, :2].T.astype(np.float32)
-    gaps = np.linalg.norm(turned[:, None] - after.places.offset_m, axis=2)
+    turned = before.cells.offset_m @ T[:2, :2].T.astype(np.float32)
+    gaps = np.linalg.norm(turned[:, None] - after.cells.offset_m, axis=2)
     row = gaps.argmin(axis=1)
     assert gaps.min(axis=1).max() < 1e-5
     assert off(after.score[row], before.score) < 0.05
     assert off(after.score, before.score) > 0.2
-    away = np.linalg.norm(before.places.offset_m, axis=1) > 0.01
+    away = np.linalg.norm(before.cells.offset_m, axis=1) > 0.01
     turns = (after.yaw_rad[row] - before.yaw_rad - quarters * np.pi / 2)[away]
     np.testing.assert_allclose(np.cos(turns), 1, atol=1e-5)
-    assert (after.places.state[row] == before.places.state).mean() > 0.95
+    assert (after.cells.state[row] == before.cells.state).mean() > 0.95
 
 
 @pytest.mark.parametrize("noise", [False, True])
@@ -197,7 +197,7 @@ def test_places_are_what_the_house_says(seen: Seen, scorer: ModelScorer) -> None
         seen.scene.house.obstacles,
         CandidateParams(),
     )
-    blocked, clear = (answer.places.state == STATES.index(name) for name in ("blocked", "clear"))
+    blocked, clear = (answer.cells.state == STATES.index(name) for name in ("blocked", "clear"))
     assert blocked.sum() > 20 and clear.sum() > 5
     assert (free[blocked] < 0.02).mean() > 0.95
     assert (free[clear] > -0.05).mean() > 0.95

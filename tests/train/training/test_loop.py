@@ -144,7 +144,7 @@ def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: P
     weight = next(iter(training.model.parameters()))
     training.optimiser.register_step_post_hook(lambda *_: weight.data.fill_(float("inf")))
     with pytest.raises(InputError, match=r"has NaN or infinite numbers\. Nothing was overwritten"):
-        run_training(training, lambda: save_checkpoint(job.out, training, head), Recorder(), lambda: True)
+        run_training(training, lambda: save_checkpoint(job.out, training, head), (), lambda: True)
     assert Path(job.out).read_bytes() == before
 
 
