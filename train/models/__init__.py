@@ -16,8 +16,7 @@ MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, 
 def build_model(name: str, config: Mapping[str, Any]) -> Model:
     """Build the model of that name with new parameters from torch's global generator.
 
-    `config` may leave out what has a default. InputError names an unknown model or field, or a
-    value out of its bounds, so that a foreign checkpoint's configuration can be handed in.
+    Fields of `config` have defaults. InputError names an unknown model or field, or a value out of range.
     """
     if name not in MODELS:
         raise InputError("model", name, "is unknown", choices(MODELS, name))

@@ -1,7 +1,4 @@
-"""What a robot is given of its cloud: the points within its reach of the target, coloured and shifted.
-
-Every model takes its cloud from here and from nowhere else, so that all see the same.
-"""
+"""Crop each robot's cloud to the points within its reach of the target; the input of all models."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ TARGET_RGB = (0.0, 77.0, 77.0)
 class Crop:
     """K points for each of R robots; rows that are not `valid` are zero and come last.
 
-    Frame: xy is the target frame's; z is counted from the arm's mount instead, upwards.
+    Frame: x and y of the target frame; z is the height above the arm's mount.
     """
 
     points_m: Tensor  # (R, K, 3) float32
@@ -34,8 +31,8 @@ class Crop:
 def crop_clouds(clouds: Clouds[Tensor], robots: RobotInputs[Tensor], n_points: int) -> Crop:
     """The first `n_points` stored points of each robot's cloud within `arm_reach_m` of the target, in 3D.
 
-    Stored order: the head of a cloud is in farthest-point order, so that what is taken covers it.
-    Rows beyond a cloud's own `n_points`, and points that are not finite, are never taken.
+    In stored order, whose first points are a farthest-point sample. Padding and points that are not finite
+    are left out.
     """
     device = clouds.points_m.device
     stored = clouds.points_m[robots.cloud_row]  # (R, P, 3)

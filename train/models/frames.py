@@ -1,7 +1,4 @@
-"""A candidate's own frame, and what stands where in it: beside the line of sight, and in the arm's way.
-
-Axes: x from the base to the target, y left, z up; origin at the target's centre.
-"""
+"""Features in a candidate's own frame: x from base to target, y left, z up; origin at the target's centre."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ N_SCALARS = 14
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Candidates (..., ) as their robots stand there; every field has the same leading dimensions."""
+    """The robot at each candidate; every field has the same leading dimensions."""
 
     forward: Tensor  # (..., 2) of length 1 from base to target; 0 where the base is below the target
     planar_m: Tensor  # (...) from base to target, horizontally
@@ -32,7 +29,7 @@ class Frames:
     target_radius_m: Tensor  # (...)
 
     def steering(self) -> Tensor:
-        """(..., 4): the frame's axis, and the axis of twice its angle."""
+        """(..., 4): the frame's axis (cos, sin), and the axis of twice its angle."""
         return torch.cat([self.forward, doubled(self.forward)], dim=-1)
 
     def scalars(self) -> Tensor:
@@ -70,13 +67,11 @@ def frames_of(
 
 
 def pair_features(frames: Frames, centres_m: Tensor) -> Tensor:
-    """(..., J, N_PAIR_FEATURES) of places (..., J, 3), target frame, for candidates (...).
+    """Features (..., J, N_PAIR_FEATURES) of positions (..., J, 3), target frame, for candidates (...).
 
-    The first one is positive on the left; the others are the same on both sides.
-
-    What is not linear in the place: its offsets from the line of sight as a camera would see them on
-    the target, in target radii, how far before the target it is, and its distances from the mount and from
-    the straight line between mount and target.
+    The offset from the line of sight as projected to the target, in target radii (its first component is
+    positive on the left and changes its sign in a mirror, all others do not); the distance in front of the
+    target; and the distances to the mount and to the straight line between mount and target.
     """
     ahead, left = turned(centres_m[..., :2], frames.forward[..., None, :]).unbind(-1)
     up = centres_m[..., 2]
@@ -86,13 +81,13 @@ def pair_features(frames: Frames, centres_m: Tensor) -> Tensor:
 
     eye = torch.hypot(planar, camera_rise).clamp(min=_MIN_LENGTH_M)
     cosine, sine = planar / eye, camera_rise / eye
-    before = up * sine - ahead * cosine  # the target, towards the camera
+    before = up * sine - ahead * cosine  # distance in front of the target, towards the camera
     scale = eye / ((eye - before).clamp(min=0.1 * eye) * radius)
     side, height = left * scale, (up * cosine + ahead * sine) * scale
     aside2 = side * side + height * height
     before = before / radius
 
-    along, above = ahead + planar, up + rise  # the mount
+    along, above = ahead + planar, up + rise  # from the mount
     line2 = (planar * planar + rise * rise).clamp(min=_MIN_LENGTH_M**2)
     share = ((along * planar + above * rise) / line2).clamp(0, 1)
     left2 = left * left
@@ -115,9 +110,9 @@ def pair_features(frames: Frames, centres_m: Tensor) -> Tensor:
 
 
 def target_features(frames: Frames, tokens: Tokens, robot_row: Tensor) -> tuple[Tensor, Tensor]:
-    """The target's size and shape as candidates of the given robots have it before them.
+    """The target's size and shape in the candidates' frames.
 
-    (N, F) of what is the same in a mirror, and (N, G) of what changes its sign.
+    Features (N, F) that a mirror leaves unchanged, and (N, G) whose sign it changes.
     """
     vectors = turned(tokens.target_vectors[robot_row], frames.forward[:, None])
     tensors = turned(tokens.target_tensors[robot_row], doubled(frames.forward)[:, None])

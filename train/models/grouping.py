@@ -1,4 +1,4 @@
-"""Choosing points in plain torch, for many clouds at once: the first of a kind, the farthest, those near."""
+"""Choose points of many clouds at once, in plain torch: first ones, farthest points, ball queries."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ T = TypeVar("T")
 
 
 def first_true(mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Where the first `count` true entries of (..., K) are: rows (..., count), and which of them there are.
-
-    Rows beyond those found are 0.
-    """
+    """Rows (..., count) of the first true entries of (..., K), 0 beyond the last, and a mask of those found."""
     rank = mask.cumsum(-1)  # 1 for the first one
-    # All that is left out goes to slot 0, which is cut off.
+    # Other entries go to slot 0, which is cut off.
     slot = torch.where(mask & (rank <= count), rank, 0)
     rows = torch.zeros((*mask.shape[:-1], count + 1), dtype=torch.int64, device=mask.device)
     rows.scatter_(-1, slot, torch.arange(mask.shape[-1], device=mask.device).expand(slot.shape))
@@ -28,8 +25,7 @@ def first_true(mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
 def farthest_points(points: Tensor, valid: Tensor, count: int) -> Tensor:
     """Rows (B, count) of a farthest-point sample of each cloud (B, M, 3), beginning with the first row.
 
-    Valid rows come first in a cloud. Where a cloud has fewer than `count` different points the last
-    rows repeat earlier ones; what they are where nothing is valid means nothing.
+    Valid rows come first in a cloud. Clouds with fewer than `count` different points repeat earlier rows.
     """
     chosen = torch.zeros((len(points), count), dtype=torch.int64, device=points.device)
     gap2 = torch.where(valid, torch.inf, -1.0).to(points.dtype)  # (B, M), to the nearest chosen point
@@ -47,8 +43,8 @@ def ball_query(
 ) -> tuple[Tensor, Tensor]:
     """The first `count` valid rows of each cloud (B, M, 3) within `radius` of its centres (B, J, 3).
 
-    Returns rows (B, J, count), filled up with the first one found (0 where none is), and how many
-    were found (B, J), at most `count`. PointNet++ (Qi et al. 2017) groups so.
+    Rows (B, J, count), padded with the first one found (0 without one), and the number found (B, J), as in
+    PointNet++ (Qi et al. 2017).
     """
     gap2 = (centres[:, :, None] - points[:, None]).square().sum(3)  # (B, J, M)
     rows, found = first_true(valid[:, None] & (gap2 <= radius**2), count)

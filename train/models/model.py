@@ -1,4 +1,4 @@
-"""What a model is to everything else: a module with a name, a configuration and `score`."""
+"""The interface of models: a module with a name, a configuration and `score`."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ ConfigT = TypeVar("ConfigT", bound="ModelConfig")
 
 
 class ModelConfig(BaseModel):
-    """The sizes and options of a model: frozen, every number bounded, nothing unknown let in."""
+    """The sizes and options of a model; every number has bounds, unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Model(nn.Module, ABC):
-    """Scores base positions from what a robot sees.
+    """Scores base positions from a robot's cloud.
 
-    `config` holds plain values that JSON can hold; with `name` it is all that
-    `datagen.train.models.build_model` needs to make the same module again, but for its parameters.
+    `config` has JSON values; `name` and `config` are all that `build_model` needs to rebuild the module.
     """
 
     name: ClassVar[str]
-    # Methods of tensors alone in which the time goes: what `fast` compiles.
+    # Methods that take most of the time, of tensors alone: `fast` compiles them.
     hot: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
@@ -58,8 +57,7 @@ class Model(nn.Module, ABC):
 def fast(model: Model) -> Model:
     """The same model, on CUDA with its hot methods compiled and matrix products in bfloat16.
 
-    On a CPU it is returned as it is: there the compiler's minutes buy little. Parameters, and so
-    checkpoints, stay as they are.
+    On a CPU it is returned unchanged. Parameters and checkpoints are the same.
     """
     if model.device.type != "cuda":
         return model
@@ -78,7 +76,7 @@ def fast(model: Model) -> Model:
 
 
 def read_config(kind: type[ConfigT], name: str, config: Mapping[str, Any]) -> ConfigT:
-    """`config` as the model's own; InputError names the first field that is wrong."""
+    """Validate a configuration. InputError names the first field that is wrong."""
     try:
         return kind.model_validate(dict(config))
     except ValidationError as error:

@@ -1,20 +1,17 @@
-"""The paper's model: each candidate is put into the cloud as points, and PointNet++ reads the whole.
+"""The paper's model: each candidate is added to the cloud as points, and PointNet++ reads the cloud.
 
 GBPP, arXiv 2509.11594: points (x, y, z, r, g, b) within the arm's reach of the target, z shifted by the
 height of the base, the target in one colour, the candidate as 50 black points at (x, y, 0); PointNet++
 (Qi et al. 2017, arXiv 1706.02413) with three set-abstraction layers; a head 1024 -> 512 -> 256 -> 2 with
 BatchNorm and Dropout. Every candidate costs a pass through the network.
 
-Ours, where the paper is silent:
+Our choices where the paper gives none:
 
-- z = 0 of the candidate's points is in the shifted frame, so that they lie at the arm's mount.
-- Sizes and radii are those of PointNet++'s single-scale classifier. Lengths stay metric (its clouds were
-  scaled to a unit sphere; ours lie within at most 1 m of the target, so that its radii fit).
-- Colours run from 0 to 1. Nothing but its colour and place tells the candidate from a black object:
-  the six numbers a point leave no room for a mask, and none was added.
-- The 50 points follow the cloud. A ball query takes the first k of a ball, so that they fill what room
-  the surface leaves; they are one point for sampling, which takes it first and then goes through the
-  robot's cloud, whose sample is therefore the same for all candidates and drawn once a robot.
+- The candidate's z = 0 is in the shifted frame, at the height of the arm's mount.
+- Sizes and radii are those of PointNet++'s single-scale classifier, in metres.
+- Colours are between 0 and 1. Only colour and position distinguish the candidate from a black object.
+- The 50 points follow the cloud, so a ball query takes them after the surface's. Farthest-point sampling
+  begins with the candidate as one point and continues in the robot's cloud: one sample a robot.
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ from datagen.train.models.grouping import ball_query, farthest_points, gather_ro
 from datagen.train.models.model import Model, ModelConfig, read_config
 
 CANDIDATE_POINTS = 50
-# Candidates that go through the network together where no gradient is kept: some 20 MB each at full size.
+# Candidates in one pass without gradients: some 20 MB each at full size.
 _CHUNK = 8
 
 Width = Annotated[int, Field(ge=1, le=4096)]
@@ -56,7 +53,7 @@ class PaperConfig(ModelConfig):
 
 @dataclass(frozen=True, eq=False)
 class _Groups:
-    """What grouping is the same for all candidates of a robot: the parts that are of its cloud alone."""
+    """The part of the grouping that is the same for all candidates of a robot."""
 
     crop: Crop
     first: Tensor  # (R, J1 - 1) rows of the cloud: its farthest-point sample
@@ -83,7 +80,7 @@ class PointMlp(nn.Module):
         flat = rows.flatten(0, -2)
         alone = self.training and len(flat) == 1
         if alone:
-            # One row has no spread to be normalised by: what was seen before serves.
+            # One row has no variance: normalise by the running statistics.
             self.layers.eval()
         features = self.layers(flat)
         if alone:
@@ -94,8 +91,8 @@ class PointMlp(nn.Module):
 class PaperModel(Model):
     """PointNet++ over cloud and candidate.
 
-    In training all candidates of a batch go through together, because BatchNorm looks at all of them,
-    and keep some 90 MB each at full size; in evaluation memory is bounded.
+    Because of BatchNorm all candidates of a batch are one pass in training, some 90 MB each at full size; in
+    evaluation memory is bounded.
     """
 
     name = "paper"
@@ -131,7 +128,7 @@ class PaperModel(Model):
         return torch.cat(logits).float()
 
     def _group(self, crop: Crop) -> _Groups:
-        """Robot by robot, so that memory does not grow with their number."""
+        """Groups of each robot, one robot at a time to bound memory."""
         (count, count_wide), (k_near, k_wide) = self.sizes.centroids, self.sizes.neighbours
         first = farthest_points(crop.points_m, crop.valid, count - 1)
         first_valid = torch.arange(count - 1, device=first.device) < crop.valid.sum(1, keepdim=True)
@@ -172,7 +169,7 @@ class PaperModel(Model):
         k, radius = self.sizes.neighbours[0], self.sizes.radii_m[0]
         crop, n = groups.crop, groups.crop.points_m.shape[1]
         centres = gather_rows(crop.points_m, groups.first)
-        # What a smaller cloud lacks in centroids is filled with the candidate.
+        # Missing centroids of a smaller cloud are the candidate.
         centres = torch.where(groups.first_valid[..., None], centres, clump)
         own, own_found = ball_query(crop.points_m, crop.valid, clump, radius, k)
         rows = torch.where(groups.first_valid[..., None], groups.near, own)
@@ -183,7 +180,7 @@ class PaperModel(Model):
         slot = torch.arange(k, device=rows.device)
         room = (slot >= found[..., None]) & (slot < found[..., None] + CANDIDATE_POINTS) & close[..., None]
         rows = torch.where(room, n, rows)
-        # A ball without a surface point is filled up with the candidate.
+        # A ball without a surface point holds the candidate alone.
         return centres, torch.where((found == 0)[..., None], n, rows)
 
     def _second_groups(self, groups: _Groups, clump: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,20 +1,16 @@
-"""Encodes what a robot sees once, and scores all its candidates on that encoding.
+"""Encode a robot's cloud once, and score all its candidates on that encoding.
 
-The cloud becomes 80 tokens: places on the target, near it and further away, with the shape of what is
-around them (`tokens.py`). A candidate sees each token from its own frame: what has a direction is
-turned into the frame, and offsets from its line of sight and from its arm's way are added
-(`frames.py`). A first layer over all of that is linear, so that the part that belongs to the
-token is worked out once for all candidates, and the part that turns is a product with (cos, sin, cos 2,
-sin 2) of the frame's angle:
+The cloud becomes 80 tokens: points on the target, near it and further away, with the shape of their
+surroundings (`tokens.py`). Each candidate has the tokens in its own frame: directions are rotated into it,
+and offsets from its line of sight and from the arm's straight path are added (`frames.py`). The first layer
+is linear in all of that: the token's part is computed once for all candidates, and the rotated part is a
+product with (cos, sin, cos 2, sin 2) of the frame's angle:
 
     token_kj = relu(A f_j + turn_k(V f_j) + B g_kj + C s_k)
 
 then a small layer, and the maximum and the mean over each kind of token, joined with the candidate's
-scalars s_k. The logits do not change when cloud and candidates are turned together about the vertical.
-Nor, if `mirrored`, when what is to the left of each candidate's line to the target is put to its right:
-what tokens say is then read both ways, and the mean taken.
-
-The computation is the same in training and in evaluation (LayerNorm, no BatchNorm).
+scalars s_k. The logits do not change when cloud and candidates rotate together about the vertical, nor, if
+`mirrored`, when the scene is mirrored at a candidate's line to the target: the mean over both sides is taken.
 """
 
 from __future__ import annotations
@@ -51,13 +47,13 @@ from datagen.train.models.tokens import (
 )
 from datagen.train.observed_visibility import visible_shares
 
-# Candidates that are worked on together: their tokens stay in a core's cache. A GPU wants more at once.
+# Candidates in one product: on a CPU their tokens stay in a core's cache.
 _TILE_CPU, _TILE_CUDA = 64, 4096
 # Height of an unknown camera above the mount: the difference of the middles of both ranges in the paper.
 _CAMERA_ABOVE_MOUNT_M = 0.4
 _MIN_REACH_M = 0.05
 _N_VISIBILITY = 3
-# An estimate of what is hidden needs surfaces without gaps: all points of a usual cloud.
+# The estimate needs surfaces without gaps: all points of a usual cloud.
 _VISIBILITY_POINTS = 4096
 
 Width = Annotated[int, Field(ge=1, le=1024)]
@@ -68,10 +64,9 @@ Scale = Annotated[float, Field(gt=0, le=10)]
 class SharedConfig(ModelConfig):
     """Sizes and inputs of the shared model.
 
-    `camera`: "given", or "unknown" for what `paper` sees, which knows the robot's mount and not its camera.
-    `observed_visibility`: also give rho as `datagen.train.observed_visibility` estimates it from the robot's
-    crop, on the CPU.
-    `mirrored`: the arm is taken to do on its left what it does on its right.
+    `camera`: "given", or "unknown" as for `paper`, which has the height of the mount and not of the camera.
+    `observed_visibility`: add rho, estimated on the CPU from the robot's crop. `mirrored`: treat left and
+    right alike.
     """
 
     n_points: int = Field(default=1024, ge=1, le=65_536)
@@ -97,7 +92,7 @@ def mlp(width_in: int, widths: Sequence[int], width_out: int) -> nn.Sequential:
 
 
 class SharedModel(Model):
-    """Tokens of a robot's cloud, read from each candidate's frame."""
+    """Tokens of a robot's cloud in each candidate's frame."""
 
     name = "shared"
     hot = ("_pool",)
@@ -145,7 +140,7 @@ class SharedModel(Model):
         return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
-        """What of the clouds is the same for all candidates; it has no parameters, so it can be kept."""
+        """The clouds' tokens, the same for all candidates; without parameters, so they can be cached."""
         with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
             return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
@@ -157,7 +152,7 @@ class SharedModel(Model):
         candidates: CandidateInputs[Tensor],
         robots: RobotInputs[Tensor],
     ) -> Tensor:
-        """Logits (N, 2) from what `encode` gave for the same clouds and robots."""
+        """Logits (N, 2) from the tokens that `encode` returned for these clouds and robots."""
         with torch.no_grad(), torch.autocast(candidates.base_xy_m.device.type, enabled=False):
             frames = self._frames(tokens, clouds, candidates, robots)
             target, target_left = target_features(frames, tokens, candidates.robot_row)
@@ -206,7 +201,7 @@ class SharedModel(Model):
     def _steered(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """The tokens' linear part, to be multiplied with 1 and `Frames.steering`.
 
-        (R, 5, J, W) of what is the same in a mirror, (R, 4, J, W) of what changes its sign.
+        (R, 5, J, W) that a mirror leaves unchanged, (R, 4, J, W) whose sign it changes.
         """
         hidden = self.token[:-1](tokens.numbers)
         gates = 2 * torch.sigmoid(self.gates(hidden))[..., None]
@@ -233,7 +228,7 @@ class SharedModel(Model):
         centres_m: Tensor,
         valid: Tensor,
     ) -> Tensor:
-        """(r, c, 1 or 2, F) of c candidates each of r robots: what tokens say, and in a mirror."""
+        """Pooled tokens (r, c, 1 or 2, F) of c candidates each of r robots; the second in the mirrored scene."""
         steering = frames.steering()
         pairs = pair_features(frames, centres_m[:, None])
         weight = self.pair.weight
@@ -258,8 +253,8 @@ class SharedModel(Model):
 def tiles(robot_row: Tensor, size: int) -> list[tuple[Tensor, Tensor]]:
     """Robots (r,) and rows (r, c) of candidates of each, r c <= size; together they hold every row once.
 
-    `robot_row` (N,) names the candidates' robots. What a robot has is cut into pieces of at most `size`,
-    and pieces of equal length lie together, so that nothing is padded.
+    `robot_row` (N,) has the candidates' robots. A robot's rows are cut into pieces of at most `size`, and
+    pieces of equal length are joined, without padding.
     """
     order = torch.argsort(robot_row, stable=True)
     robots, counts = torch.unique_consecutive(robot_row[order], return_counts=True)

@@ -1,9 +1,9 @@
-"""What a robot sees as tokens: places in its cloud, each with the shape and colour of what is around it.
+"""Tokens of a robot's cloud: points, each with the shape and colour of its surroundings.
 
-Nothing here depends on a candidate or has parameters. What a token says is sorted by how it turns when the
-scene is turned about the vertical: numbers that stay, vectors that turn along, and second-order tensors
-that turn twice as fast; so a candidate's own frame can be had by a product (`frames.py`). In a
-mirror along a candidate's line to the target numbers stay as well, and what is to the left changes its sign.
+Nothing here depends on a candidate or has parameters. Features are grouped by how they rotate with the scene
+about the vertical: numbers (invariant), vectors, and second-order tensors (with twice the angle), so that
+rotation into a candidate's frame is a product (`frames.py`). In a mirror along a candidate's line to the
+target numbers are invariant too, and components to the left change their sign.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ N_KINDS = 3  # on the target, near it, further away
 
 @dataclass(frozen=True, eq=False)
 class Tokens:
-    """J places in each of R robots' clouds, and the target as a whole. Rows not `valid` are zero.
+    """J points in each of R robots' clouds, and the target as a whole. Rows not `valid` are zero.
 
     Vectors and tensors are pairs: a tensor (a, b) is that of a symmetric 2 x 2 matrix [[a, b], [b, -a]] / 2.
     """
@@ -58,7 +58,7 @@ TARGET_NUMBERS, TARGET_VECTORS, TARGET_TENSORS = 6, 2, 1
 
 
 def token_sizes(n_scales: int) -> TokenSizes:
-    """Widths of what `tokens_of` gives."""
+    """Widths of the features of `tokens_of`."""
     vectors, tensors = 2 * n_scales, n_scales
     numbers = 11 * n_scales + 2 * (vectors + tensors) + 4 + 3 + N_KINDS
     return TokenSizes(numbers, vectors + 2, tensors + 1)
@@ -67,8 +67,8 @@ def token_sizes(n_scales: int) -> TokenSizes:
 def tokens_of(crop: Crop, counts: tuple[int, int, int], near_m: float, scales_m: Sequence[float]) -> Tokens:
     """Tokens at the first `counts` points, in stored order, on the target, within `near_m` of it, beyond.
 
-    At each scale a token has the moments of the points around it, weighed by 1 - (d / scale)^2: how many
-    they are, their mean colour and share of target, their mean place and its covariance.
+    At each scale a token has the moments of the points around it, weighted by 1 - (d / scale)^2: their
+    number, mean colour, share of target, mean position and its covariance.
     """
     points = target_frame_points(crop)
     distance = torch.linalg.vector_norm(points, dim=2)
@@ -144,10 +144,7 @@ def target_frame_points(crop: Crop) -> Tensor:
 
 
 def turned(v: Tensor, axis: Tensor) -> Tensor:
-    """Pairs (..., 2) as seen from axes (..., 2): (along, to the left), for axes of length 1.
-
-    The product of v with the axis' conjugate, as complex numbers.
-    """
+    """Pairs (..., 2) in the frame of unit axes (..., 2): (along, to the left), v times the axis' conjugate."""
     x, y = v.unbind(-1)
     c, s = axis.unbind(-1)
     return torch.stack([x * c + y * s, y * c - x * s], dim=-1)
@@ -160,7 +157,7 @@ def doubled(axis: Tensor) -> Tensor:
 
 
 def _moment_sums(centres: Tensor, points: Tensor, lifted: Tensor, scales_m: Sequence[float]) -> list[Tensor]:
-    """Weighed sums (R, J, F) of `lifted` (R, K, F) around centres (R, J, 3), a tensor for each scale."""
+    """Weighted sums (R, J, F) of `lifted` (R, K, F) around centres (R, J, 3), a tensor for each scale."""
     sums: list[list[Tensor]] = [[] for _ in scales_m]
     for c, p, values in zip(centres, points, lifted, strict=True):  # a robot's (J, K) fits a cache
         x, y, z = (c[:, None, k] - p[None, :, k] for k in range(3))
@@ -174,7 +171,7 @@ def _moment_sums(centres: Tensor, points: Tensor, lifted: Tensor, scales_m: Sequ
 
 
 def _moments(sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean place (..., 3), covariance (..., 6), mean of colour and mask (..., 4) from sums (..., 14)."""
+    """Mean position (..., 3), covariance (..., 6), mean of colour and mask (..., 4) from sums (..., 14)."""
     means = sums[..., 1:] / sums[..., :1].clamp(min=1e-6)
     place, products, rest = means.split([3, 6, 4], dim=-1)
     return place, products - place[..., _LEFT] * place[..., _RIGHT], rest
