@@ -117,10 +117,7 @@ class ColourJitter(_Effect):
 
 @dataclass(frozen=True)
 class Rotation(_Effect):
-    """Rotation of cloud and candidates about the vertical axis through the target.
-
-    The angle is uniform in [-largest_rad, largest_rad].
-    """
+    """Rotation of cloud and candidates about the vertical axis through the target, up to largest_rad."""
 
     largest_rad: float = _up_to(pi, pi)
 

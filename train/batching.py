@@ -47,10 +47,7 @@ class StoredScene:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A scene in one epoch: the cloud and the selected candidates.
-
-    `rows` are the candidates' rows among the scene's samples, grouped by robot.
-    """
+    """A scene in one epoch: the cloud and the selected candidates, as rows of the scene's samples."""
 
     scene: StoredScene
     rows: Rows  # (k,)
@@ -111,10 +108,7 @@ def stored_view(scene: StoredScene, rows: Rows) -> View:
 
 
 def candidate_rows(robot_index: Ints, per_robot: int | None, rng: np.random.Generator) -> Rows:
-    """Rows of the candidates by ascending robot; of each robot at most `per_robot`, at random.
-
-    Candidates of one robot keep their stored order.
-    """
+    """Rows by ascending robot, in stored order; at most `per_robot` random ones of each robot."""
     if per_robot is None:
         return np.argsort(robot_index, kind="stable")
     drawn = np.lexsort([rng.random(len(robot_index)), robot_index])

@@ -11,10 +11,7 @@ from datagen.train.inputs import I64
 
 @dataclass(frozen=True, eq=False)
 class EpochPlan:
-    """Batch i of one rank is `order[cuts[i]:cuts[i + 1]]`, rows of the scene table.
-
-    `buffer` (n,) is ascending: scenes with one number are read together.
-    """
+    """Batch i of a rank is `order[cuts[i]:cuts[i + 1]]`; scenes of one `buffer` are read together."""
 
     order: I64  # (n,)
     buffer: I64  # (n,)
@@ -22,10 +19,7 @@ class EpochPlan:
 
 
 def batches_of(n_scenes: int, scenes_per_batch: int, world: int) -> int:
-    """Number of batches per rank, so that none is larger than requested and none is empty.
-
-    Where every batch has one scene, the latter overrides: some then have two.
-    """
+    """Number of batches per rank: none is empty, and none larger than requested where scenes suffice."""
     largest_rank = -(-n_scenes // world)
     return max(1, min(-(-largest_rank // scenes_per_batch), n_scenes // world))
 

@@ -117,10 +117,7 @@ def fit_leaving_houses_out(
     seed: int,
     step: Callable[[], None] = lambda: None,
 ) -> LeftOut:
-    """Divide houses into `FOLDS` folds, and label the candidates of each by a rule fitted on the others.
-
-    Needs at least two houses (`refuse_too_little`). InputError where one fold has all candidates of a class.
-    """
+    """Label the candidates of each of `FOLDS` folds of houses by a rule fitted on the other folds."""
     houses, house = np.unique(trials.house.astype(str), return_inverse=True)
     folds = min(FOLDS, len(houses))
     dealt = np.random.default_rng([seed, 0]).permutation(len(houses)) % folds
@@ -176,7 +173,7 @@ def agreements(trials: Trials, said: Sequence[Bools], resamples: int, seed: int)
 
 
 def reach_in_sigmas(visible: F64, params: HeuristicParams) -> F64:
-    """How many sigmas from mu H is tau, for visibility scores (N,); nan where H is below tau even at mu.
+    """Distance |d - mu| (N,) in sigmas at which H is tau, from visibility scores; nan where H < tau at mu.
 
     From a exp(-k^2 / 2) = (tau - alpha vis) / (1 - alpha). Requires tau > alpha vis.
     """
@@ -231,10 +228,7 @@ def _with_best_sigmas(
 
 
 def _best_cut(needed: F64, gains: I64, otherwise: float) -> tuple[int, float]:
-    """The gain of calling good what needs at most sigma (M,), and sigma in the middle of its gap.
-
-    `otherwise` where there is nothing on this side.
-    """
+    """The best gain of positives that need at most sigma (M,), and sigma; `otherwise` for no rows."""
     if not len(needed):
         return 0, otherwise
     order = np.argsort(needed)

@@ -73,10 +73,7 @@ class CandidateInputs(Generic[A]):
 
 @dataclass(frozen=True, eq=False)
 class Batch(Generic[A]):
-    """Candidates with their labels. `extra` holds further columns of the store that were asked for.
-
-    Columns of samples have N rows, columns of scenes S rows; text stays numpy.
-    """
+    """Candidates with labels. `extra`: further columns with N rows (samples) or S rows (scenes)."""
 
     clouds: Clouds[A]
     robots: RobotInputs[A]

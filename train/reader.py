@@ -35,11 +35,9 @@ JOIN_FIELDS = ("scene_index", "sample_scene_index")
 
 
 class SampleReader:
-    """Shards of one or more runs, merged or not, sealed or not; also of a sealed store that came alone.
+    """Shards of one or more runs, merged or not, sealed or not; also of a sealed store without its run.
 
-    `scene_fields` and `sample_fields` choose what is read (text fields on request). Float16 clouds
-    come as float32. A run that lacks planned samples is read with `allow_incomplete` alone. InputError
-    names what is missing, foreign or damaged.
+    `scene_fields` and `sample_fields` choose the columns. Float16 clouds are returned as float32.
     """
 
     def __init__(
@@ -78,10 +76,7 @@ class SampleReader:
 
 
 def load_shard(place: ShardPlace, arrays: Mapping[str, StoredArray]) -> tuple[Columns, I64]:
-    """A shard's columns, and the bounds (scenes + 1,) of each scene's samples, which lie together.
-
-    `arrays` must include JOIN_FIELDS. InputError where the samples do not follow their scenes.
-    """
+    """A shard's columns (with JOIN_FIELDS), and the bounds (scenes + 1,) of each scene's samples."""
     columns = place.read(arrays.values())
     scenes, owners = columns["scene_index"], columns["sample_scene_index"]
     bounds = np.append(np.searchsorted(owners, scenes), len(owners)).astype(np.int64)

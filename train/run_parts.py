@@ -25,8 +25,8 @@ _SEALED_FIX = "Seal the run again, and copy the whole data.zarr"
 class RunPart:
     """One run's shards and arrays, or those of a sealed store without its run.
 
-    `spec_hashes` and `specs` have several where such a store was merged. `cost` adds up the commits' wall
-    and CPU seconds, with those of the labels that a run was relabelled from; None where no commit came along.
+    A merged store has several `spec_hashes` and `specs`. `cost` is the sum over commits of wall and CPU
+    seconds, with those of the labels that a run was relabelled from; None for a sealed store.
     """
 
     place: str
@@ -42,11 +42,10 @@ class RunPart:
 def open_parts(
     places: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
 ) -> list[RunPart]:
-    """The runs of all places, in order, with the named arrays, which are alike in all of them.
+    """The runs of all places, in order, with the named arrays, whose types are equal in all of them.
 
-    InputError where a place is no run, of a schema that this program does not know, without such a field,
-    or lacks samples that its plan has (without any, if `allow_incomplete`), and where two of them store a
-    field differently.
+    InputError for a place without a run, an unknown schema, a missing field, or missing samples of the plan
+    (unless `allow_incomplete`).
     """
     if not places:
         raise InputError("training data", "", "no run is given", "Name at least one run folder")
@@ -149,10 +148,7 @@ def is_sealed_store(place: Path | str) -> bool:
 
 
 def open_sealed(place: Path | str, names: Sequence[str]) -> RunPart:
-    """A sealed store that is read without its run, with the named arrays, by its own attributes.
-
-    InputError when it is not a sealed store, of a schema that this program does not know, or lacks a field.
-    """
+    """A sealed store without its run, with the named arrays, described by its own attributes."""
     storage = open_storage(place, probe=False, create=False)
     data = storage.get("zarr.json", 64 * MAX_META_BYTES)
     where = f"{storage.url}/zarr.json"

@@ -13,7 +13,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import I64, Ints
-from datagen.train.reader import JOIN_FIELDS, Columns, load_shard
+from datagen.train.reader import JOIN_FIELDS, load_shard
 from datagen.train.run_parts import RunPart, refuse_twins
 
 TABLE_FIELDS = (
@@ -40,15 +40,11 @@ class PartSummary:
 
 @dataclass(frozen=True, eq=False)
 class SceneTable:
-    """One row a scene that counts and has samples, in stored order.
+    """One row a selected scene that has samples, in stored order."""
 
-    `shard` is its shard's place among all shards of all parts, `row` its row there, `samples` what an
-    epoch takes of it.
-    """
-
-    shard: I64  # (S,), ascending
-    row: I64  # (S,)
-    samples: I64  # (S,)
+    shard: I64  # (S,), ascending, among all shards of all parts
+    row: I64  # (S,), in the shard
+    samples: I64  # (S,), of an epoch
     house_of_digest: Mapping[str, str]  # house_digest -> house_id
     house_ids: frozenset[str]
     object_digests: frozenset[str]  # of targets and clutter
@@ -63,16 +59,14 @@ def read_scene_table(
 ) -> SceneTable:
     """The scenes of the houses that count. InputError where there is none, or a run is named twice."""
     refuse_twins(parts)
-    shard: list[int] = []
-    row: list[int] = []
-    samples: list[int] = []
+    rows: list[tuple[int, int, int]] = []  # shard, row, samples
     house_of_digest: dict[str, str] = {}
     house_ids: set[str] = set()
     objects: set[str] = set()
     summaries: list[PartSummary] = []
     number = 0
     for part in parts:
-        digest, begun = hashlib.sha256(), len(shard)
+        digest, begun = hashlib.sha256(), len(rows)
         counts = np.zeros(2, np.int64)
         for place in part.shards:
             columns, bounds = load_shard(place, {name: part.arrays[name] for name in TABLE_FIELDS})
@@ -83,36 +77,24 @@ def read_scene_table(
                     continue
                 label = columns["label"][first:past]
                 if label.max() > 1:
-                    where, fix = (
-                        f"{place.storage.url}/{place.folder}",
-                        "Repair the run with `datagen repair`",
-                    )
-                    raise InputError(where, "label", f"a label of {label.max()}", fix)
+                    where, problem = f"{place.storage.url}/{place.folder}", f"a label of {label.max()}"
+                    raise InputError(where, "label", problem, "Repair the run with `datagen repair`")
                 digest.update(columns["sample_id"][first:past].tobytes())
                 digest.update(label.tobytes())
                 counts += np.bincount(label, minlength=2)
-                shard.append(number)
-                row.append(scene)
-                samples.append(_taken(columns["robot_index"][first:past], per_robot))
+                rows.append((number, scene, _taken(columns["robot_index"][first:past], per_robot)))
                 house_ids.add(house)
                 house_of_digest[str(columns["house_digest"][scene])] = house
-                objects |= _texts(columns, "object_digest", scene)
+                objects |= set(map(str, columns["object_digest"][scene]))
             number += 1
         negatives, positives = counts.tolist()
-        summaries.append(PartSummary(part, len(shard) - begun, negatives, positives, digest.hexdigest()))
-    if not shard:
+        summaries.append(PartSummary(part, len(rows) - begun, negatives, positives, digest.hexdigest()))
+    if not rows:
         place = ", ".join(dict.fromkeys(part.place for part in parts))
         problem = "has no scene in the selected houses"
         raise InputError(place, "house_id", problem, "Name more runs, or runs of more houses")
-    return SceneTable(
-        np.array(shard, np.int64),
-        np.array(row, np.int64),
-        np.array(samples, np.int64),
-        house_of_digest,
-        frozenset(house_ids),
-        frozenset(objects),
-        summaries,
-    )
+    numbers = np.array(rows, np.int64).T
+    return SceneTable(*numbers, house_of_digest, frozenset(house_ids), frozenset(objects), summaries)
 
 
 def _taken(robot_index: Ints, per_robot: int | None) -> int:
@@ -120,7 +102,3 @@ def _taken(robot_index: Ints, per_robot: int | None) -> int:
         return len(robot_index)
     _, counts = np.unique(robot_index, return_counts=True)
     return int(np.minimum(counts, per_robot).sum())
-
-
-def _texts(columns: Columns, name: str, row: int) -> set[str]:
-    return {str(text) for text in np.atleast_1d(columns[name][row])}

@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 class Scorer(Protocol):
-    """A method that can be evaluated.
-
-    From `threshold` on a score says label 1. A threshold of nan belongs to a method that only picks: it
-    calls the best-scored of a robot's candidates good, and all others bad.
-    """
+    """A method that can be evaluated: label 1 from `threshold` on; nan: for each robot's best alone."""
 
     @property
     def name(self) -> str: ...
@@ -34,11 +30,7 @@ class Scorer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelScorer:
-    """A model in evaluation mode, whatever mode it is in: its probability of label 1.
-
-    With `only_clear` it is told where the base fits, as the baselines are, and says 0 where it does not:
-    models are trained on places that are clear, and what they make of others means nothing.
-    """
+    """A model's probability of label 1; with `only_clear` 0 where the base is not clear."""
 
     model: Model
     name: str

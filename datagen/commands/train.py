@@ -237,8 +237,7 @@ def _refuse_odd_init(stage: str, init: str | Path | None, needs_one: bool) -> No
 
 def _train(job: TrainingJob, processes: int) -> bool:
     """Run the training; True when it finished, False when it was interrupted."""
-    from datagen.train.training.launching import interruptible, train_in_processes
-    from datagen.train.training.ranks import Ranks
+    from datagen.train.training.launching import Ranks, interruptible, train_in_processes
     from datagen.train.training.training_setup import train_job
 
     with interruptible() as stopping:

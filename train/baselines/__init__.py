@@ -32,11 +32,7 @@ def make_baselines(
     heuristic: HeuristicParams | None = None,
     seed: int = 0,
 ) -> list[Baseline]:
-    """Return the baselines of these names, before fitting.
-
-    `detector` is a folder for `threshold-detector`, `heuristic` the parameters of `analytic`, `seed` that
-    of `scalars`. InputError names an unknown one.
-    """
+    """Return unfitted baselines; `detector` is a folder, `seed` for `scalars`. InputError for other names."""
     for name in names:
         if name not in BASELINES:
             raise InputError("--baselines", name, "is not a baseline", choices(BASELINES, name))
@@ -54,10 +50,7 @@ def make_baselines(
 
 
 def fit_baselines(baselines: Sequence[Baseline], batches: Iterable[Batch[Array]]) -> list[Baseline]:
-    """Fit all of them on the same batches, read with `FIELDS`, from other scenes than the evaluation's.
-
-    The batches are kept in memory: 15 MB for 100 scenes of 4,096 points.
-    """
+    """Fit all of them on the same batches, read with `FIELDS`; kept in memory, 15 MB for 100 scenes."""
     held = list(batches)
     return [baseline.fit(held) for baseline in baselines]
 

@@ -28,10 +28,7 @@ class Baseline(Scorer, Protocol):
         ...
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Self:
-        """Return a copy fitted to the labels, for the best balanced accuracy or likelihood.
-
-        A baseline without parameters returns itself. InputError where all labels are equal.
-        """
+        """Return a copy fitted to the labels. InputError where all labels are equal."""
         ...
 
     def state(self) -> dict[str, Any]:
@@ -93,10 +90,7 @@ def labels(batches: Sequence[Batch[Array]], of: str) -> Bools:
 
 
 def best_cut(score: F64, label: Bools) -> float:
-    """The threshold on scores (N,) with the best balanced accuracy, midway between two scores.
-
-    Of equally good ones the lowest. Both classes must occur.
-    """
+    """The lowest threshold on scores (N,) with the best balanced accuracy, midway between two scores."""
     order = np.argsort(score, kind="stable")
     s, y = score[order], label[order]
     # All rows from k on are positive.

@@ -65,10 +65,7 @@ class ThresholdDetector:
 
 
 def _confidence(detector: ZeroShotDetector, batch: Batch[Array], asked: Bools) -> F64:
-    """Confidences (N,) in [0, 1] from the views of the asked candidates (N,); 0 for others.
-
-    The confidence is that of the best box around the middle of the view, where the target's centre is.
-    """
+    """Scores (N,) of the best boxes around the middle of the asked candidates' views; 0 for others."""
     found = np.zeros(len(batch))
     eyes_m = eyes(batch.clouds, batch.robots, batch.candidates)
     cloud_row = batch.robots.cloud_row[batch.candidates.robot_row]

@@ -28,10 +28,7 @@ class Detections:
 
 
 class ZeroShotDetector:
-    """A zero-shot detector of transformers (OWL-ViT, OWLv2, Grounding DINO) from a local folder.
-
-    Nothing is downloaded. InputError where the folder, the package or a part of the model is missing.
-    """
+    """A zero-shot detector of transformers (OWL-ViT, OWLv2, Grounding DINO) from a local folder."""
 
     def __init__(self, folder: str | Path, device: str = "cpu") -> None:
         where = Path(folder)

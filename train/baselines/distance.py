@@ -18,11 +18,7 @@ _EDGES = 101
 
 @dataclass(frozen=True)
 class DistanceBand:
-    """Positive where low <= d <= high and the base is clear; score: distance from the band's edges.
-
-    d is one of the heuristic's kinds of distance, in metres or shares of the reach. `fit` chooses kind and
-    band.
-    """
+    """Positive where low <= d <= high and the base is clear, d being a distance of the heuristic."""
 
     kind: Kind = "planar"
     low: float = float("nan")

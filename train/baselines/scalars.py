@@ -24,10 +24,7 @@ Layer = tuple[F64, F64]  # weights (out, in), bias (out,)
 
 @dataclass(frozen=True, eq=False)
 class Scalars:
-    """Probability of a positive label by two hidden layers of 32; 0 where the base is not clear.
-
-    Fitted by cross-entropy on clear candidates.
-    """
+    """Probability of a positive label by two hidden layers of 32; 0 where the base is not clear."""
 
     seed: int = 0
     steps: int = 3000

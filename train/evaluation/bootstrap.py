@@ -46,10 +46,7 @@ def resampled_area_under_roc(weights: Weights, true: Bools, score: F64, scene: I
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A value with its resampled values (B,).
-
-    `trials` is the number of scenes of a share of scenes, where each scene counts as 0 or 1.
-    """
+    """A value with its resampled values (B,); `trials` is the number of scenes of a share of scenes."""
 
     value: float
     resamples: F64

@@ -44,10 +44,7 @@ _RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its name among the scores, and its training, which baselines lack.
-
-    Scores in [0, 1] may or may not be probabilities, so this is a field.
-    """
+    """A method: its name among the scores, its threshold and its training."""
 
     name: str
     threshold: float
@@ -73,10 +70,7 @@ def evaluate_set(
     weights: Weights,
     trained_objects: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`.
-
-    InputError where the set is empty, or its labels are all alike.
-    """
+    """Return the report of one candidate set; `weights` (B, S) resample the scenes of `columns`."""
     columns = columns.at(columns.is_in(candidates))
     n, positives = len(columns), int(columns.label.sum())
     if not n:
@@ -158,11 +152,7 @@ def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights
 
 
 def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Estimate]:
-    """What each robot with a good clear candidate is given, on average over such robots.
-
-    The share of good picks, the mean distance of the others to the nearest good candidate, and the average
-    precision of the order in which its clear candidates stand.
-    """
+    """Means over robots with a good clear candidate: good picks, miss distance, average precision."""
     score = columns.scores[method.name]
     chosen = select(score, columns.label, columns.base_xy_m, columns.robot, columns.is_clear)
     scene_of = np.zeros(int(columns.robot.max(initial=-1)) + 1, np.int64)

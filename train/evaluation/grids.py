@@ -13,10 +13,7 @@ from datagen.train.inputs import F64, Bools, Ints
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:
-    """Share (N,) of each group's choice: 1 for the best-scored allowed candidate, 0 for others.
-
-    Of k candidates with the best score each has 1/k. A group without an allowed candidate has no choice.
-    """
+    """Share (N,) of each group's choice: 1/k for its k best-scored allowed candidates, 0 for others."""
     share = np.zeros(len(score))
     rows = np.flatnonzero(allowed)
     if not len(rows):

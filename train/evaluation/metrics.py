@@ -26,10 +26,7 @@ def accuracy(counts: F64) -> F64:
 
 
 def balanced_accuracy(counts: F64) -> F64:
-    """Balanced accuracy (...), the mean of sensitivity and specificity, of confusions (..., 4).
-
-    0.5 for a constant method, however rare positives are.
-    """
+    """Balanced accuracy (...), the mean of sensitivity and specificity, of confusions (..., 4)."""
     found = _ratio(counts[..., 0], counts[..., 0] + counts[..., 2])
     refused = _ratio(counts[..., 3], counts[..., 3] + counts[..., 1])
     return (found + refused) / 2

@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def first_true(mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows (..., count) of the first true entries of (..., K), 0 beyond the last, and a mask of those found."""
+    """Rows (..., count) of the first true entries of (..., K), 0 beyond the last, and a mask."""
     rank = mask.cumsum(-1)  # 1 for the first one
     # Other entries go to slot 0, which is cut off.
     slot = torch.where(mask & (rank <= count), rank, 0)

@@ -228,7 +228,7 @@ class SharedModel(Model):
         centres_m: Tensor,
         valid: Tensor,
     ) -> Tensor:
-        """Pooled tokens (r, c, 1 or 2, F) of c candidates each of r robots; the second in the mirrored scene."""
+        """Pooled tokens (r, c, 1 or 2, F) of c candidates each of r robots; second: mirrored scene."""
         steering = frames.steering()
         pairs = pair_features(frames, centres_m[:, None])
         weight = self.pair.weight

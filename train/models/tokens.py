@@ -144,7 +144,7 @@ def target_frame_points(crop: Crop) -> Tensor:
 
 
 def turned(v: Tensor, axis: Tensor) -> Tensor:
-    """Pairs (..., 2) in the frame of unit axes (..., 2): (along, to the left), v times the axis' conjugate."""
+    """Pairs (..., 2) in the frame of unit axes (..., 2): (along, left), v times the axis' conjugate."""
     x, y = v.unbind(-1)
     c, s = axis.unbind(-1)
     return torch.stack([x * c + y * s, y * c - x * s], dim=-1)

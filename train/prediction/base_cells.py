@@ -70,10 +70,7 @@ def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Can
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:
-    """Share of the disc around the target, from above, in which anything was measured.
-
-    `cloud_m` (N, 3) has the target's centre as origin.
-    """
+    """Share of the disc around the target, from above, with a point of the cloud (N, 3, target frame)."""
     n, cell_m = int(np.ceil(radius_m / 0.05)), 0.05
     hit = _occupied(cloud_m, np.full(2, -n * cell_m), cell_m, (2 * n, 2 * n))
     centres = (np.arange(2 * n) + 0.5 - n) * cell_m

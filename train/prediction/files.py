@@ -69,10 +69,7 @@ def valid_depth(depth_m: F32) -> F32:
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float, int, int]:
-    """(fx, fy, cx, cy, width, height) of a JSON object; `ppx` and `ppy` may stand for `cx` and `cy`.
-
-    Pixels are those of the file: cameras and OpenCV put the centre of the first pixel at 0.
-    """
+    """(fx, fy, cx, cy, width, height) of a JSON object (or `ppx`, `ppy`); pixel centres are integers."""
     node = _document(path)
     names = {**{name: (name,) for name in _INTRINSICS}, "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
     found = {key: n for key, keys in names.items() for k in reversed(keys) if (n := node.find(k))}

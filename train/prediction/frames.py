@@ -64,10 +64,7 @@ class RgbdImage:
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
 
     def facets(self, T: F64) -> F64:
-        """Area times normal (H, W, 3), turned to the camera, of what each pixel sees; in T's parent frame.
-
-        From smoothed depth: a pixel's own neighbours are nearer to it than a stereo camera's noise is wide.
-        """
+        """Area times normal (H, W, 3) of each pixel from smoothed depth, towards the camera; T's parent frame."""
         known = (self.depth_m > 0).astype(np.float32)
         weight = np.asarray(ndimage.uniform_filter(known, 7), np.float32)
         smooth = np.asarray(ndimage.uniform_filter(self.depth_m, 7), np.float32) / np.maximum(weight, 1e-6)
@@ -85,11 +82,7 @@ class RgbdImage:
 
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
-    """Measured points in the camera's frame: x right, y down, z forward (OpenCV, RealSense optical).
-
-    `on_target` is None where nothing says which points are the target's; `T_world_camera` where the
-    frame came without a pose; `image` for a cloud that came without a picture.
-    """
+    """Points in the camera's frame: x right, y down, z forward (OpenCV); None where the input lacks it."""
 
     place: str
     points_m: F32  # (N, 3)
@@ -108,10 +101,7 @@ def read_frame(
     pose: str | Path | None = None,
     depth_scale_m: float = DEPTH_SCALE_M,
 ) -> SensorFrame:
-    """A frame of two aligned pictures and a JSON file of intrinsics, each as `files.py` has it.
-
-    InputError where a file is missing or no such thing, or where sizes differ.
-    """
+    """A frame of two aligned images and a JSON file of intrinsics. InputError for bad or unequal files."""
     colour, depth_m = read_rgb(Path(rgb)), read_depth(Path(depth), depth_scale_m)
     fx, fy, cx, cy, width, height = read_intrinsics(Path(intrinsics))
     chosen = None if mask is None else read_mask(Path(mask))
@@ -144,11 +134,7 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
 
 
 def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, str]) -> SensorFrame:
-    """The frame of a picture; `places` says where rgb, depth and mask come from.
-
-    InputError for pictures of different sizes, for depth that is missing everywhere, and for a mask
-    that selects nothing.
-    """
+    """The frame of an image; `places` names the sources of rgb, depth and mask in errors."""
     where = {name: places.get(name, name) for name in ("rgb", "depth", "mask")}
     for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
         if picture is not None and picture.shape[:2] != image.depth_m.shape:

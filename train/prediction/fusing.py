@@ -59,10 +59,7 @@ def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
 
 
 def join_target(seen: SeenPoints, center_m: F64, radius_m: float, support_m: float) -> SeenPoints:
-    """The cloud with those points marked too that hang together with the target's, above its support.
-
-    What a frame without a mask saw of the target's other sides joins it; nothing beyond its sphere does.
-    """
+    """The cloud with points above the support marked too that are connected to the target's."""
     free = (np.linalg.norm(seen.points_m - center_m, axis=1) < 1.1 * radius_m) & ~seen.on_target
     free &= seen.points_m[:, 2] > support_m + 0.008
     rows, marked = np.flatnonzero(free), seen.on_target.copy()

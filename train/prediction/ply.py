@@ -35,10 +35,7 @@ class PlyCloud:
 
 
 def read_ply(path: Path) -> PlyCloud:
-    """The finite vertices of a file: x, y, z, and where it has them red, green, blue, and target.
-
-    InputError for a header that is not one, or that promises other vertices than the file holds.
-    """
+    """The finite vertices of a file: x, y, z, and optionally red, green, blue, and target."""
     data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
     form, count, properties, start = _header(path, data)
     if not count:
@@ -49,7 +46,7 @@ def read_ply(path: Path) -> PlyCloud:
         what = f"no property {missing[0]}" if missing else "a property named twice"
         raise InputError(path, "element vertex", what, _FIX)
     body = memoryview(data)[start:]
-    columns = (_ascii if form == "ascii" else _binary)(path, body, count, properties, _FORMATS[form])
+    columns = _columns(path, body, count, properties, _FORMATS[form])
     with np.errstate(over="ignore"):  # doubles beyond float32 are infinite, and are left out below
         points = np.stack([columns[axis].astype(np.float32) for axis in "xyz"], axis=1)
     finite = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e4).all(axis=1)
@@ -102,23 +99,19 @@ def _count(path: Path, place: str, text: str) -> int:
     return int(text)
 
 
-_Columns = dict[str, npt.NDArray[np.generic]]
-
-
-def _binary(
+def _columns(
     path: Path, body: memoryview, count: int, properties: list[tuple[str, str]], order: str
-) -> _Columns:
-    row = np.dtype([(name, order + kind) for name, kind in properties])
-    if len(body) < count * row.itemsize:
-        raise _short(path, count, len(body) // row.itemsize)
-    table = np.frombuffer(body, row, count)
-    return {name: table[name] for name, _ in properties}
-
-
-def _ascii(path: Path, body: memoryview, count: int, properties: list[tuple[str, str]], _: str) -> _Columns:
+) -> dict[str, npt.NDArray[np.generic]]:
+    """Columns (count,) of the vertices; as text where `order` is empty."""
+    if order:
+        row = np.dtype([(name, order + kind) for name, kind in properties])
+        if len(body) < count * row.itemsize:
+            raise _short(path, count, len(body) // row.itemsize)
+        vertices = np.frombuffer(body, row, count)
+        return {name: vertices[name] for name, _ in properties}
     if count > _MAX_ASCII_POINTS:
         raise InputError(path, "format", f"has {count:,} vertices as text", "Save it as binary PLY")
-    # A number takes a character and a space at least: nothing is made for vertices that cannot be there.
+    # A number is a character and a space at least: nothing is allocated for vertices that cannot be there.
     if len(body) < count * (2 * len(properties) - 1):
         raise _short(path, count, len(body) // (2 * len(properties)))
     lines = bytes(body).split(b"\n", count)[:count]

@@ -22,8 +22,7 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     """Mask (H, W) of the object at pixel (u, v), by region growing above its support.
 
     The region grows to neighbours of similar depth, above the largest level surface below the clicked point;
-    where it spreads over a higher surface, that one is the support.
-        InputError for a pixel outside the picture, or without depth.
+    where it spreads over a higher surface, that surface is the support.
     """
     h, w = image.depth_m.shape
     u, v = click

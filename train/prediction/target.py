@@ -37,10 +37,7 @@ class Filled:
 
 
 def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
-    """The frame with depth for all of the mask's pixels: that of the nearest pixel of the mask.
-
-    InputError where too few pixels of the mask have depth to say what the others would have.
-    """
+    """The frame with the depth of the nearest pixel where the mask has none. InputError for few."""
     image = frame.image
     assert image is not None and image.mask is not None
     mask, known = image.mask, image.mask & (image.depth_m > 0)

@@ -35,10 +35,7 @@ class TrainingCallback(Protocol):
 
 
 class TrainingProgress:
-    """Shows loss, samples a second, time left and the loader's share of the last minute; a line an epoch.
-
-    `place` is where the training is kept.
-    """
+    """Progress of the training to `place`: loss, speed, time left, the loader's share; a row an epoch."""
 
     def __init__(self, shown: Progress, place: str) -> None:
         self._shown, self._place = shown, place

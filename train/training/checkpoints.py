@@ -93,10 +93,7 @@ _HEAD = TypeAdapter(CheckpointHead)
 
 
 def load_model(path: str | Path, device: str | torch.device = "cpu") -> tuple[Model, CheckpointHead]:
-    """Load the model of a checkpoint with its best weights, in evaluation mode, and its metadata.
-
-    InputError, one line, for what is missing, cut, foreign, of a newer format or does not fit its model.
-    """
+    """Load the model of a checkpoint with its best weights, in evaluation mode, and its metadata."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
     with torch.random.fork_rng(devices=[]):  # fresh parameters are drawn only to be replaced
@@ -141,10 +138,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Replace the file atomically: after a crash it is the old one or the new one.
-
-    InputError, and the file stays, where a weight or the optimiser's state is not finite.
-    """
+    """Replace the file atomically. InputError, and the file stays, where a tensor is not finite."""
     path = Path(path)
     document = {
         "sha256": _UNSIGNED.decode(),  # before any other text that could hold as many zeros

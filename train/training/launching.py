@@ -1,4 +1,4 @@
-"""Choose the device, start training processes, and let them finish their step after Ctrl-C."""
+"""Training in one or many processes: their device, start, common sums and gradients, and the end by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import current_thread, main_thread
@@ -16,10 +17,51 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.locked_folders import locked_folder
-from datagen.train.training.ranks import Ranks
+from datagen.train.models import Model
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among `world` that train together; a world of 1 needs no process group."""
+
+    rank: int = 0
+    world: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes and shows."""
+        return self.rank == 0
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sums over all ranks, element by element."""
+        if self.world > 1:
+            dist.all_reduce(values)
+        return values
+
+    def gather(self, value: Any) -> list[Any]:
+        """The values of all ranks, in order."""
+        if self.world == 1:
+            return [value]
+        values: list[Any] = [None] * self.world
+        dist.all_gather_object(values, value)
+        return values
+
+    def share_gradients(self, model: Model) -> Callable[..., Tensor]:
+        """The model to call in training: gradients are the mean over ranks, parameters those of rank 0."""
+        return DistributedDataParallel(model) if self.world > 1 else model
+
+    def share_buffers(self, model: Model) -> None:
+        """Copy the running statistics of rank 0, which are saved, to all ranks."""
+        if self.world > 1:
+            with torch.no_grad():
+                for buffer in model.buffers():
+                    dist.broadcast(buffer, 0)
+
 
 Stopping = Callable[[], bool]
 # The function of each process, importable by name; True when it finished.
@@ -28,10 +70,7 @@ _PREFIX = "datagen-ranks-"
 
 
 def choose_device(asked: str, processes: int | None) -> tuple[str, int]:
-    """`cpu` or `cuda`, and the number of processes: as given, else one per GPU, or one.
-
-    InputError where there are fewer GPUs than that.
-    """
+    """`cpu` or `cuda`, and the number of processes: as given, else one per GPU, or one."""
     gpus = torch.cuda.device_count() if asked != "cpu" and torch.cuda.is_available() else 0
     if asked == "cuda" and not gpus:
         raise InputError("datagen train", "--device", "torch finds no GPU", "Give --device cpu")
@@ -61,11 +100,7 @@ def interruptible() -> Generator[Stopping]:
 
 
 def train_in_processes(work: ProcessWork, job: Any, processes: int, device: str, stopping: Stopping) -> bool:
-    """Run `work(job, ranks, stopping)` in new processes that can reach each other.
-
-    What one of them raises as InputError is raised here, and ends the others; so does the end of this
-    process. Returns whether they came to their end.
-    """
+    """Run `work(job, ranks, stopping)` in new processes; whether they finished. Raises their InputError."""
     context = multiprocessing.get_context("spawn")
     with locked_folder(_PREFIX, Path(tempfile.gettempdir())) as folder:
         children: list[tuple[Any, Connection]] = []
@@ -93,27 +128,23 @@ def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: St
         if stopping():
             (folder / "stop").touch()
         ready = wait(list(waiting), timeout=0.2)
-        answers = {here: _answer(here) for here in ready}  # type: ignore[arg-type]
-        # Who lost another process ends without a word; the one that knows why has spoken before.
+        answers: dict[Any, Any] = {}
+        for here in ready:
+            with suppress(EOFError):  # without an answer
+                answers[here] = here.recv()  # type: ignore[union-attr]
+        # A process that lost another one ends without an answer; the error of the other one explains it.
         for answer in answers.values():
             if isinstance(answer, InputError):
                 raise answer
-        for here, answer in answers.items():
+        for here in ready:
             child = waiting.pop(here)  # type: ignore[arg-type]
-            if answer is None:
+            if here not in answers:
                 child.join()
                 problem = f"a process exited with code {child.exitcode} without a message"
                 fix = "Run the same command to resume, with fewer --processes if memory was short"
                 raise InputError("datagen train", "--processes", problem, fix)
-            finished = finished and bool(answer)
+            finished = finished and answers[here]
     return finished
-
-
-def _answer(here: Connection) -> bool | InputError | None:
-    try:
-        return here.recv()
-    except EOFError:
-        return None
 
 
 def _child(work: ProcessWork, job: Any, ranks: Ranks, device: str, folder: str, there: Connection) -> None:

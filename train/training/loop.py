@@ -23,9 +23,9 @@ from datagen.train.models import Model
 from datagen.train.tensors import to_torch
 from datagen.train.training.callbacks import TrainingCallback, TrainingStep
 from datagen.train.training.checkpoints import EpochRecord
+from datagen.train.training.launching import Ranks
 from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
-from datagen.train.training.ranks import Ranks
 from datagen.train.training.validation import validate
 
 _STEP_STREAM = 0x57E9  # keeps the draws of steps apart from those of batches
@@ -77,10 +77,10 @@ def run_training(
     stopping: Callable[[], bool] = lambda: False,
     save_every_s: float = 300.0,
 ) -> bool:
-    """Train from the position on. Whether it came to its end; else it was stopped, and all is kept.
+    """Train from the position on; whether it finished, else it was stopped and saved.
 
-    `save` is called after each epoch, every `save_every_s` and when it stops. InputError at a loss or
-    gradient that is no number, before it can reach the weights.
+    `save` is called after each epoch, every `save_every_s` and on a stop. InputError at a loss or gradient
+    that is not finite, before it reaches the weights.
     """
     at, clock = training.position, _Clock()
     logits_of = training.ranks.share_gradients(training.model)

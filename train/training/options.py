@@ -32,10 +32,7 @@ STAGES: dict[str, TrainingStage] = {
 
 @dataclass(frozen=True)
 class Options:
-    """All that decides the weights, besides the data and the checkpoint to begin from.
-
-    Where it runs (device, threads, processes) is not among them.
-    """
+    """All that decides the weights, besides the data and the checkpoint to begin from."""
 
     stage: str
     model: str
@@ -54,20 +51,24 @@ class Options:
 
     def refuse_bad(self) -> None:
         """InputError for values out of range, by the option's name."""
-        whole = {"epochs": (self.epochs, 1), "batch-scenes": (self.batch_scenes, 1), "seed": (self.seed, 0)}
-        whole |= {"patience": (self.patience, 1), "candidates-per-robot": (self.candidates_per_robot or 1, 1)}
-        for name, (value, low) in whole.items():
-            if value < low:
-                raise InputError("datagen train", f"--{name}", f"{value}", f"Give {low} or more")
-        if not 0 < self.house_share <= 1:
-            raise InputError(
-                "datagen train", "--house-share", f"{self.house_share}", "Give a share above 0, at most 1"
-            )
-        for name, value, low in (("lr", self.lr, 0), ("weight-decay", self.weight_decay, -1)):
-            if not max(low, 0) <= value <= 1000 or value == low:
-                raise InputError(
-                    "datagen train", f"--{name}", f"{value}", "Give a positive number, below 1000"
-                )
+        least = "Give {} or more"
+        rules = {
+            "epochs": (self.epochs, self.epochs >= 1, least.format(1)),
+            "batch-scenes": (self.batch_scenes, self.batch_scenes >= 1, least.format(1)),
+            "seed": (self.seed, self.seed >= 0, least.format(0)),
+            "patience": (self.patience, self.patience >= 1, least.format(1)),
+            "candidates-per-robot": (
+                self.candidates_per_robot,
+                self.candidates_per_robot is None or self.candidates_per_robot >= 1,
+                least.format(1),
+            ),
+            "house-share": (self.house_share, 0 < self.house_share <= 1, "Give a share above 0, at most 1"),
+            "lr": (self.lr, 0 < self.lr <= 1000, "Give a positive number, below 1000"),
+            "weight-decay": (self.weight_decay, 0 <= self.weight_decay <= 1000, "Give 0 to 1000"),
+        }
+        for name, (value, valid, fix) in rules.items():
+            if not valid:
+                raise InputError("datagen train", f"--{name}", f"{value}", fix)
 
     def document(self) -> dict[str, Any]:
         """As plain data, without the model, which a checkpoint states by itself."""

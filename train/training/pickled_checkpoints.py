@@ -99,10 +99,7 @@ def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, grad: Any, hooks
 
 
 def read_pickled(data: bytes) -> tuple[dict[str, Tensor], str]:
-    """The tensors of a file of format 1, and its `head`.
-
-    Raises one of `NOT_PICKLED` for anything else.
-    """
+    """The tensors of a file of format 1, and its `head`. Raises one of `NOT_PICKLED` for other files."""
     # Every record of the zip's directory begins with these bytes; counted before a list is made of them.
     if data.count(b"PK\1\2") > _MAX_RECORDS:
         raise ValueError("too many records")

@@ -29,10 +29,10 @@ from datagen.train.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
+from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from datagen.train.training.options import STAGES, Options
-from datagen.train.training.ranks import Ranks
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,7 @@ class TrainingJob:
 
 
 def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
-    """Train in this process, one of `ranks`, from where `job.out` stands. Whether it came to its end.
-
-    InputError for data, checkpoints or options that do not go together, before anything is written.
-    """
+    """Train in this process, one of `ranks`, from the position of `job.out`. Whether it finished."""
     torch.set_num_threads(job.threads)
     with ExitStack() as stack:
         callbacks: list[TrainingCallback] = []

@@ -14,7 +14,7 @@ from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
 from datagen.train.tensors import to_torch
-from datagen.train.training.ranks import Ranks
+from datagen.train.training.launching import Ranks
 
 
 class ValidationMetrics(TypedDict):
@@ -29,10 +29,7 @@ class ValidationMetrics(TypedDict):
 def validate(
     model: Model, batches: Iterable[Batch[Array]], class_weights: Tensor, ranks: Ranks
 ) -> ValidationMetrics:
-    """Loss (the stage's own), accuracy, balanced accuracy and AUC over all ranks' batches.
-
-    Numbers that are not defined, with one class alone, are None. InputError where the loss is not a number.
-    """
+    """Loss, accuracy, balanced accuracy and AUC over all ranks; None where undefined."""
     ranks.share_buffers(model)
     model.eval()
     ids: list[Array] = []

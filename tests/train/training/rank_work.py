@@ -13,8 +13,8 @@ import torch
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch, CandidateInputs, Clouds, RobotInputs
+from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import run_training
-from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 

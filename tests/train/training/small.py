@@ -9,9 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from datagen.train.training.callbacks import TrainingStep
+from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import run_training
 from datagen.train.training.options import Options
-from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 TINY: dict[str, Any] = {

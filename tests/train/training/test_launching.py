@@ -18,9 +18,8 @@ import pytest
 
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import read_checkpoint
-from datagen.train.training.launching import interruptible, train_in_processes
+from datagen.train.training.launching import Ranks, interruptible, train_in_processes
 from datagen.train.training.loop import run_training
-from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import TrainingJob, prepare_training
 from tests.train.training.rank_work import Union, told_by, train_and_tell
 from tests.train.training.small import TINY, equal, job_of

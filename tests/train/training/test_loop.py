@@ -14,8 +14,8 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.training.checkpoints import load_model, read_checkpoint
+from datagen.train.training.launching import Ranks
 from datagen.train.training.loop import Batches, run_training
-from datagen.train.training.ranks import Ranks
 from datagen.train.training.training_setup import prepare_training, save_checkpoint
 from tests.train.training.small import TINY_PAPER, Recorder, equal, job_of, train_until
 
