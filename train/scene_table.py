@@ -93,8 +93,10 @@ def read_scene_table(
         place = ", ".join(dict.fromkeys(part.place for part in parts))
         problem = "has no scene in the selected houses"
         raise InputError(place, "house_id", problem, "Name more runs, or runs of more houses")
-    numbers = np.array(rows, np.int64).T
-    return SceneTable(*numbers, house_of_digest, frozenset(house_ids), frozenset(objects), summaries)
+    shard, row, samples = np.array(rows, np.int64).T
+    return SceneTable(
+        shard, row, samples, house_of_digest, frozenset(house_ids), frozenset(objects), summaries
+    )
 
 
 def _taken(robot_index: Ints, per_robot: int | None) -> int:

@@ -64,7 +64,7 @@ class RgbdImage:
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
 
     def facets(self, T: F64) -> F64:
-        """Area times normal (H, W, 3) of each pixel from smoothed depth, towards the camera; T's parent frame."""
+        """Area times normal (H, W, 3) of each pixel of smoothed depth, towards the camera; world frame."""
         known = (self.depth_m > 0).astype(np.float32)
         weight = np.asarray(ndimage.uniform_filter(known, 7), np.float32)
         smooth = np.asarray(ndimage.uniform_filter(self.depth_m, 7), np.float32) / np.maximum(weight, 1e-6)

@@ -1,4 +1,4 @@
-"""Training in one or many processes: their device, start, common sums and gradients, and the end by Ctrl-C."""
+"""Training in one or many processes: device, start, sums and gradients over ranks, Ctrl-C."""
 
 from __future__ import annotations
 

@@ -34,6 +34,8 @@ from datagen.train.training.loop import Position, Training, run_training
 from datagen.train.training.optimiser import make_optimiser, optimiser_tensors, put_optimiser_tensors
 from datagen.train.training.options import STAGES, Options
 
+_POSITION = ("step", "epoch", "best_epoch", "finished")  # fields of both Position and CheckpointHead
+
 
 @dataclass(frozen=True)
 class TrainingJob:
@@ -104,10 +106,7 @@ def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None
         head,
         cost={**head.cost, **at.cost},
         history=tuple(at.history),
-        step=at.step,
-        epoch=at.epoch,
-        best_epoch=at.best_epoch,
-        finished=at.finished,
+        **{name: getattr(at, name) for name in _POSITION},
     )
     # Before the first epoch has ended nothing is better than the last weights.
     weights = at.best_weights or last
@@ -127,14 +126,11 @@ def _resume_position(
     if best is not None and not 1 <= best <= len(there.head.history):
         raise InputError(place, "best_epoch", "is beyond the history", "Train it again to another file")
     return Position(
-        epoch=there.head.epoch,
+        **{name: getattr(there.head, name) for name in _POSITION},
         batch=batch,
-        step=there.head.step,
         sums=[float(value) for value in sums],
         history=list(there.head.history),
-        best_epoch=best,
         best_weights={k: v.to(model.device) for k, v in there.weights.items()} if best else {},
-        finished=there.head.finished,
         cost={k: v for k, v in there.head.cost.items() if k != "label_cpu_s"},
     )
 
