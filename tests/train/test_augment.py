@@ -198,7 +198,7 @@ def test_colours_are_scaled_and_padding_stays_black(scene: int, seed: int):
         assert 0.7 < gains.mean() < 1.33
 
 
-def test_effects_draw_apart():
+def test_effects_have_independent_random_numbers():
     before = view_of(1)
     alone = Augmentation(rotation=Rotation()).apply(before, (0, 1))
     together = replace(ALL, noise=None, holes=None, dropout=None).apply(before, (0, 1))
@@ -207,7 +207,7 @@ def test_effects_draw_apart():
     assert ALL.apply(empty, (0,)) is empty
 
 
-def test_the_camera_is_read_only_where_it_is_needed(tmp_path):
+def test_the_camera_pose_is_read_only_for_effects_that_need_it(tmp_path):
     assert Augmentation(None, None, PointDropout(), ColourJitter(), Rotation()).fields == ()
     folder = tmp_path / "run"
     make_stream_run(folder, 18)
@@ -242,6 +242,6 @@ def test_labels_and_names_are_those_of_the_plain_stream(tmp_path_factory: pytest
         (lambda: DepthHoles(most=-1), "most"),
     ],
 )
-def test_numbers_that_make_no_sense_are_refused(make, field: str):
+def test_numbers_out_of_range_are_refused(make, field: str):
     with pytest.raises(InputError, match=f"augmentation: {field}: .* is not between"):
         make()

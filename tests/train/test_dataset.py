@@ -111,7 +111,7 @@ def test_a_batch_has_the_stored_rows_in_the_targets_frame(run: Run, place: str):
             assert b.extra["object_name"][row].tolist() == scene["object_name"].tolist()
 
 
-def test_frames_of_a_real_run_are_those_that_a_batch_names(heuristic_run: Path):
+def test_batches_of_a_run_have_the_documented_frames(heuristic_run: Path):
     """Distances that the run stores follow from a batch; its camera sees the cloud, which noise keeps."""
     extra = ("mount_distance_m", "T_world_camera", "target_center_m")
     plain, noisy = (
@@ -148,7 +148,7 @@ def test_ranks_together_give_every_sample_once(place: str, options: dict[str, An
 
 @given(OPTIONS, st.integers(0, 30), st.integers(0, 3))
 @few
-def test_an_epoch_goes_on_from_any_batch(place: str, options: dict[str, Any], skip: int, k: int):
+def test_an_epoch_resumes_at_any_batch(place: str, options: dict[str, Any], skip: int, k: int):
     stream = SampleStream([place], **options)
     whole = list(stream.epoch(k))
     # A stream of its own, as another process would have.
@@ -160,7 +160,7 @@ def test_an_epoch_goes_on_from_any_batch(place: str, options: dict[str, Any], sk
 
 @given(OPTIONS, OPTIONS, st.integers(0, 3))
 @few
-def test_what_a_scene_gives_depends_on_seed_and_epoch_alone(
+def test_augmentation_depends_on_seed_and_epoch_alone(
     place: str, one: dict[str, Any], other: dict[str, Any], k: int
 ):
     shared = {name: one[name] for name in ("seed", "candidates_per_robot", "augment")}
@@ -185,7 +185,7 @@ def test_epochs_and_seeds_differ_and_stored_order_does_not(place: str):
     assert len(drawn[0]) == len(drawn[1]) == 2 * SCENES
 
 
-def test_what_is_skipped_is_not_read(tmp_path: Path):
+def test_skipped_batches_are_not_read(tmp_path: Path):
     folder = tmp_path / "run"
     make_stream_run(folder, 6 * 3 * 6)
     stream = SampleStream([folder], scenes_per_batch=3, buffer_shards=2)
@@ -230,7 +230,7 @@ def test_houses_choose_the_scenes(place: str):
     assert len(whole.house_digests()) == len(whole.house_ids()) == HOUSES
 
 
-def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tmp_path: Path):
+def test_sealed_and_merged_runs_give_the_same_samples(run: Run, place: str, tmp_path: Path):
     other = make_stream_run(tmp_path / "other", 30, seed=5)
     both = SampleStream([place, tmp_path / "other"], shuffle=False)
     assert cli.run(["merge", place, str(tmp_path / "other"), "--out", str(tmp_path / "merged")]) == 0
@@ -263,14 +263,14 @@ def test_sealed_and_merged_places_give_the_same_samples(run: Run, place: str, tm
         ({"houses": lambda house: False}, "house_id: has no scene in the selected houses"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(place: str, changes: dict[str, Any], problem: str):
+def test_options_out_of_range_are_refused(place: str, changes: dict[str, Any], problem: str):
     with pytest.raises(InputError, match=problem):
         SampleStream([place], **changes)
     with pytest.raises(InputError, match="skip_batches: -1"):
         SampleStream([place]).epoch(0, -1)
 
 
-def test_rows_that_make_no_sense_are_refused_with_their_shard(tmp_path: Path):
+def test_invalid_rows_are_refused_with_their_shard(tmp_path: Path):
     make_stream_run(tmp_path / "label", 18, label=2)
     with pytest.raises(InputError, match=r"shards/000000/a-0: label: a label of 2"):
         SampleStream([tmp_path / "label"])

@@ -20,7 +20,7 @@ def plans(sizes: list[int], asked: tuple[int, int], seed: int | None, world: int
 
 @given(SHARDS, ASKED, st.none() | st.integers(0, 99), st.integers(1, 5))
 @settings(max_examples=150, deadline=None)
-def test_ranks_share_the_scenes_out_evenly_in_equally_many_batches(
+def test_ranks_have_equal_numbers_of_scenes_and_batches(
     sizes: list[int], asked: tuple[int, int], seed: int | None, world: int
 ):
     n = sum(sizes)
@@ -55,7 +55,7 @@ def test_scenes_are_shuffled_within_a_buffer_of_whole_shards(
 
 @given(SHARDS, st.tuples(ASKED, ASKED), st.integers(1, 4))
 @settings(max_examples=50, deadline=None)
-def test_unshuffled_order_depends_on_nothing(
+def test_unshuffled_order_ignores_the_seed(
     sizes: list[int], asked: tuple[tuple[int, int], tuple[int, int]], world: int
 ):
     assume(sum(sizes) >= world)

@@ -98,7 +98,7 @@ def test_a_hidden_rule_of_another_weight_and_form_is_found_too() -> None:
 
 
 @pytest.mark.parametrize("objective", ["balanced", "accuracy"])
-def test_the_order_of_rows_changes_no_fit(objective: Any) -> None:
+def test_row_order_does_not_change_the_fit(objective: Any) -> None:
     trials = make_trials(4, n=240)
     other = permuted(trials, np.random.default_rng(5).permutation(len(trials)))
     fitted = fit(trials, BEFORE, ["planar"], objective)
@@ -107,7 +107,7 @@ def test_the_order_of_rows_changes_no_fit(objective: Any) -> None:
 
 @given(st.integers(0, 1000))
 @settings(max_examples=10, deadline=None)
-def test_the_order_of_rows_changes_no_figure(seed: int) -> None:
+def test_row_order_does_not_change_the_report(seed: int) -> None:
     trials = make_trials(seed)
     order = np.random.default_rng(seed).permutation(len(trials))
     other = permuted(trials, order)
@@ -144,7 +144,7 @@ def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
 
 @given(st.floats(0, 1), st.floats(0.31, 0.7), st.floats(0, 2))
 @settings(max_examples=50, deadline=None)
-def test_reach_in_sigmas_is_where_the_score_is_tau(rho: float, tau: float, sigmas: float) -> None:
+def test_at_reach_in_sigmas_the_score_is_tau(rho: float, tau: float, sigmas: float) -> None:
     params = BEFORE.model_copy(update={"tau": tau})
     visible = visibility_score(np.array([rho]))
     k = reach_in_sigmas(visible, params)[0]
@@ -155,7 +155,7 @@ def test_reach_in_sigmas_is_where_the_score_is_tau(rho: float, tau: float, sigma
         assert (score > tau) == (sigmas < k)
 
 
-def test_every_house_is_labelled_by_a_rule_that_never_saw_it() -> None:
+def test_every_house_is_labelled_by_a_rule_fitted_on_other_houses() -> None:
     trials, seen = labelled_by(make_trials(1), BEFORE), list[set[str]]()
 
     def refit(some: Trials) -> HeuristicParams:
@@ -174,7 +174,7 @@ def test_every_house_is_labelled_by_a_rule_that_never_saw_it() -> None:
     assert sorted(h for houses in seen for h in set(trials.house) - houses) == sorted(set(trials.house))
 
 
-def test_what_was_learned_of_noise_shows_on_it_alone() -> None:
+def test_overfitting_to_noise_shows_only_on_the_fitted_houses() -> None:
     trials = make_trials(6, n=300)
 
     def refit(some: Trials) -> HeuristicParams:
@@ -187,7 +187,7 @@ def test_what_was_learned_of_noise_shows_on_it_alone() -> None:
     assert low < 0.5 < high
 
 
-def test_other_seeds_deal_houses_otherwise() -> None:
+def test_other_seeds_give_other_folds() -> None:
     trials, seen = labelled_by(make_trials(1), BEFORE), list[frozenset[str]]()
 
     def refit(some: Trials) -> HeuristicParams:
@@ -199,7 +199,7 @@ def test_other_seeds_deal_houses_otherwise() -> None:
     assert seen[:5] == seen[5:10] and set(seen[:5]) != set(seen[10:])
 
 
-def test_a_rule_that_is_right_is_left_alone_in_its_figures() -> None:
+def test_a_correct_rule_keeps_its_agreement() -> None:
     trials = labelled_by(make_trials(2), BEFORE)
     right, wrong = agreements(trials, [trials.said(BEFORE), ~trials.label], 20, 0)
     assert right.accuracy.value == right.balanced_accuracy.value == 1
@@ -216,13 +216,13 @@ def test_a_rule_that_is_right_is_left_alone_in_its_figures() -> None:
         (lambda t: t.at(np.zeros(len(t), bool)), "no candidate"),
     ],
 )
-def test_what_says_too_little_is_refused(change: Any, words: str) -> None:
+def test_too_few_labels_are_refused(change: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         refuse_too_little(change(make_trials(0)), "runs")
     refuse_too_little(make_trials(0), "runs")
 
 
-def test_a_class_that_lies_in_one_house_is_refused() -> None:
+def test_a_class_in_one_house_alone_is_refused() -> None:
     trials = make_trials(0)
     label = np.array([trials.house[s] == "house-3" for s in trials.scene])
     with pytest.raises(InputError, match="too few houses"):

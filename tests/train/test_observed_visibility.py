@@ -64,7 +64,7 @@ def share(others: np.ndarray, eye: tuple[float, float, float], target: np.ndarra
 NOTHING = np.zeros((0, 3), np.float32)
 
 
-def test_seen_where_nothing_stands_before_it() -> None:
+def test_fully_visible_without_an_occluder() -> None:
     assert share(NOTHING, (0.8, 0.1, 0.4)) == 1
     assert share(wall(-0.3, 0.3), (-0.8, 0.1, 0.4)) == 1  # from the other side
 
@@ -85,7 +85,9 @@ def test_half_behind_the_end_of_a_wall() -> None:
     eye_m=st.floats(0.6, 1.1),
     height=st.floats(-0.1, 0.4),
 )
-def test_as_rays_have_it(low: float, width: float, angle: float, eye_m: float, height: float) -> None:
+def test_estimate_agrees_with_rays(
+    low: float, width: float, angle: float, eye_m: float, height: float
+) -> None:
     eye = np.array([eye_m * np.cos(angle), eye_m * np.sin(angle), height])
     found = share(wall(low, low + width), tuple(eye))
     assert found == pytest.approx(true_share(eye, low, low + width), abs=0.2)
@@ -120,7 +122,7 @@ def plain_share(others: np.ndarray, eye: np.ndarray) -> float:
 
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_as_every_disc_against_every_cell_has_it(seed: int) -> None:
+def test_estimate_equals_every_disc_against_every_cell(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pole = rng.normal([0.2, 0.15, 0.1], [0.01, 0.01, 0.2], (60, 3))
     blob = rng.normal([-0.15, 0.0, 0.03], 0.02, (300, 3))  # its discs are smaller than cells
@@ -142,7 +144,7 @@ def test_a_table_hides_what_stands_on_it_only_from_below() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 100))
-def test_turning_the_scene_with_the_eyes_changes_nothing(angle: float, seed: int) -> None:
+def test_rotating_the_scene_with_the_eyes_changes_nothing(angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     eyes = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(0, 0.6, 20)])
@@ -154,7 +156,7 @@ def test_turning_the_scene_with_the_eyes_changes_nothing(angle: float, seed: int
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 100))
-def test_order_and_company_of_eyes_change_nothing(seed: int) -> None:
+def test_order_and_number_of_eyes_change_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     eyes = np.column_stack([rng.uniform(-1, 1, (40, 2)), rng.uniform(0, 0.6, 40)]).astype(np.float32)
     others = np.concatenate([wall(-0.2, 0.2), table(-0.07)])
@@ -181,13 +183,13 @@ def test_more_walls_never_show_more(seed: int) -> None:
     assert (both <= one + 1e-9).all()
 
 
-def test_nothing_is_seen_of_what_was_not_observed_or_holds_the_camera() -> None:
+def test_visibility_is_zero_without_target_points_or_inside_the_target() -> None:
     assert share(NOTHING, (0.8, 0, 0.4), target=NOTHING) == 0
     assert share(NOTHING, (0.0, 0.0, 0.05)) == 0
     assert share(NOTHING, (0.0, 0.0, 0.8)) == 1  # straight above: no way is right, and any will do
 
 
-def test_points_that_are_no_numbers_are_left_out() -> None:
+def test_nan_points_are_left_out() -> None:
     bad = np.full((3, 3), np.nan, np.float32)
     assert share(np.concatenate([bad, wall(-0.3, 0.3)]), (0.8, 0.05, 0.1)) < 0.04
     assert share(bad, (0.8, 0.05, 0.1), target=np.concatenate([bad, sphere()])) == 1

@@ -74,7 +74,7 @@ def test_runs_with_other_clouds_are_not_mixed(tmp_path: Path):
         SampleReader([tmp_path / "a", tmp_path / "b"])
 
 
-def test_every_bit_flip_of_a_chunk_is_noticed_and_named(tmp_path: Path):
+def test_every_bit_flip_of_a_chunk_is_detected_and_named(tmp_path: Path):
     make_run(tmp_path, n=20)
     rng = np.random.default_rng(3)
     reader = SampleReader([tmp_path], ALL, SAMPLES)
@@ -109,7 +109,7 @@ def test_missing_and_cut_files_are_named(tmp_path: Path):
         SampleReader([tmp_path])
 
 
-def test_what_cannot_be_read_is_refused(tmp_path: Path):
+def test_unreadable_runs_are_refused(tmp_path: Path):
     make_run(tmp_path / "run", n=20)
     make_run(tmp_path / "bare", n=20, shards=[])
     (tmp_path / "odd.zarr").mkdir()
@@ -170,7 +170,7 @@ def test_a_run_may_be_named_like_a_store(tmp_path: Path) -> None:
     assert len(SampleReader([tmp_path / "run.zarr" / "data.zarr"])) == 50
 
 
-def test_merged_shards_may_word_their_arrays_otherwise_but_not_be_others(tmp_path: Path):
+def test_merged_shards_may_differ_in_descriptions_but_not_in_types(tmp_path: Path):
     run = make_run(tmp_path, n=20, shards=[0])
     scenes, samples = rows_of(run, 1)
     files = encode_shard(run.schema, run.layout, run.manifest.spec_hash, scenes, samples)
@@ -233,7 +233,9 @@ def test_swapped_metadata_are_refused(tmp_path: Path):
         SampleReader([tmp_path])
 
 
-def test_a_file_is_held_against_its_commit_once_in_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_file_is_checked_against_its_commit_once_per_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     make_run(tmp_path, n=20)
     hashed: list[int] = []
 
@@ -252,7 +254,7 @@ def test_a_file_is_held_against_its_commit_once_in_a_process(tmp_path: Path, mon
     assert not hashed
 
 
-def test_a_run_that_lacks_planned_samples_is_read_only_where_that_is_said(tmp_path: Path):
+def test_an_incomplete_run_is_read_only_with_allow_incomplete(tmp_path: Path):
     make_run(tmp_path, n=30)
     (tmp_path / "commits/000001.json").unlink()
     words = r"10 of the 30 planned samples are missing\. .*resume.*--allow-incomplete"

@@ -30,7 +30,7 @@ def test_a_shared_house_is_named_by_id_or_by_content(tmp_path: Path):
         refuse_shared_houses(train, SampleStream([tmp_path / "b", tmp_path / "content"]))
 
 
-def test_sides_are_a_tenth_and_the_rest_whatever_split_a_run_has():
+def test_a_tenth_of_the_houses_is_held_out_in_any_split():
     ids = [f"house-{i}" for i in range(4000)]
     held, kept = HouseSide(held_out=True), HouseSide(held_out=False)
     assert all(held(i) != kept(i) for i in ids)

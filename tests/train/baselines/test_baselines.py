@@ -69,7 +69,7 @@ def test_proximity_picks_the_nearest_clear_one() -> None:
     assert np.isnan(Proximity().threshold)
 
 
-def test_threshold_says_reach_and_clearance() -> None:
+def test_threshold_requires_reach_and_clearance() -> None:
     batch = make_batch(2)
     geometric = BASELINES["threshold"]()
     said = geometric.score(batch) >= geometric.threshold
@@ -89,7 +89,7 @@ def test_analytic_is_the_label_sources_rule_on_the_estimated_visibility() -> Non
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), min_size=2, max_size=30))
-def test_best_cut_is_what_trying_all_would_find(rows: list[tuple[int, bool]]) -> None:
+def test_best_cut_equals_exhaustive_search(rows: list[tuple[int, bool]]) -> None:
     score, label = np.array([float(s) for s, _ in rows]), np.array([y for _, y in rows])
     if label.all() or not label.any():
         return
@@ -118,7 +118,7 @@ def test_scalars_learn_and_are_the_same_for_the_same_seed() -> None:
     assert not np.array_equal(Scalars(seed=6, steps=300).fit(batches).score(test), fitted.score(test))
 
 
-def test_scalars_know_all_that_they_name_and_how_much_room_a_base_has() -> None:
+def test_scalars_have_all_named_features_and_learn_from_clearance() -> None:
     batch = make_batch(3)
     numbers = features(batch)
     assert numbers.shape == (len(batch), len(FEATURES))
@@ -131,7 +131,7 @@ def test_scalars_know_all_that_they_name_and_how_much_room_a_base_has() -> None:
     assert balanced(fitted.score(batches[0]) >= fitted.threshold, roomy[0].label == 1) > 0.9
 
 
-def test_stand_in_says_that_it_is_one_and_cuts_among_what_is_feasible() -> None:
+def test_the_stand_in_is_named_so_and_fits_among_feasible_candidates() -> None:
     batches = [make_batch(seed) for seed in range(2)]
     stand_in = ThresholdDetector().fit(batches)
     assert "stand-in" in stand_in.name
@@ -146,7 +146,7 @@ def test_states_are_json(fitted: list[Baseline]) -> None:
         assert json.loads(json.dumps(baseline.state())) is not None
 
 
-def test_what_cannot_be_fitted_or_scored_is_said_in_one_line() -> None:
+def test_impossible_fits_and_scores_give_one_line() -> None:
     batch = make_batch(0)
     one_class = replace(batch, label=np.zeros_like(batch.label))
     for name in ("distance", "scalars", "threshold-detector"):
@@ -176,5 +176,5 @@ def test_fits_on_a_run_and_scores_it(sim_run: Path) -> None:
     ("name", "spoken"),
     [("003_cracker_box", "cracker box"), ("mug", "mug"), ("063-a_marbles", "a marbles"), ("077", "077")],
 )
-def test_names_are_spoken(name: str, spoken: str) -> None:
+def test_object_names_become_words(name: str, spoken: str) -> None:
     assert spoken_name(name) == spoken

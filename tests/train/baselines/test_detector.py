@@ -63,7 +63,7 @@ def test_boxes_of_every_frame_from_the_real_forward_pass(folder: Path) -> None:
     np.testing.assert_allclose(again.scores, found[0].scores, atol=1e-5)  # frames do not know of each other
 
 
-def test_baseline_asks_it_about_feasible_candidates_alone(folder: Path) -> None:
+def test_the_detector_sees_feasible_candidates_alone(folder: Path) -> None:
     (baseline,) = make_baselines(["threshold-detector"], detector=folder)
     assert baseline.name == "threshold-detector"
     batch = make_batch(4, n_scenes=1, per_robot=6)
@@ -73,7 +73,7 @@ def test_baseline_asks_it_about_feasible_candidates_alone(folder: Path) -> None:
     assert ((score[feasible] >= 0) & (score[feasible] <= 1)).all() and (score[~feasible] == -1).all()
 
 
-def test_a_folder_that_holds_none_is_said_in_one_line(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_without_a_detector_gives_one_line(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json"):
         ZeroShotDetector(tmp_path / "missing")
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
@@ -104,7 +104,7 @@ def test_views_show_the_target_in_the_middle_the_right_way_up() -> None:
     assert np.array_equal(view[0, 0], [127] * 3)
 
 
-def test_views_paint_what_is_near_over_what_is_far() -> None:
+def test_near_points_cover_far_ones_in_views() -> None:
     points = np.array([[0.3, 0, 0], [0, 0, 0], [2, 0, 0]], np.float32)  # the last is behind the eye
     rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     for order in ([0, 1, 2], [1, 0, 2]):

@@ -25,7 +25,7 @@ def by_hand(weights: np.ndarray, scene: np.ndarray) -> list[np.ndarray]:
 
 @given(st.integers(0, 2**32), st.integers(1, 70), st.integers(1, 6))
 @settings(deadline=None, max_examples=25)
-def test_weighted_sums_are_what_resampled_rows_give(seed: int, n_scenes: int, levels: int) -> None:
+def test_weighted_sums_equal_sums_of_resampled_rows(seed: int, n_scenes: int, levels: int) -> None:
     rng = np.random.default_rng(seed)
     n = 4 * n_scenes
     scene = rng.integers(0, n_scenes, n)
@@ -42,7 +42,7 @@ def test_weighted_sums_are_what_resampled_rows_give(seed: int, n_scenes: int, le
         np.testing.assert_allclose(counts[k], one[0])
 
 
-def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
+def test_intervals_have_their_nominal_coverage() -> None:
     # Scenes differ in how well they are judged: 200 rows of one scene are far from 200 independent ones.
     rng = np.random.default_rng(0)
     covered = naive = 0
@@ -60,7 +60,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     assert naive / 200 < 0.6
 
 
-def test_paired_differences_are_sharper_than_intervals_that_do_not_touch() -> None:
+def test_paired_differences_are_more_precise_than_disjoint_intervals() -> None:
     rng = np.random.default_rng(3)
     hard = rng.beta(2, 2, 80)[:, None]
     weights = resample_weights(80, 1000, rng)
@@ -76,7 +76,7 @@ def test_paired_differences_are_sharper_than_intervals_that_do_not_touch() -> No
     assert are_disjoint(a, Estimate(b.value - 0.5, b.resamples - 0.5))
 
 
-def test_shares_of_all_and_none_are_no_certainty() -> None:
+def test_shares_of_0_and_1_have_exact_intervals() -> None:
     all_alike = np.ones(50)
     low, high = Estimate(1.0, all_alike, trials=19).interval()
     assert (low, high) == (pytest.approx(0.8235, abs=1e-4), 1)
@@ -85,7 +85,7 @@ def test_shares_of_all_and_none_are_no_certainty() -> None:
     assert both.minus(both).interval() == (0, 0) and verdict(both.minus(both)) == "open"
 
 
-def test_what_no_resample_can_say_has_no_interval() -> None:
+def test_undefined_resamples_have_no_interval() -> None:
     weights = resample_weights(5, 50, np.random.default_rng(0))
     scene, true = np.arange(5), np.array([True, False, False, False, False])
     areas = resampled_area_under_roc(weights, true, np.arange(5.0), scene)

@@ -86,7 +86,7 @@ def test_scenes_and_robots_are_numbered_through_all_places() -> None:
         np.testing.assert_array_equal(example.points_m, by_scene[example.scene][:7])
 
 
-def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
+def test_examples_are_drawn_uniformly_and_follow_the_seed() -> None:
     def drawn(seed: int) -> list[int]:
         batches = [make_batch(4 * k, [1, 1, 1, 1]) for k in range(5)]
         found = gather([(CELLS, batches)], {"x": ByX()}, np.random.default_rng(seed), n_examples=5)
@@ -98,7 +98,7 @@ def test_examples_are_drawn_evenly_and_by_the_seed() -> None:
     assert counts.sum() == 300 and counts.min() >= 5 and counts.max() <= 26
 
 
-def test_a_score_that_is_no_number_and_a_run_named_twice_are_refused() -> None:
+def test_scores_that_are_not_finite_and_repeated_runs_are_refused() -> None:
     rng = np.random.default_rng(0)
     for broken in (np.nan, np.inf, -np.inf):
         with pytest.raises(InputError, match="x: score: is not finite for sample 0301"):
@@ -107,7 +107,7 @@ def test_a_score_that_is_no_number_and_a_run_named_twice_are_refused() -> None:
         gather([(0, [make_batch(3, [1])]), (0, [make_batch(3, [1])])], {"x": ByX()}, rng)
 
 
-def test_candidate_sets_hold_what_their_names_say() -> None:
+def test_candidate_sets_match_their_definitions() -> None:
     columns = make_columns(np.random.default_rng(0))
     clear, in_range = columns.is_in("clear"), columns.is_in("in-range")
     assert columns.is_in("grid").all()
@@ -116,7 +116,7 @@ def test_candidate_sets_hold_what_their_names_say() -> None:
     assert (columns.mount_distance_m[in_range] <= columns.reach_m[in_range]).all()
 
 
-def test_cutting_rows_keeps_scenes_and_cutting_scenes_numbers_them_anew() -> None:
+def test_selecting_rows_keeps_scenes_and_selecting_scenes_renumbers_them() -> None:
     columns = make_columns(np.random.default_rng(1))
     cut = columns.at(columns.is_clear)
     assert len(cut) == columns.is_clear.sum() and cut.n_scenes == columns.n_scenes

@@ -18,7 +18,7 @@ METRICS = ("accuracy", "balanced_accuracy", "mean_average_precision")
 
 @given(st.integers(0, 2**32), st.integers(3, 20), st.floats(0, 1))
 @settings(deadline=None, max_examples=15)
-def test_a_difference_is_turned_round_with_its_methods_and_nothing_between_equals(
+def test_swapping_methods_negates_the_difference_and_equal_ones_differ_by_zero(
     seed: int, n_scenes: int, skill: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ def test_a_difference_is_turned_round_with_its_methods_and_nothing_between_equal
         assert [none[metric][k] for k in ("value", "low", "high", "verdict")] == [0, 0, 0, "open"]
 
 
-def test_regimes_are_held_against_the_one_before_and_the_best_against_the_best() -> None:
+def test_regimes_are_compared_with_the_previous_and_the_best_model_with_the_best_baseline() -> None:
     columns = make_columns(np.random.default_rng(0), 30)
     rng = np.random.default_rng(1)
     shares = {

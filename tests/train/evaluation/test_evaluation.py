@@ -36,7 +36,7 @@ def scored(seed: int = 0, **changes: Any) -> Columns:
     return replace(columns, scores=scores)
 
 
-def test_a_set_is_told_as_counting_by_hand_tells_it() -> None:
+def test_the_report_of_a_set_equals_counts_by_hand() -> None:
     columns = scored(n_scenes=40)
     told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 200, 0), ["0" * 64])
     rows = columns.is_clear
@@ -58,7 +58,7 @@ def test_a_set_is_told_as_counting_by_hand_tells_it() -> None:
     json.dumps(told, allow_nan=False)
 
 
-def test_a_method_without_threshold_says_good_of_its_pick_alone() -> None:
+def test_a_method_without_threshold_labels_only_its_pick_positive() -> None:
     columns = scored(n_scenes=30)
     told = evaluate_set(columns, METHODS, "in-range", weights_for(columns, 50, 0))
     cut = columns.at(columns.is_in("in-range"))
@@ -71,7 +71,7 @@ def test_a_method_without_threshold_says_good_of_its_pick_alone() -> None:
     assert told["methods"]["nearest"]["accuracy"]["value"] == pytest.approx(right / len(cut))
 
 
-def test_breakdowns_part_the_candidates_and_know_what_was_trained_on() -> None:
+def test_breakdowns_group_all_candidates_and_mark_trained_objects() -> None:
     columns = scored(n_scenes=30)
     told = evaluate_set(columns, METHODS, "clear", weights_for(columns, 10, 0), ["0" * 64])
     headings = dict.fromkeys(row["by"] for row in told["breakdown"])
@@ -89,7 +89,7 @@ def test_breakdowns_part_the_candidates_and_know_what_was_trained_on() -> None:
     assert trained == [on_first.sum(), told["count"] - on_first.sum()]
 
 
-def test_differences_are_of_the_same_resamples_both_ways_round() -> None:
+def test_differences_use_the_same_resamples_in_both_directions() -> None:
     columns = scored(n_scenes=40)
     weights = weights_for(columns, 300, 5)
     forth = evaluate_set(columns, METHODS, "clear", weights)["differences"]

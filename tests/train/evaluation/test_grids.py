@@ -13,7 +13,7 @@ from datagen.train.evaluation.metrics import average_precision
 
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
 @settings(deadline=None)
-def test_a_selection_is_what_looking_at_every_candidate_gives(seed: int, side: int, levels: int) -> None:
+def test_selection_equals_brute_force(seed: int, side: int, levels: int) -> None:
     rng = np.random.default_rng(seed)
     n_groups, cells = 4, side * side
     group = rng.permutation(np.repeat(np.arange(n_groups), cells))

@@ -33,7 +33,7 @@ def test_the_area_under_roc_is_the_share_of_pairs_in_the_right_order(told: list[
 
 @given(TOLD)
 @settings(deadline=None)
-def test_curves_are_what_every_threshold_gives(told: list[tuple[bool, float]]) -> None:
+def test_curves_equal_the_rates_at_every_threshold(told: list[tuple[bool, float]]) -> None:
     true, score = arrays(told)
     if true.all() or not true.any():
         return
@@ -76,7 +76,7 @@ def test_perfect_and_constant_scorers() -> None:
     assert metrics.average_precision(true, np.full(500, 0.3)) == pytest.approx(true.mean())
 
 
-def test_calibration_tells_the_sure_from_the_right() -> None:
+def test_calibration_measures_overconfidence() -> None:
     rng = np.random.default_rng(1)
     p = rng.random(200_000)
     true = rng.random(len(p)) < p

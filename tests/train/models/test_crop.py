@@ -12,7 +12,7 @@ from datagen.train.models.crop import crop_clouds
 from tests.train.models.made_batches import drawn_tables
 
 
-def test_the_crop_is_that_of_a_plain_loop():
+def test_the_crop_equals_a_plain_loop():
     clouds, _, robots = drawn_tables(3, scenes=2, robots=5, points=60)
     clouds = replace(clouds, n_points=torch.tensor([60, 41]))
     robots = replace(robots, arm_reach_m=torch.tensor([0.8, 0.2, 0.1, 0.05, 0.3]))

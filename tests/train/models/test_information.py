@@ -138,11 +138,11 @@ def test_points_out_of_reach_change_nothing(name: str):
 
 
 @torch.no_grad()
-def test_a_camera_that_is_given_counts():
+def test_a_given_camera_changes_logits():
     model = small_model("shared", camera="given")
     before, after = model.score(*drawn_tables(5)), model.score(*raise_the_camera(drawn_tables(5)))
     assert float((after - before).abs().amax()) > 1e-4
 
 
-def test_small_models_take_as_many_points():
+def test_small_models_use_their_number_of_points():
     assert {config["n_points"] for config in SMALL.values()} == {96}

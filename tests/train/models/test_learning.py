@@ -16,7 +16,7 @@ STEPS = 300
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
-def test_a_handful_of_scenes_is_learnt_by_heart(name: str, heuristic_run: Path):
+def test_models_overfit_a_few_scenes(name: str, heuristic_run: Path):
     stream = SampleStream([heuristic_run], scenes_per_batch=3, shuffle=False)
     batch = to_torch(next(iter(stream.epoch(0))), "cpu")
     assert 0.1 < float(batch.label.float().mean()) < 0.9

@@ -70,7 +70,7 @@ def test_odd_clouds_give_finite_logits_and_gradients(name: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_batch_of_one_candidate_can_be_learnt_from(name: str):
+def test_a_batch_of_one_candidate_trains(name: str):
     model = small_model(name).train()
     logits = model.score(*drawn_tables(0, candidates=1))
     logits[0, 1].backward()
@@ -111,7 +111,7 @@ def test_a_configuration_that_went_through_json_builds_the_same_model(name: str)
         ("paper", {"dropout": 1.0}, "dropout"),
     ],
 )
-def test_a_configuration_that_is_not_one_is_named(name: str, config: dict[str, Any], words: str):
+def test_an_invalid_configuration_names_its_field(name: str, config: dict[str, Any], words: str):
     with pytest.raises(InputError) as error:
         build_model(name, config)
     assert words in str(error.value)

@@ -11,7 +11,7 @@ from tests.train.models.made_batches import drawn_tables, small_model
 
 
 @torch.no_grad()
-def test_groups_are_those_of_the_cloud_with_fifty_points_after_it():
+def test_groups_equal_those_of_the_cloud_followed_by_fifty_points():
     model = small_model("paper", neighbours=(12, 6))
     assert isinstance(model, PaperModel)
     clouds, candidates, robots = drawn_tables(7, candidates=12)

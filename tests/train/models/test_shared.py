@@ -34,7 +34,7 @@ def model() -> Model:
 @settings(max_examples=25, deadline=None)
 @given(angle=st.floats(-10, 10), seed=st.integers(0, 50))
 @torch.no_grad()
-def test_turning_cloud_and_candidates_together_changes_nothing(model: Model, angle: float, seed: int):
+def test_rotating_cloud_and_candidates_together_changes_nothing(model: Model, angle: float, seed: int):
     tables = drawn_tables(seed)
     logits, turned = model.score(*tables), model.score(*turned_about_z(tables, angle))
     torch.testing.assert_close(turned, logits, atol=1e-4, rtol=1e-4)
@@ -42,7 +42,7 @@ def test_turning_cloud_and_candidates_together_changes_nothing(model: Model, ang
 
 @pytest.mark.parametrize("mirrored", [True, False])
 @torch.no_grad()
-def test_left_and_right_are_the_same_to_a_mirrored_model_alone(mirrored: bool):
+def test_only_mirrored_models_are_invariant_to_a_mirror(mirrored: bool):
     model = small_model("shared", mirrored=mirrored)
     clouds, candidates, robots = drawn_tables(4)
     flip = torch.tensor([1.0, -1.0, 1.0])
@@ -54,7 +54,7 @@ def test_left_and_right_are_the_same_to_a_mirrored_model_alone(mirrored: bool):
 
 
 @torch.no_grad()
-def test_turning_the_candidates_alone_changes_much(model: Model):
+def test_rotating_the_candidates_alone_changes_logits(model: Model):
     clouds, candidates, robots = drawn_tables(0)
     _, elsewhere, _ = turned_about_z((clouds, candidates, robots), 1.0)
     change = model.score(clouds, elsewhere, robots) - model.score(clouds, candidates, robots)
@@ -77,7 +77,7 @@ def frame_at(x: float, y: float, rise: float, camera: float) -> Tensor:
     return frames_of(torch.tensor([[x, y]]), *(torch.tensor([v]) for v in (rise, camera, 0.8, 0.1)))
 
 
-def test_a_place_on_the_line_of_sight_has_no_offset_from_it():
+def test_a_point_on_the_line_of_sight_has_no_offset_from_it():
     # Target at the origin, camera 0.6 m before it and 0.3 m above: half way between them, and beside that.
     frame = frame_at(0.0, -0.6, 0.2, 0.3)
     places = torch.tensor([[[0.0, -0.3, 0.15], [-0.1, -0.3, 0.15], [0.0, 0.0, 0.0]]])
@@ -101,7 +101,7 @@ def test_distances_from_the_mount_and_from_the_arms_line():
 
 
 @torch.no_grad()
-def test_the_estimate_of_what_is_hidden_is_one_more_input():
+def test_observed_visibility_is_one_more_input():
     model = small_model("shared", observed_visibility=True)
     clouds, candidates, robots = drawn_tables(1, scenes=1, robots=1)
     before = model.score(clouds, candidates, robots)

@@ -39,7 +39,7 @@ def refused(path: Path, data: bytes) -> bool:
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_no_changed_byte_and_no_cut_gives_more_than_a_line(tmp_path: Path, method: int):
+def test_changed_bytes_and_truncation_give_one_line(tmp_path: Path, method: int):
     good = packed(saved(DEPTH), method)
     path = tmp_path / "a.npz"
     assert not refused(path, good)
@@ -50,7 +50,7 @@ def test_no_changed_byte_and_no_cut_gives_more_than_a_line(tmp_path: Path, metho
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_methods_that_numpy_never_writes_are_refused(tmp_path: Path, method: int):
+def test_compression_methods_that_numpy_never_writes_are_refused(tmp_path: Path, method: int):
     assert refused(tmp_path / "a.npz", packed(saved(DEPTH), method))
 
 
@@ -68,7 +68,7 @@ def test_methods_that_numpy_never_writes_are_refused(tmp_path: Path, method: int
         ("(" * 9000, "(2, 3)", 24),
     ],
 )
-def test_headers_that_are_no_arrays_are_refused(tmp_path: Path, descr: str, shape: str, size: int):
+def test_invalid_array_headers_are_refused(tmp_path: Path, descr: str, shape: str, size: int):
     text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
     start = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
     assert refused(tmp_path / "a.npz", packed(start + bytes(size)))

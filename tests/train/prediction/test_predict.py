@@ -87,7 +87,7 @@ def test_a_frame_gives_the_scores_of_the_stored_cloud(
     assert off(noisy.score, theirs) < 2 * sampling
 
 
-def test_a_rule_over_the_observed_cloud_says_the_same_of_both(seen: Seen) -> None:
+def test_a_rule_on_the_observed_cloud_scores_both_alike(seen: Seen) -> None:
     rule = Analytic(only_clear=False)
     for shot, centre, most in (
         (seen, seen.scene.target_center_m, 0.1),
@@ -101,7 +101,7 @@ def test_a_rule_over_the_observed_cloud_says_the_same_of_both(seen: Seen) -> Non
         assert off(ours.score, shifted) > 2 * most or most > 0.2
 
 
-def test_the_cloud_has_the_form_of_a_stored_one(seen: Seen, scorer: ModelScorer) -> None:
+def test_the_cloud_has_the_shape_of_a_stored_one(seen: Seen, scorer: ModelScorer) -> None:
     stored, cloud = seen.scene.cloud, of(scorer, sensor_frame(seen)).cloud
     assert cloud.points_m.dtype == stored.points_m.dtype and cloud.points_m.shape == stored.points_m.shape
     points = cloud.points_m[:512].astype(np.float64)
@@ -125,7 +125,7 @@ def test_a_real_house_gives_the_scores_of_its_stored_cloud(assets: Path, scorer:
 
 
 @pytest.mark.parametrize(("quarters", "x", "y"), [(1, 0.0, 0.0), (2, -3.0, 17.5), (3, 8.0, -0.3)])
-def test_scores_turn_with_the_world(
+def test_scores_rotate_with_the_world(
     quarters: int, x: float, y: float, seen: Seen, scorer: ModelScorer
 ) -> None:
     before = of(scorer, sensor_frame(seen))
@@ -163,7 +163,9 @@ def test_the_floor_in_the_picture_serves_as_well_as_a_pose(
     assert found.grounds[0].residual_m is not None and found.grounds[0].residual_m < 0.02
 
 
-def test_a_frame_fused_with_itself_says_the_same(seen: Seen, scorer: ModelScorer, sampling: float) -> None:
+def test_a_frame_fused_with_itself_gives_the_same_scores(
+    seen: Seen, scorer: ModelScorer, sampling: float
+) -> None:
     one, twice = of(scorer, sensor_frame(seen)), of(scorer, sensor_frame(seen), sensor_frame(seen))
     assert len(twice.seen) < len(one.seen)
     assert np.linalg.norm(twice.center_m - one.center_m) < 0.005
@@ -187,7 +189,7 @@ def test_a_second_frame_shows_more(seen: Seen, scorer: ModelScorer) -> None:
     assert len(marked) > int(one.seen.on_target.sum()) * 0.5
 
 
-def test_places_are_what_the_house_says(seen: Seen, scorer: ModelScorer) -> None:
+def test_cell_states_agree_with_the_house(seen: Seen, scorer: ModelScorer) -> None:
     answer = predict(scorer, [sensor_frame(seen)], ROBOT)
     n = len(answer.score)
     free = base_clearance_m(
@@ -217,7 +219,7 @@ def test_the_best_is_clear_and_its_poses_agree(seen: Seen, scorer: ModelScorer) 
     np.testing.assert_allclose(inverse(T) @ back, np.eye(4), atol=1e-9)
 
 
-def test_unseen_places_are_chosen_only_when_asked(seen: Seen, scorer: ModelScorer) -> None:
+def test_unseen_base_poses_are_chosen_only_with_allow_unseen(seen: Seen, scorer: ModelScorer) -> None:
     table = sensor_frame(seen)
     low = np.flatnonzero((table.points_m @ seen.camera.T_world_camera[:3, :3].T)[:, 2] + seen.height_m > 0.3)
     assert table.on_target is not None
@@ -230,7 +232,7 @@ def test_unseen_places_are_chosen_only_when_asked(seen: Seen, scorer: ModelScore
     assert "not visible" in lax.sure
 
 
-def test_missing_depth_on_the_target_is_filled_and_told(seen: Seen, scorer: ModelScorer) -> None:
+def test_missing_depth_on_the_target_is_filled_and_reported(seen: Seen, scorer: ModelScorer) -> None:
     whole = sensor_frame(seen)
     assert whole.image is not None and whole.image.mask is not None
     holes = whole.image.mask & (np.random.default_rng(0).random(whole.image.mask.shape) < 0.5)

@@ -18,7 +18,7 @@ from datagen.train.training.loop import run_training
 from datagen.train.training.training_setup import TrainingJob, prepare_training, save_checkpoint
 
 
-def train_and_tell(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
+def train_and_save_results(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
     """Train, and leave this rank's weights and samples beside the checkpoint.
 
     Then the second rank refuses something while the first still waits for it.
@@ -85,5 +85,5 @@ def joined(parts: list[Batch[Array]]) -> Batch[Array]:
     )
 
 
-def told_by(out: Path | str, rank: int) -> dict[str, Any]:
+def results_of(out: Path | str, rank: int) -> dict[str, Any]:
     return torch.load(f"{out}.{rank}", weights_only=True)

@@ -42,7 +42,7 @@ def job_of(runs: Path, out: Path, val: Path | None = None, **changes: Any) -> Tr
 
 
 class Recorder:
-    """Remembers what it was told."""
+    """Keeps all steps and epochs."""
 
     def __init__(self) -> None:
         self.steps: list[TrainingStep] = []
@@ -56,7 +56,7 @@ class Recorder:
 
 
 def train_until(job: TrainingJob, step: int | None = None) -> tuple[bool, Recorder]:
-    """Go on with a job, as the verb does, until it ends or Ctrl-C comes during the given step."""
+    """Resume a job until it ends or Ctrl-C comes during the given step."""
     training, head = prepare_training(job, Ranks())
     seen = Recorder()
 

@@ -69,7 +69,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_is_written_is_read(tmp_path: Path):
+def test_written_checkpoints_are_read_back(tmp_path: Path):
     checkpoint = checkpoint_of()
     path = tmp_path / "new/folder/a.ckpt"
     write_checkpoint(path, checkpoint)
@@ -92,7 +92,7 @@ def test_safetensors_alone_reads_it(written: Path):
         assert stored.get_tensor("weights/token.0.weight").dtype == torch.float32
 
 
-def test_loading_draws_nothing_from_the_global_generator(written: Path):
+def test_loading_leaves_the_global_generator_unchanged(written: Path):
     torch.manual_seed(7)
     load_model(written)
     after = torch.rand(3)
@@ -100,7 +100,7 @@ def test_loading_draws_nothing_from_the_global_generator(written: Path):
     assert torch.equal(torch.rand(3), after)
 
 
-def test_a_file_cut_anywhere_is_one_line(written: Path, tmp_path: Path):
+def test_a_truncated_file_gives_one_line(written: Path, tmp_path: Path):
     data = written.read_bytes()
     cut = tmp_path / "cut.ckpt"
     for length in np.linspace(0, len(data) - 1, 40).astype(int):
@@ -112,7 +112,7 @@ def test_a_file_cut_anywhere_is_one_line(written: Path, tmp_path: Path):
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_a_changed_byte_is_noticed_or_changes_nothing(written: Path, data: st.DataObject):
+def test_a_changed_byte_is_detected_or_changes_nothing(written: Path, data: st.DataObject):
     is_refused_or_equal_with_a_byte_changed(written, written.with_name("changed.ckpt"), data)
 
 
@@ -163,7 +163,7 @@ def test_files_are_refused_by_their_sizes(written: Path, tmp_path: Path):
             read_checkpoint(sparse)
 
 
-def test_what_is_no_checkpoint_is_named(tmp_path: Path):
+def test_files_that_are_no_checkpoints_are_named(tmp_path: Path):
     model = build_model("shared", TINY).state_dict()
     plain, listed, newer = tmp_path / "plain.pt", tmp_path / "list.pt", tmp_path / "newer.ckpt"
     foreign, zeros = tmp_path / "foreign.safetensors", tmp_path / "zeros"
@@ -256,7 +256,7 @@ def test_every_text_and_number_of_the_document_is_checked(written: Path, tmp_pat
 
 
 @pytest.mark.parametrize("at", ["fsync", "replace"])
-def test_killed_while_it_is_written_the_old_file_is_whole(tmp_path: Path, at: str):
+def test_a_kill_during_writing_keeps_the_old_file(tmp_path: Path, at: str):
     path = tmp_path / "c.ckpt"
     write_checkpoint(path, checkpoint_of(step=1))
     before = path.read_bytes()
@@ -301,7 +301,7 @@ def test_one_process_at_a_time_writes_it(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_view_is_kept_without_what_it_is_a_view_of(tmp_path: Path):
+def test_a_view_is_saved_without_its_base_tensor(tmp_path: Path):
     large = torch.zeros(1_000_000)
     write_checkpoint(tmp_path / "c.ckpt", Checkpoint(head_of(), {"w": large[:3]}))
     assert (tmp_path / "c.ckpt").stat().st_size < 100_000

@@ -42,7 +42,7 @@ def test_the_speed_is_that_of_the_last_minute():
     assert (last["step"], last["left_s"]) == (40, 120)
 
 
-def test_a_bar_shows_numbers_and_a_line_an_epoch():
+def test_progress_shows_numbers_and_a_row_per_epoch():
     out = io.StringIO()
     with Progress(console=Console(file=out, force_terminal=True, width=110, color_system=None)) as shown:
         bar = TrainingProgress(shown, "a.ckpt")

@@ -21,7 +21,7 @@ from datagen.train.training.checkpoints import read_checkpoint
 from datagen.train.training.launching import Ranks, interruptible, train_in_processes
 from datagen.train.training.loop import run_training
 from datagen.train.training.training_setup import TrainingJob, prepare_training
-from tests.train.training.rank_work import Union, told_by, train_and_tell
+from tests.train.training.rank_work import Union, results_of, train_and_save_results
 from tests.train.training.small import TINY, equal, job_of
 
 # Without dropout, whose draws are each rank's own.
@@ -37,8 +37,8 @@ def test_two_processes_train_like_one_on_both_their_batches_and_end_together(
 ):
     job = still_job(heuristic_run, tmp_path / "two.ckpt")
     with pytest.raises(InputError, match="place: field: problem"):
-        train_in_processes(train_and_tell, job, 2, "cpu", lambda: False)
-    told = [told_by(job.out, rank) for rank in (0, 1)]
+        train_in_processes(train_and_save_results, job, 2, "cpu", lambda: False)
+    told = [results_of(job.out, rank) for rank in (0, 1)]
     kept = read_checkpoint(job.out)
     assert equal(told[0]["weights"], told[1]["weights"])
     assert equal(
@@ -72,7 +72,7 @@ assert train_in_processes(wait_for_stop, job, 1, "cpu", lambda: Path(job + ".sto
 """
 
 
-def test_the_folder_of_a_killed_training_is_removed_by_the_next_and_that_of_a_living_one_stays(
+def test_the_next_training_removes_folders_of_killed_ones_alone(
     tmp_path: Path,
 ):
     temporary = tmp_path / "tmp"
@@ -120,6 +120,6 @@ def test_the_first_interrupt_is_noted_and_the_second_ends():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_steps_share_out_whole_scenes(heuristic_run: Path, tmp_path: Path):
+def test_steps_have_whole_scenes(heuristic_run: Path, tmp_path: Path):
     with pytest.raises(InputError, match="cannot be divided evenly among 3"):
         prepare_training(still_job(heuristic_run, tmp_path / "c.ckpt"), Ranks(0, 3))

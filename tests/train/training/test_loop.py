@@ -28,7 +28,7 @@ def whole(heuristic_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return out
 
 
-def test_stopped_at_any_batch_it_ends_as_if_it_had_not(heuristic_run: Path, whole: Path, tmp_path: Path):
+def test_stopped_at_any_batch_training_ends_the_same(heuristic_run: Path, whole: Path, tmp_path: Path):
     truth = read_checkpoint(whole)
     assert truth.head.step == 6
     for step in range(1, 7):
@@ -43,7 +43,7 @@ def test_stopped_at_any_batch_it_ends_as_if_it_had_not(heuristic_run: Path, whol
         assert gone_on.loop == truth.loop
 
 
-def test_stopped_at_every_step_it_ends_as_if_it_had_not(heuristic_run: Path, tmp_path: Path):
+def test_stopped_at_every_step_training_ends_the_same(heuristic_run: Path, tmp_path: Path):
     """With batch statistics and dropout, which both leave traces that a step must find again."""
     config = {"model": "paper", "model_config": TINY_PAPER, "candidates_per_robot": 2}
     whole = job_of(heuristic_run, tmp_path / "whole.ckpt", epochs=1, **config)
@@ -80,7 +80,7 @@ def test_the_best_epoch_is_kept_and_patience_ends_it(heuristic_run: Path, tmp_pa
     assert head == checkpoint.head
 
 
-def test_classes_weigh_alike_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
+def test_classes_have_equal_weight_in_stage_1_alone(heuristic_run: Path, tmp_path: Path):
     training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
     counts = np.array(training.train.class_counts())  # type: ignore[attr-defined]
     weights = training.class_weights.numpy()
@@ -107,7 +107,9 @@ class Spoilt:
             yield batch
 
 
-def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_run: Path, tmp_path: Path):
+def test_a_loss_that_is_not_finite_names_its_samples_and_keeps_the_weights(
+    heuristic_run: Path, tmp_path: Path
+):
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
     training, _ = prepare_training(job, Ranks())
     rows = [3, 5, 6, 20, 21]
@@ -125,7 +127,7 @@ def test_a_loss_that_is_no_number_names_its_samples_and_harms_nothing(heuristic_
     assert all(torch.isfinite(p).all() for p in training.model.parameters())
 
 
-def test_a_gradient_that_is_no_number_ends_it_too(heuristic_run: Path, tmp_path: Path):
+def test_a_gradient_that_is_not_finite_ends_training(heuristic_run: Path, tmp_path: Path):
     training, _ = prepare_training(job_of(heuristic_run, tmp_path / "c.ckpt"), Ranks())
     first = next(iter(training.model.parameters()))
     first.register_hook(lambda gradient: gradient * float("nan"))
@@ -148,7 +150,7 @@ def test_weights_that_overflow_do_not_replace_a_good_checkpoint(heuristic_run: P
     assert Path(job.out).read_bytes() == before
 
 
-def test_what_a_step_tells(heuristic_run: Path, whole: Path, tmp_path: Path):
+def test_steps_report_loss_time_and_samples(heuristic_run: Path, whole: Path, tmp_path: Path):
     job = job_of(heuristic_run, tmp_path / "c.ckpt")
     _, seen = train_until(job)
     head = read_checkpoint(job.out).head

@@ -47,7 +47,7 @@ def test_decay_keeps_matrices_small_and_leaves_the_rest():
         torch.testing.assert_close(p.detach(), factor * before[name])
 
 
-def test_a_state_is_put_back_or_refused():
+def test_optimiser_state_is_restored_or_refused():
     model = build_model("shared", TINY)
     optimiser = stepped(model)
     set_rate(optimiser, 0.25)

@@ -40,7 +40,7 @@ def test_torch_reads_the_same():
     assert not load_model(OLD)[0].training
 
 
-def test_a_training_begun_by_the_version_before_is_finished(tmp_path: Path):
+def test_a_training_of_the_previous_version_resumes(tmp_path: Path):
     """It ends as one that was never interrupted."""
     unpack(GOLDEN / "run-format-2-schema-2.zip", tmp_path)
     val = tmp_path / "merged/parts/7dd3e367e63166c1"
@@ -61,14 +61,14 @@ def test_a_training_begun_by_the_version_before_is_finished(tmp_path: Path):
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_a_changed_byte_is_noticed_or_changes_nothing(
+def test_a_changed_byte_is_detected_or_changes_nothing(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ):
     path = tmp_path_factory.mktemp("changed") / "a.ckpt"
     is_refused_or_equal_with_a_byte_changed(OLD, path, data)
 
 
-def test_a_file_cut_anywhere_is_one_line(tmp_path: Path):
+def test_a_truncated_file_gives_one_line(tmp_path: Path):
     data, cut = OLD.read_bytes(), tmp_path / "cut.ckpt"
     for length in np.linspace(0, len(data) - 1, 40).astype(int):
         cut.write_bytes(data[:length])
@@ -131,7 +131,7 @@ def test_declared_sizes_must_be_those_of_the_file(written: Path, tmp_path: Path)
             read_checkpoint(path)
 
 
-def test_a_shape_without_end_is_refused(written: Path, tmp_path: Path):
+def test_an_unbounded_shape_is_refused(written: Path, tmp_path: Path):
     """Its strides are products over the shape, so that a million axes would take hours."""
     axes = b"K\x01" * 1_000_000
 
@@ -143,7 +143,7 @@ def test_a_shape_without_end_is_refused(written: Path, tmp_path: Path):
         read_checkpoint(with_pickle(tmp_path / "long.ckpt", written, longer))
 
 
-def test_bombs_are_refused_by_their_sizes(written: Path, tmp_path: Path):
+def test_zip_bombs_are_refused_by_their_sizes(written: Path, tmp_path: Path):
     packed = tmp_path / "packed.ckpt"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as out:
         out.writestr("archive/data.pkl", b"\0" * 10_000_000)
@@ -151,7 +151,7 @@ def test_bombs_are_refused_by_their_sizes(written: Path, tmp_path: Path):
         read_checkpoint(packed)
 
 
-def test_pickles_made_to_take_for_ever_are_refused(tmp_path: Path):
+def test_pickles_that_would_never_end_are_refused(tmp_path: Path):
     nested = b"\x80\x02}(X\x04\x00\x00\x00headX\x00\x00\x00\x00)" + b"q\x00h\x00\x86" * 60
     for odd in (
         nested + b"K\x01u.",  # as a key, whose hash would take 2^60 steps
