@@ -13,7 +13,6 @@ from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMAS
 from datagen.schemas.keys import MERGED
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Commit
 from datagen.schemas.shard_reading import MAX_META_BYTES, ShardPlace, StoredArray, committed_place
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import open_storage
@@ -100,7 +99,8 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
         place = committed_place(run.storage, commit, names, *run.layout.rows_wanted(commit.shard, n))
         metadata = {entry.path: entry.sha256 for entry in commit.files if entry.path in paths}
         if not shards:
-            _refuse_unknown(url, names, commit)
+            stored = [e.path for e in commit.files if e.path.endswith("/zarr.json")]
+            _refuse_unknown(url, names, [path.removesuffix("/zarr.json") for path in stored])
             first, arrays = metadata, place.metadata(names)
         # Merged runs may come from programs that word an array's meaning otherwise.
         elif metadata != first:
@@ -121,8 +121,7 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
     return RunPart(url, (manifest.spec_hash,), specs, manifest.schema_name, version, shards, arrays, cost)
 
 
-def _refuse_unknown(url: str, names: Sequence[str], commit: Commit) -> None:
-    stored = [e.path.removesuffix("/zarr.json") for e in commit.files if e.path.endswith("/zarr.json")]
+def _refuse_unknown(url: str, names: Sequence[str], stored: Sequence[str]) -> None:
     for name in names:
         if name not in stored:
             raise InputError(url, name, "is not a field of the run", choices(stored, name))
@@ -170,9 +169,7 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> RunPart:
         known = ", ".join(f"{s.name} {OLDEST_SCHEMA_VERSION} to {s.version}" for s in SCHEMAS.values())
         problem = f"is {schema!r} {version}, but this program reads {known}"
         raise InputError(where, "schema_version", problem, "Use the version of datagen that made the run")
-    for name in names:
-        if name not in stored:
-            raise InputError(storage.url, name, "is not a field of the store", choices(stored, name))
+    _refuse_unknown(storage.url, names, stored)
     arrays = ShardPlace(storage, "", 0, 0, 0, 0, 0).metadata(names)
     scenes = {a.shape[0] for a in arrays.values() if a.dims[0] == "scene"}
     samples = {a.shape[0] for a in arrays.values() if a.dims[0] == "sample"}

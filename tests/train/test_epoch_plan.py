@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from datagen.train.epoch_plan import EpochPlan, batches_of, plan_epoch
+from datagen.train.dataset import EpochPlan, batches_of, plan_epoch
 
 SHARDS = st.lists(st.integers(1, 6), min_size=1, max_size=12)  # scenes of each
 ASKED = st.tuples(st.integers(1, 9), st.integers(1, 5))  # scenes a batch, shards a buffer

@@ -163,16 +163,15 @@ def _picked(columns: Columns, method: Method, weights: Weights) -> dict[str, Est
     per_scene = np.zeros((columns.n_scenes, parts.shape[1]))
     np.add.at(per_scene, scene_of[chosen.group], parts)
     whole, drawn = per_scene.sum(axis=0), summed(weights, per_scene)
+
+    def share(sums: F64, first: int) -> F64:
+        return metrics.ratio(sums[..., first], sums[..., first + 1])
+
     trials = {"good": int((per_scene[:, 1] > 0).sum())}
     return {
-        name: Estimate(float(_share(whole, first)), _share(drawn, first), trials.get(name, 0))
+        name: Estimate(float(share(whole, first)), share(drawn, first), trials.get(name, 0))
         for name, first in (("good", 0), ("missed_m", 2), ("mean_average_precision", 4))
     }
-
-
-def _share(sums: F64, first: int) -> F64:
-    part, whole = sums[..., first], sums[..., first + 1]
-    return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
 
 
 def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:

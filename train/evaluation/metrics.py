@@ -22,17 +22,18 @@ def confusion(said: F64, true: Bools, group: Ints, n_groups: int) -> F64:
 
 def accuracy(counts: F64) -> F64:
     """Accuracy (...) of confusions (..., 4)."""
-    return _ratio(counts[..., 0] + counts[..., 3], counts.sum(axis=-1))
+    return ratio(counts[..., 0] + counts[..., 3], counts.sum(axis=-1))
 
 
 def balanced_accuracy(counts: F64) -> F64:
     """Balanced accuracy (...), the mean of sensitivity and specificity, of confusions (..., 4)."""
-    found = _ratio(counts[..., 0], counts[..., 0] + counts[..., 2])
-    refused = _ratio(counts[..., 3], counts[..., 3] + counts[..., 1])
+    found = ratio(counts[..., 0], counts[..., 0] + counts[..., 2])
+    refused = ratio(counts[..., 3], counts[..., 3] + counts[..., 1])
     return (found + refused) / 2
 
 
-def _ratio(part: F64, whole: F64) -> F64:
+def ratio(part: F64, whole: F64) -> F64:
+    """part / whole, nan where whole is 0."""
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0)
 
 

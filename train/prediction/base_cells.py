@@ -77,11 +77,6 @@ def seen_share(cloud_m: F32, radius_m: float) -> float:
     return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
 
-def facing_yaw(offset_m: F32) -> F64:
-    """Yaw (N,) of bases at these offsets (N, 2) from the target that face it."""
-    return np.arctan2(-offset_m[:, 1].astype(np.float64), -offset_m[:, 0].astype(np.float64))
-
-
 def _counts(points_m: F32, base_xy: F64, radius_m: float) -> I64:
     """Points (N, 3) within the radius of each base, seen from above."""
     near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < _AROUND_M

@@ -53,11 +53,6 @@ class RgbdImage:
     pinhole: Pinhole
     mask: Bools | None  # (H, W), the target's pixels
 
-    @property
-    def missing_share(self) -> float:
-        """Share of pixels without depth."""
-        return float((self.depth_m == 0).mean())
-
     def points(self, pixels: I64, depth_m: F32 | None = None) -> F32:
         """Points (N, 3) in the camera's frame, of flat pixel indices (N,)."""
         v, u = np.divmod(pixels, self.depth_m.shape[1])

@@ -28,9 +28,6 @@ class SeenPoints:
     on_target: Bools  # (N,)
     eyes_m: F64  # (F, 3), where the cameras were; the first is the one that sees most of the target
 
-    def __len__(self) -> int:
-        return len(self.points_m)
-
 
 def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
     """Frames by their `T_world_camera` in one cloud.
@@ -84,7 +81,7 @@ def crop_cloud(seen: SeenPoints, center_m: F64, params: ObservationParams, rng: 
     rel = seen.points_m.astype(np.float64) - center_m
     near = np.flatnonzero(np.einsum("ij,ij->i", rel, rel) <= params.crop_radius_m**2)
     sure = rng.permutation(near[seen.on_target[near]])[: params.min_target_points]
-    fresh = np.ones(len(seen), np.bool_)
+    fresh = np.ones(len(seen.points_m), np.bool_)
     fresh[sure] = False
     rows = np.concatenate([sure, (order := rng.permutation(near))[fresh[order]]])[: params.n_points]
     return stored_cloud(rel[rows].astype(np.float32), seen.rgb[rows], seen.on_target[rows], params)

@@ -18,7 +18,6 @@ from datagen.train.prediction.base_cells import (
     UNSEEN,
     BaseCells,
     RobotSize,
-    facing_yaw,
     observe_cells,
     seen_share,
 )
@@ -66,7 +65,8 @@ class Prediction:
     @property
     def yaw_rad(self) -> F64:
         """Headings (N,) that face the target, counter-clockwise from x."""
-        return facing_yaw(self.cells.offset_m)
+        x, y = -self.cells.offset_m.astype(np.float64).T
+        return np.arctan2(y, x)
 
     def T_world_base(self, row: int) -> F64:
         """Pose (4, 4) of the arm's mount at one base pose: at base height, x towards the target."""
@@ -103,7 +103,7 @@ class Prediction:
     @property
     def missing_depth(self) -> float | None:
         """Share of the frames' pixels without depth; None for clouds without pictures."""
-        shares = [f.image.missing_share for f in self.frames if f.image is not None]
+        shares = [(f.image.depth_m == 0).mean() for f in self.frames if f.image is not None]
         return float(np.mean(shares)) if shares else None
 
     @property

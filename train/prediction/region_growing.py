@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from datagen.schemas.errors import InputError
-from datagen.train.inputs import F32, F64, I64, Bools
+from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.frames import RgbdImage
 from datagen.train.prediction.ground import depth_error_m
 from datagen.train.prediction.target import from_nearest
@@ -43,7 +43,8 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     for _ in range(_ROUNDS):
         lowest_m = _above_support(grid, facets, level, seed)
         allowed = around & (grid[..., 2] > min(lowest_m, seed[2] - 1e-4))
-        labels = _pieces(allowed & joined)
+        labels = np.zeros((h, w), np.int64)
+        ndimage.label(allowed & joined, output=labels)
         grown = (labels == labels[v, u]) & allowed & joined
         if not grown.any() or far_m[grown].max() < _RAN_OUT * _GROWS_M:
             break
@@ -73,13 +74,6 @@ def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
     height_m = float(np.median(z[np.abs(z - (edges[k] + edges[k + 1]) / 2) < 1.5 * _BIN_M]))
     near = np.abs(z[np.abs(z - height_m) < 0.015] - height_m)
     return height_m + 0.004 + 3 * 1.48 * float(np.median(near))
-
-
-def _pieces(mask: Bools) -> I64:
-    """Number (H, W) of the connected piece that each pixel belongs to, 0 outside."""
-    labels = np.zeros(mask.shape, np.int64)
-    ndimage.label(mask, output=labels)
-    return labels
 
 
 def _step_m(depth_m: F32) -> F64:

@@ -39,7 +39,7 @@ class Filled:
 def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
     """The frame with the depth of the nearest pixel where the mask has none. InputError for few."""
     image = frame.image
-    assert image is not None and image.mask is not None
+    assert image is not None and image.mask is not None and frame.on_target is not None
     mask, known = image.mask, image.mask & (image.depth_m > 0)
     wanted, have = int(mask.sum()), int(known.sum())
     if have < max(_LEAST_POINTS, _LEAST_SHARE * wanted):
@@ -54,7 +54,7 @@ def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
         frame,
         points_m=np.concatenate([frame.points_m, image.points(pixels, depth_m)]),
         rgb=np.concatenate([frame.rgb, image.rgb.reshape(-1, 3)[pixels]]),
-        on_target=np.concatenate([_known(frame), np.ones(len(pixels), np.bool_)]),
+        on_target=np.concatenate([frame.on_target, np.ones(len(pixels), np.bool_)]),
     ), Filled(wanted, wanted - have)
 
 
@@ -111,8 +111,3 @@ def _support_under(others_m: F64, middle_xy: F64, half_m: float, low_m: float) -
     counted, edges = np.histogram(z, np.arange(low_m - 0.1, low_m + 0.035, 0.005))
     k = int(counted.argmax())
     return float(np.median(z[(z >= edges[k] - 0.0025) & (z <= edges[k + 1] + 0.0025)]))
-
-
-def _known(frame: SensorFrame) -> Bools:
-    assert frame.on_target is not None
-    return frame.on_target
