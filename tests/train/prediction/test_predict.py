@@ -167,7 +167,7 @@ def test_a_frame_fused_with_itself_gives_the_same_scores(
     seen: Seen, scorer: ModelScorer, sampling: float
 ) -> None:
     one, twice = of(scorer, sensor_frame(seen)), of(scorer, sensor_frame(seen), sensor_frame(seen))
-    assert len(twice.seen) < len(one.seen)
+    assert len(twice.seen.points_m) < len(one.seen.points_m)
     assert np.linalg.norm(twice.center_m - one.center_m) < 0.005
     assert off(twice.score, one.score) < 2 * sampling
 
