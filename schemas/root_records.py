@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.record_files import MAX_RECORD_BYTES, different_fields
-from datagen.schemas.run_records import Manifest
+from datagen.schemas.run_records import FORMAT_VERSION, Manifest
 from datagen.schemas.storage import Storage
 from datagen.schemas.storage.errors import NotARegularFile
 
@@ -22,6 +22,13 @@ def publish(storage: Storage, key: str, record: bytes) -> None:
     storage.put_new(copy_key(key), record)
     kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
     storage.put_new(key, record if kept is None else kept)
+
+
+def refuse_other_format(place: str, version: int) -> None:
+    """Raise InputError for a record of another format, at `place`."""
+    if version != FORMAT_VERSION:
+        problem = f"is {version}, but this program reads {FORMAT_VERSION}"
+        raise InputError(place, "format_version", problem, "Use the version of datagen that made the run")
 
 
 def refuse_foreign(storage: Storage, *also: str) -> None:

@@ -20,9 +20,8 @@ from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
 from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
-from datagen.schemas.root_records import publish, refuse_foreign, refuse_other
+from datagen.schemas.root_records import publish, refuse_foreign, refuse_other, refuse_other_format
 from datagen.schemas.run_records import (
-    FORMAT_VERSION,
     Commit,
     FileEntry,
     Layout,
@@ -91,20 +90,10 @@ class Run:
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
             raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
         where = f"{storage.url}/manifest.json"
-        if manifest.format_version != FORMAT_VERSION:
-            raise InputError(
-                where,
-                "format_version",
-                f"is {manifest.format_version}, but this program reads {FORMAT_VERSION}",
-                "Use the version of datagen that made the run",
-            )
+        refuse_other_format(where, manifest.format_version)
         if manifest.spec.hash() != manifest.spec_hash:
-            raise InputError(
-                where,
-                "spec_hash",
-                "is not the hash of the specification in the record",
-                "The manifest was edited: restore it from a copy",
-            )
+            problem = "is not the hash of the specification in the record"
+            raise InputError(where, "spec_hash", problem, "The manifest was edited: restore it from a copy")
         return cls(storage, manifest)
 
     @property

@@ -15,7 +15,6 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field
 from datagen.schemas.sealing.contents import Contents
 from datagen.schemas.sealing.metadata import SEALED
-from datagen.schemas.shard_files import TABLES
 from datagen.schemas.storage import storage_error
 from datagen.schemas.storage.errors import CANNOT_EXCHANGE, TAKEN
 
@@ -34,9 +33,8 @@ def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes])
     draft = draft_of(folder)
     try:
         _write(draft, metadata)
-        for table in TABLES:
-            for field in contents.schema.table(table):
-                _link(contents, field, draft)
+        for _, field in contents.schema.fields:
+            _link(contents, field, draft)
         _sync_folders(draft)
         old = _take_the_name(draft, folder / SEALED)
         _sync_folder(folder)
@@ -86,7 +84,7 @@ def _write(draft: Path, files: Mapping[str, bytes]) -> None:
 
 def _link(contents: Contents, field: Field, draft: Path) -> None:
     for _, source, name in contents.chunks(field):
-        contents.place.link_or_copy(source, f"{draft.name}/{field.name}/{name}")
+        contents.place.adopt(contents.place, source, f"{draft.name}/{field.name}/{name}")
         target = draft / field.name / name
         mode = target.lstat().st_mode
         if not stat.S_ISREG(mode):

@@ -136,10 +136,6 @@ class Storage:
         if isinstance(files, LocalFiles):
             self._try(folder, lambda: files.remove_empty(folder))
 
-    def link_or_copy(self, source: str, target: str) -> None:
-        """Link or copy a file to a second key, which is replaced. See `adopt`."""
-        self.adopt(self, source, target)
-
     def adopt(self, source: Storage, source_key: str, key: str, limit_bytes: int = 2**31) -> None:
         """Link or copy a file of another storage, replacing an existing one. Not durable before `sync`.
 
