@@ -132,7 +132,7 @@ class _Driver(Generic[T]):
         stop: StopRequest,
         clock: Callable[[], float],
     ) -> None:
-        self._make_task, self._executor, self._books = make_task, executor, recorder
+        self._make_task, self._executor, self._recorder = make_task, executor, recorder
         self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
         self._totals = JobTotals(len(shards))
         self._flights: dict[str, _Flight] = {}
@@ -240,7 +240,7 @@ class _Driver(Generic[T]):
         )
         if report.outcome not in ("cancelled", "hung"):  # those have no worker's report
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
-        self._books.close(_ledger_entry(report))
+        self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True))
         self._totals.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
@@ -253,11 +253,12 @@ class _Driver(Generic[T]):
             heapq.heappush(self._due, (self._clock() + decision.wait_s, shard))
         elif decision.action == "quarantine":
             self._troubled.pop(shard, None)
-            self._books.quarantine(shard, decision.trouble)
+            self._recorder.quarantine(shard, decision.trouble)
             self._totals.count_quarantined(shard)
             if ends_early(self._policy, self._totals.quarantined, self._totals.shards):
                 self._begin_end("failed", f"{self._totals.quarantined} shards are quarantined")
-        if decision.action == "abort" or (self._end is None and self._nothing_runs()):
+        is_futile = nothing_runs(self._policy, self._lost_in_a_row, self._width())
+        if decision.action == "abort" or (self._end is None and is_futile):
             again = "" if decision.action == "abort" else "every attempt is lost, the last by: "
             self._begin_end("aborted", again + report.cause)
             self.kill_all("the job cannot continue")
@@ -266,12 +267,9 @@ class _Driver(Generic[T]):
     def _width(self) -> int:
         return min(window(self._policy, self._executor.slots), self._totals.shards - self._totals.finished)
 
-    def _nothing_runs(self) -> bool:
-        return nothing_runs(self._policy, self._lost_in_a_row, self._width())
-
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
         """A worker may die, or miss the store's response, after its commit: the commit record decides."""
-        commit = self._books.commit_of(report.shard)
+        commit = self._recorder.commit_of(report.shard)
         if commit is None:
             return report
         if commit.attempt != report.attempt:
@@ -299,7 +297,7 @@ class _Driver(Generic[T]):
 
     def _look_for_others(self) -> None:
         start_s = self._clock()
-        dropped = self._open.keep(self._books.missing()) if len(self._open) else 0
+        dropped = self._open.keep(self._recorder.missing()) if len(self._open) else 0
         self._totals.elsewhere += dropped
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
@@ -357,17 +355,3 @@ class _Driver(Generic[T]):
         for flight in list(self._flights.values()):
             if flight.verdict is None:
                 self._kill(flight, "cancelled", cause)
-
-
-def _ledger_entry(report: AttemptReport) -> LedgerEntry:
-    return LedgerEntry(
-        attempt=report.attempt,
-        shard=report.shard,
-        outcome=report.outcome,
-        cause=report.cause,
-        stack=report.stack,
-        started=report.started,
-        ended=report.ended,
-        cost=report.cost,
-        host=report.host,
-    )

@@ -41,8 +41,6 @@ _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 Removal = Literal["removed", "spared", "damaged"]
 _MOST_PLANS = 10**9
 AGAIN = "Run the same command again after `datagen gc` has ended: it makes the missing shards"
-# A commit with its file entries takes some 30 kB of memory.
-_COMMITS_KEPT = 1000
 
 
 class Run:
@@ -55,7 +53,6 @@ class Run:
         self.storage = storage
         self.manifest = manifest
         self.ledger = Ledger(storage)
-        self._commits: dict[int, Commit] = {}  # the most recently read; immutable once written
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
@@ -175,16 +172,12 @@ class Run:
 
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
-        if shard not in self._commits:
-            key = commit_key(shard)
-            data = self.storage.get(key, MAX_RECORD_BYTES)
-            if data is None:
-                place = f"{self.storage.url}/{key}"
-                raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
-            while len(self._commits) >= _COMMITS_KEPT:
-                del self._commits[next(iter(self._commits))]
-            self._commits[shard] = self.decode_commit(shard, data)
-        return self._commits[shard]
+        key = commit_key(shard)
+        data = self.storage.get(key, MAX_RECORD_BYTES)
+        if data is None:
+            place = f"{self.storage.url}/{key}"
+            raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
+        return self.decode_commit(shard, data)
 
     def decode_commit(self, shard: int, data: bytes) -> Commit:
         """The commit record in the bytes of a shard's file, checked against the manifest."""
