@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from datagen.cluster.executor import Executor
 from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import (
@@ -37,7 +36,7 @@ from datagen.cluster.retry_policy import (
     window,
 )
 from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.task import AttemptReport, Executor
 from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import http.client
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -38,25 +39,27 @@ class RayJobs:
         if JOB_ENVIRONMENT in environment:
             runtime["worker_process_setup_hook"] = "datagen.cluster.environment.adopt_job_environment"
         until_s = time.monotonic() + _AGENT_WITHIN_S
-        while True:
-            try:
-                self._client.submit_job(entrypoint=entrypoint, submission_id=submission, runtime_env=runtime)
-                return
-            except RuntimeError as error:
-                if "No available agent" not in str(error) or time.monotonic() >= until_s:
-                    raise InputError(
-                        self.url, "", first_line(error), "See the cluster's dashboard"
-                    ) from error
-                time.sleep(0.5)
+        with self._refusing("", "See the cluster's dashboard"):
+            while True:
+                try:
+                    self._client.submit_job(
+                        entrypoint=entrypoint, submission_id=submission, runtime_env=runtime
+                    )
+                    return
+                except RuntimeError as error:
+                    if "No available agent" not in str(error) or time.monotonic() >= until_s:
+                        raise
+                    time.sleep(0.5)
 
     def state(self, submission: str) -> str:
         """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED; "" for an unknown job."""
-        try:
-            return str(self._client.get_job_status(submission).value)
-        except RuntimeError as error:
-            if "does not exist" in str(error):
-                return ""
-            raise InputError(self.url, submission, first_line(error), _FIX) from error
+        with self._refusing(submission, _FIX):
+            try:
+                return str(self._client.get_job_status(submission).value)
+            except RuntimeError as error:
+                if "does not exist" not in str(error):
+                    raise
+        return ""
 
     def message(self, submission: str) -> str:
         """Ray's message on the job."""
@@ -64,21 +67,21 @@ class RayJobs:
 
     def output(self, submission: str) -> str:
         """The output of the command so far."""
-        try:
+        with self._refusing(submission, "The cluster does not keep this job any more"):
             return str(self._client.get_job_logs(submission))
-        except RuntimeError as error:
-            raise InputError(
-                self.url, submission, first_line(error), "The cluster does not keep this job any more"
-            ) from error
 
     def stop(self, submission: str) -> None:
         """Stop the command: SIGTERM, and SIGKILL some seconds later."""
-        try:
+        with self._refusing(submission, "See the cluster's dashboard"):
             self._client.stop_job(submission)
+
+    @contextmanager
+    def _refusing(self, submission: str, fix: str) -> Generator[None]:
+        """Raise InputError for an error of the Jobs API within the block."""
+        try:
+            yield
         except RuntimeError as error:
-            raise InputError(
-                self.url, submission, first_line(error), "See the cluster's dashboard"
-            ) from error
+            raise InputError(self.url, submission, first_line(error), fix) from error
 
     def at_work(self) -> list[str]:
         """Commands of jobs that have not ended."""

@@ -1,12 +1,14 @@
-"""Data sent to a worker and back: an immutable task, a small report."""
+"""Data sent to a worker and back, an immutable task and a small report; and the interface of executors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from datagen.schemas.run_records import Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
+
+T_contra = TypeVar("T_contra", contravariant=True)
 
 
 class Task(Protocol):
@@ -80,6 +82,31 @@ class AttemptReport:
     host: Host | None = None
     # The job cannot continue: every attempt would fail (full disk, sources missing).
     ends_job: bool = False
+
+
+class Executor(Protocol[T_contra]):
+    """Runs attempts. Every submitted attempt gives one report, whatever happens to it."""
+
+    @property
+    def slots(self) -> int:
+        """Attempts that can run at the same time now."""
+        ...
+
+    def submit(self, task: T_contra, /) -> None:
+        """Start an attempt; return at once."""
+        ...
+
+    def wait(self, timeout_s: float, /) -> list[AttemptReport]:
+        """Reports of ended attempts, as soon as there is one, or none after the timeout."""
+        ...
+
+    def has_begun(self, attempt: str, /) -> bool:
+        """Whether a worker has begun the attempt."""
+        ...
+
+    def kill(self, attempt: str, /) -> None:
+        """Kill an attempt. Its report follows through `wait`, with outcome `cancelled`."""
+        ...
 
 
 class JobCannotContinue(Exception):

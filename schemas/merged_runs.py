@@ -8,8 +8,7 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.record_files import read_record
-from datagen.schemas.root_records import refuse_other_format
+from datagen.schemas.record_files import read_record, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged, other_value
 from datagen.schemas.storage import Storage, open_storage

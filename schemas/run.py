@@ -19,8 +19,17 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
-from datagen.schemas.root_records import publish, refuse_foreign, refuse_other, refuse_other_format
+from datagen.schemas.record_files import (
+    MAX_RECORD_BYTES,
+    decode_record,
+    encode_record,
+    publish,
+    read_record,
+    refuse_foreign,
+    refuse_other,
+    refuse_other_format,
+    utc_now,
+)
 from datagen.schemas.run_records import (
     Commit,
     FileEntry,

@@ -10,8 +10,7 @@ from datagen.schemas.checking.records import AnyRecord, compare, read, sound
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.root_records import copy_key, refuse_other_format
+from datagen.schemas.record_files import copy_key, encode_record, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
 from datagen.schemas.storage import Storage

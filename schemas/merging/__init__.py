@@ -12,8 +12,7 @@ from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
 from datagen.schemas.merging.resharding import common_layout
 from datagen.schemas.merging.writing import WrittenUnion, begin_union, replace_record, write_union
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
-from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, refuse_foreign
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, Merged
 from datagen.schemas.sealing import SEALED, seal, sealed_metadata

@@ -16,8 +16,7 @@ from datagen.schemas.lineage import LINEAGE, Origins, ShardOrigin, encode_lineag
 from datagen.schemas.merging.ledgers import UnitedLedger
 from datagen.schemas.merging.plan import Holding, Union
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
-from datagen.schemas.root_records import copy_key, publish
+from datagen.schemas.record_files import MAX_RECORD_BYTES, copy_key, encode_record, publish
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, QuarantineRecord
 from datagen.schemas.scene_rows import read_shard

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.storage.errors import FileTooLarge, storage_error
-from datagen.schemas.storage.local_files import LocalFiles
-from datagen.schemas.storage.stored_file import StoredFile
+from datagen.schemas.storage.local_files import LocalFiles, StoredFile
 
 if TYPE_CHECKING:
     from datagen.schemas.storage.remote_objects import RemoteObjects

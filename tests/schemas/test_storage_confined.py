@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.record_files import refuse_foreign
 from datagen.schemas.storage import Storage, local_files, open_storage
 from tests.made_runs import files_of
 
