@@ -104,7 +104,6 @@ def _failure(task: Task, started: str, meter: Meter, error: Exception) -> Attemp
 
 @contextmanager
 def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
-    """Write the note and the stack file of an attempt, and remove them after it."""
     if not task.notes:
         yield
         return

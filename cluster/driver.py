@@ -55,35 +55,24 @@ class AttemptOrder:
 
 
 class Recorder(Protocol):
-    """Records of the ends of attempts and shards."""
+    """Records of the ends of attempts and shards. `missing` are neither committed nor quarantined now."""
 
     def close(self, entry: LedgerEntry) -> None: ...
-
     def quarantine(self, shard: int, trouble: ShardFailures) -> None: ...
-
-    def commit_of(self, shard: int) -> Commit | None:
-        """The shard's commit record, if there is one."""
-        ...
-
-    def missing(self) -> ShardRanges:
-        """Shards that are currently neither committed nor quarantined."""
-        ...
+    def commit_of(self, shard: int) -> Commit | None: ...
+    def missing(self) -> ShardRanges: ...
 
 
 class Events(Protocol):
-    """Events for a progress display."""
+    """Events for a progress display.
 
-    def ended(self, report: AttemptReport, action: str) -> None:
-        """An attempt was recorded; `action` is the policy's decision."""
-        ...
+    `ended`: an attempt was recorded; `action` is the policy's decision. `tick` is called often; the totals
+    are the driver's own and change. `stopping`: no new shard is started from now on.
+    """
 
-    def tick(self, totals: JobTotals) -> None:
-        """Called often; the totals are the driver's own and change."""
-        ...
-
-    def stopping(self, reason: str) -> None:
-        """No new shard is started from now on."""
-        ...
+    def ended(self, report: AttemptReport, action: str) -> None: ...
+    def tick(self, totals: JobTotals) -> None: ...
+    def stopping(self, reason: str) -> None: ...
 
 
 @dataclass
@@ -350,7 +339,6 @@ class _Driver(Generic[T]):
             self._events.stopping(cause)
 
     def kill_all(self, cause: str) -> None:
-        """Kill the attempts in flight; they are reported as cancelled."""
         for flight in list(self._flights.values()):
             if flight.verdict is None:
                 self._kill(flight, "cancelled", cause)

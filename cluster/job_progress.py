@@ -30,10 +30,7 @@ class StatusBoard(Protocol):
     """Where a job publishes its status, and where others leave requests to stop it."""
 
     def publish(self, status: JobStatus) -> None: ...
-
-    def stop_requested(self) -> StopMode | None:
-        """How this job was asked to stop; None if it was not."""
-        ...
+    def stop_requested(self) -> StopMode | None: ...
 
 
 class JobProgress:
@@ -123,7 +120,6 @@ class JobMonitor:
         self._reason, self._next_beat_s = reason, self.clock()
 
     def tick(self, totals: JobTotals) -> None:
-        """Poll and publish when it is time."""
         self.shown.tick(totals)
         self._pace.see(totals.labels)
         now_s = self.clock()

@@ -62,11 +62,9 @@ class RayJobs:
         return ""
 
     def message(self, submission: str) -> str:
-        """Ray's message on the job."""
         return " ".join(str(self._client.get_job_info(submission).message).split())
 
     def output(self, submission: str) -> str:
-        """The output of the command so far."""
         with self._refusing(submission, "The cluster does not keep this job any more"):
             return str(self._client.get_job_logs(submission))
 
@@ -84,7 +82,6 @@ class RayJobs:
             raise InputError(self.url, submission, first_line(error), fix) from error
 
     def at_work(self) -> list[str]:
-        """Commands of jobs that have not ended."""
         return [str(job.entrypoint) for job in self._client.list_jobs() if job.status.value in _WORK]
 
 

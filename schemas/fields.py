@@ -72,7 +72,6 @@ class RecordSchema:
         return tuple((table, f) for table in TABLES for f in self.table(table))
 
     def shape(self, f: Field, rows: int) -> tuple[int, ...]:
-        """Shape of the field's array with `rows` rows."""
         return (rows, *(self.sizes[d] for d in f.dims))
 
     def sized(self, **sizes: int) -> RecordSchema:
@@ -80,7 +79,6 @@ class RecordSchema:
         return replace(self, sizes={**self.sizes, **sizes})
 
     def at(self, version: int) -> RecordSchema:
-        """The schema as of that version."""
         scene, sample = (tuple(f for f in self.table(t) if f.since <= version) for t in TABLES)
         later = frozenset(f.name for _, f in self.fields if f.since > version)
         return replace(self, version=version, scene_fields=scene, sample_fields=sample, later=later)

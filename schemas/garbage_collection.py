@@ -66,7 +66,6 @@ class Swept:
     damaged: tuple[str, ...] = ()  # commits whose files were removed nevertheless
 
     def plus(self, other: Swept) -> Swept:
-        """The sum of both."""
         return Swept(
             self.files + other.files,
             self.bytes + other.bytes,

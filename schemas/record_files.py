@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any, TypeVar
@@ -74,6 +74,13 @@ def read_record(storage: Storage, key: str, model: type[Record]) -> Record | Non
     """Read the validated record, or None when there is no such file. InputError as `decode_record`."""
     data = storage.get(key, MAX_RECORD_BYTES)
     return None if data is None else decode_record(f"{storage.url}/{key}", data, model)
+
+
+def read_records(storage: Storage, keys: Iterable[str], model: type[Record]) -> Iterator[Record]:
+    """Read the records that exist, in the order of their keys. InputError as `decode_record`."""
+    for key, data in storage.get_many(keys, MAX_RECORD_BYTES):
+        if data is not None:
+            yield decode_record(f"{storage.url}/{key}", data, model)
 
 
 def different_fields(ours: object, theirs: object, path: str = "") -> list[tuple[str, object, object]]:

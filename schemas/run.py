@@ -25,6 +25,7 @@ from datagen.schemas.record_files import (
     encode_record,
     publish,
     read_record,
+    read_records,
     refuse_foreign,
     refuse_other,
     refuse_other_format,
@@ -104,7 +105,6 @@ class Run:
 
     @property
     def layout(self) -> Layout:
-        """How scenes are cut into shards."""
         return self.manifest.layout
 
     @property
@@ -123,7 +123,6 @@ class Run:
 
     @property
     def n(self) -> int:
-        """Number of samples in the newest plan."""
         return self._newest_plan()[1]
 
     def grow(self, n: int, created: str | None = None) -> None:
@@ -163,11 +162,9 @@ class Run:
     # Shards and commits.
 
     def planned(self) -> range:
-        """Indices of the shards that hold the wanted samples."""
         return range(self.layout.shards_for(self.n))
 
     def committed(self) -> set[int]:
-        """Indices of committed shards, by listing."""
         return self._numbers("commits")
 
     def commit_stamps(self) -> dict[str, str]:
@@ -197,7 +194,6 @@ class Run:
         return commit
 
     def commits(self) -> Iterator[Commit]:
-        """Commit records of all committed shards, in order of their shards."""
         shards = sorted(self.committed())
         for shard, (_, data) in zip(
             shards, self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES), strict=True
@@ -325,10 +321,8 @@ class Run:
         return self._numbers("quarantine") - self.committed()
 
     def quarantine_records(self) -> list[QuarantineRecord]:
-        """Records of the quarantined shards, in order."""
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
-        found = (read_record(self.storage, key, QuarantineRecord) for key in keys)
-        return [record for record in found if record is not None]
+        return list(read_records(self.storage, keys, QuarantineRecord))
 
     def _numbers(self, folder: str, width: int = 6) -> set[int]:
         return {int(name) for name, _ in self._numbered(folder, width)}

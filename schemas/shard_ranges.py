@@ -37,11 +37,9 @@ class ShardRanges(Sequence[int]):
         return cls(np.stack([first, last + 1], axis=1))
 
     def within(self, others: ShardRanges) -> ShardRanges:
-        """The shards of both sets."""
         return self.without(self.without(others))
 
     def without(self, others: ShardRanges) -> ShardRanges:
-        """The shards of this set that are not in the other."""
         # Sweep over all bounds: +1 within this set and -1 within the other, so 1 where only this one is.
         numbers = np.concatenate([*self.bounds.T, *others.bounds.T])
         steps = np.repeat([1, -1, -1, 1], [len(self.bounds)] * 2 + [len(others.bounds)] * 2)

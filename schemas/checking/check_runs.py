@@ -37,7 +37,6 @@ class Checked:
     runs: list[Run] = field(default_factory=list[Run])
 
     def count(self, commit: Commit) -> None:
-        """Add a committed shard."""
         self.shards += 1
         self.files += len(commit.files)
         self.bytes += sum(entry.size for entry in commit.files)
@@ -103,7 +102,6 @@ class _RunCheck:
     sealed: SealedRun | None  # its part of the store
 
     def shards(self) -> list[int]:
-        """Shards that are committed or in the sealed store."""
         return sorted(self.run.committed().union(self.sealed.shards if self.sealed else ()))
 
     def look_at(self, shard: int) -> CheckedShard:

@@ -80,7 +80,6 @@ def _copy(run: Run, shard: int, attempt: str) -> Read[Commit]:
 
 
 def _foreign_to(run: Run, shard: int, commit: Commit) -> str:
-    """Why a commit cannot belong to this shard, or ""."""
     return ": ".join(foreign_field(run.manifest, shard, commit) or ())
 
 

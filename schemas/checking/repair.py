@@ -53,7 +53,6 @@ class Repaired:
 
     @property
     def written(self) -> set[str]:
-        """Keys of all written files."""
         return {*self.records, *self.copied_files, *self.regenerated_files, *self.sealed_files}
 
 
@@ -178,7 +177,6 @@ class _Repair:
         return put
 
     def _sealed_runs(self) -> Mapping[str, SealedRun]:
-        """The runs in the sealed store, by specification hash."""
         runs = open_roots(self.place).runs
         root, _ = read_root(self.place, runs, {run.manifest.spec_hash: run.n for run in runs})
         return runs_named(root, runs) if root else {}

@@ -103,7 +103,6 @@ def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | Non
 
 
 def _named(storage: Storage) -> set[str]:
-    """The specification hashes in the commits and plans of a run."""
     commits = (read(storage, file.key, Commit).record for file in storage.list("commits"))
     plans = (read(storage, file.key, Plan).record for file in storage.list("plans"))
     return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}

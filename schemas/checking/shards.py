@@ -38,7 +38,6 @@ class ShardForm:
     arrays: Mapping[str, StoredArray]
 
     def most_bytes(self, path: str) -> int:
-        """An upper bound of the size of a file."""
         array = self.arrays.get(path.split("/")[0])
         if array is None or path in self.metadata:
             return MAX_META_BYTES
@@ -48,7 +47,6 @@ class ShardForm:
 
     @property
     def paths(self) -> frozenset[str]:
-        """Every file of a shard."""
         return frozenset((*self.metadata, *(path for paths in self.chunks.values() for path in paths)))
 
 

@@ -148,7 +148,6 @@ def _is_lost(run: Run, holding: Holding) -> bool:
 
 
 def _without(union: Union, lost: Iterable[Holding]) -> Union:
-    """The union after other processes committed some of its shards."""
     kept, spare = dict(union.kept), dict(union.spare)
     for holding in lost:
         spare[holding.shard] = (*spare.get(holding.shard, ()), kept.pop(holding.shard))

@@ -44,7 +44,6 @@ class SealedRun:
     is_last: bool = False  # its last shard is the store's, and cut to n
 
     def position_of(self, shard: int) -> int:
-        """Position of a shard in the store."""
         return self.first + self.shards.position_of(shard)
 
     def rows_of(self, shard: int) -> tuple[int, int]:
@@ -68,7 +67,6 @@ class RowsDigest:
             self._digest.update(f"{entry.path} {entry.sha256}\n".encode())
 
     def hexdigest(self) -> str:
-        """The digest so far."""
         return self._digest.hexdigest()
 
 
@@ -85,11 +83,9 @@ class Contents:
 
     @property
     def is_merged(self) -> bool:
-        """Whether the store has several runs."""
         return len(self.runs) > 1
 
     def rows(self, table: Table) -> int:
-        """Rows of a table in the whole store."""
         return sum(shard.scenes if table == "scene" else shard.samples for shard in self.shards)
 
     def chunks(self, field: Field) -> Iterator[tuple[int, str, str]]:

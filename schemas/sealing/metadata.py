@@ -38,7 +38,6 @@ class SealedRoot(BaseModel):
     rows_sha256: str = ""
 
     def part(self, spec_hash: str) -> SealedPart | None:
-        """The entry of one run; None where there is none."""
         return next((part for part in self.parts if part.spec_hash == spec_hash), None)
 
 

@@ -109,7 +109,6 @@ class Storage:
         return concurrent_map(_threads(), _AT_ONCE, do, items)
 
     def exists(self, key: str) -> bool:
-        """Whether the file exists."""
         return self._try(key, lambda: self._files.exists(key))
 
     def list(self, prefix: str) -> Iterator[StoredFile]:

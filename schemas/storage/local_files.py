@@ -23,6 +23,7 @@ from datagen.schemas.storage.errors import (
     storage_error,
     too_large,
 )
+from datagen.schemas.whole_files import sync_folder
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Enough to traverse a folder, without permission to read it.
@@ -64,15 +65,12 @@ class LocalFiles:
 
     @staticmethod
     def make_root(folder: Path) -> None:
-        """Create a folder durably."""
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         for path in missing:
-            with _closing(os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)) as fd:
-                os.fsync(fd)
+            sync_folder(path.parent)
 
     def below(self, key: str) -> LocalFiles:
-        """The files of a subfolder, which need not exist, from the same root."""
         return LocalFiles(self.root, (*self.prefix, *key.split("/")))
 
     def put(self, key: str, data: bytes) -> None:
@@ -232,7 +230,6 @@ class LocalFiles:
                     yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
 
     def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
-        """Raise NotARegularFile for anything but a file or a folder."""
         kind = _KINDS.get(stat.S_IFMT(mode))
         if kind is not None:
             place = f"{self.folder}/{key}"
@@ -259,7 +256,6 @@ def _closing(fd: int) -> Generator[int]:
 
 @contextmanager
 def _drafted(name: str, folder: int) -> Generator[str]:
-    """Give the name of a draft in a file's folder; it is removed when the block ends."""
     draft = f"{name}.{secrets.token_hex(8)}.part"
     try:
         yield draft
@@ -282,7 +278,6 @@ def _remove_folder(name: str, here: int) -> None:
 
 
 def _with_parents(folders: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """A folder and all above it, up to the root."""
     return (folders[:depth] for depth in range(len(folders) + 1))
 
 

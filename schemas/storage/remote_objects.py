@@ -41,7 +41,6 @@ class RemoteObjects:
         self._store = self._open(self.prefix)
 
     def below(self, key: str) -> RemoteObjects:
-        """The objects below a longer prefix."""
         return RemoteObjects(f"{self.url}/{key}")
 
     def put(self, key: str, data: bytes) -> None:
