@@ -16,7 +16,7 @@ from datagen.schemas.errors import InputError
 _FIX = "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
 # A newly started head has no agent yet.
 _AGENT_WITHIN_S = 60.0
-_ANSWER_WITHIN_S = 5.0
+_ANSWER_WITHIN_S = 10.0
 _WORK = ("PENDING", "RUNNING")
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 # Ray prefers these to the given address.
@@ -103,15 +103,14 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
             refuse_unreachable(address)
             # Asked for its dashboard, a cluster wants the token where it wants one at all.
             changed |= {} if address == "auto" else token_for(address)
-    if not token and (found := known_token()) and (not url or _turns_away(url)):
+    if not token and (found := known_token()) and (not url or dashboard_status(url) in (401, 403)):
         token = found[0]
     with changed_environment(changed):
         from ray.exceptions import RayError
         from ray.job_submission import JobSubmissionClient
 
-        headers = {"Authorization": f"Bearer {token}"} if token else None
         try:
-            client = JobSubmissionClient(url or address, headers=headers)
+            client = JobSubmissionClient(url or address, headers=_headers(token) or None)
         except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise InputError("--address", address, first_line(error), _FIX) from error
         return RayJobs(str(client.get_address()), client)
@@ -119,22 +118,22 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
 
 def _speaks_http(address: str) -> bool:
     """Whether HOST:PORT is a dashboard: other ports of a cluster do not respond to HTTP."""
-    return "://" not in address and address != "auto" and _status(f"http://{address}") is not None
+    return "://" not in address and address != "auto" and dashboard_status(f"http://{address}") is not None
 
 
-def _turns_away(url: str) -> bool:
-    return _status(url) in (401, 403)
-
-
-def _status(url: str) -> int | None:
-    """A dashboard's response to a request without a token; None where there is none."""
+def dashboard_status(url: str, token: str = "") -> int | None:
+    """A dashboard's response to a request, without a token by default; None where there is none."""
     parts = urlsplit(url)
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     connection = kind(parts.netloc, timeout=_ANSWER_WITHIN_S)
     try:
-        connection.request("GET", "/api/version")
+        connection.request("GET", "/api/version", headers=_headers(token))
         return connection.getresponse().status
     except (OSError, ValueError, http.client.HTTPException):
         return None
     finally:
         connection.close()
+
+
+def _headers(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"} if token else {}
