@@ -108,21 +108,19 @@ def drive(
         driver.kill_all("the driver ended")
 
 
+@dataclass
 class _Driver(Generic[T]):
-    def __init__(
-        self,
-        shards: Sequence[int],
-        make_task: Callable[[AttemptOrder], T],
-        executor: Executor[T],
-        recorder: Recorder,
-        policy: RetryPolicy,
-        events: Events,
-        stop: StopRequest,
-        clock: Callable[[], float],
-    ) -> None:
-        self._make_task, self._executor, self._recorder = make_task, executor, recorder
-        self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
-        self._totals = JobTotals(len(shards))
+    _shards: Sequence[int]
+    _make_task: Callable[[AttemptOrder], T]
+    _executor: Executor[T]
+    _recorder: Recorder
+    _policy: RetryPolicy
+    _events: Events
+    _stop: StopRequest
+    _clock: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        self._totals = JobTotals(len(self._shards))
         self._flights: dict[str, _Flight] = {}
         self._troubled: dict[int, ShardFailures] = {}
         self._due: list[tuple[float, int]] = []  # heap of (time, shard) that wait for a retry
@@ -131,7 +129,7 @@ class _Driver(Generic[T]):
         self._lost_in_a_row = 0
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
-        self._open = OpenShards(shards, random.Random(self._name))
+        self._open = OpenShards(self._shards, random.Random(self._name))
         # The number of the first attempt after this driver last moved to other shards.
         self._here_since = 1
         self._look_s = float("inf")  # when to check other drivers; never before a sign of one

@@ -128,9 +128,8 @@ class Summaries:
 def refresh(run: Run) -> int:
     """Update the index with the run's records; return the number of added ones.
 
-    Unreadable records are omitted. Small files, and those with mostly stale rows, are joined, so that the
-    index has few files and at most one row per record. Of several concurrent updates each adds a file, and
-    the next update joins them.
+    Unreadable records are omitted. Small files, and those with mostly stale rows, are joined, also those of
+    concurrent updates, so that the index has few files and one row per record.
     """
     stamps = _stamps_by_key(run.ledger.stamps(), run.commit_stamps())
     known, kept, replaced = set[str](), Rows(), set(index_files(run))

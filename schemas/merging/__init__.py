@@ -60,8 +60,9 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     if not places:
         raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
     place = _place(out)
-    existing = open_runs(place) if place is not None and _holds_runs(place) else []
-    sources = _distinct([run for place in places for run in open_runs(place)])
+    has_runs = place is not None and any(map(place.exists, ("manifest.json", MERGED)))
+    existing = open_runs(place) if place is not None and has_runs else []
+    sources = list({_identity(run.storage): run for path in places for run in open_runs(path)}.values())
     refuse_incompatible(sources)
     if existing:
         refuse_incompatible([existing[0], *sources])
@@ -121,14 +122,6 @@ def _place(out: str) -> Storage | None:
         if e.problem == "no such folder":
             return None
         raise
-
-
-def _holds_runs(place: Storage) -> bool:
-    return place.exists("manifest.json") or place.exists(MERGED)
-
-
-def _distinct(runs: Sequence[Run]) -> list[Run]:
-    return list({_identity(run.storage): run for run in runs}.values())
 
 
 def _identity(storage: Storage) -> str:
