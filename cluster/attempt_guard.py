@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
@@ -62,49 +63,43 @@ def guarded(function: Callable[[T, Meter], AttemptResult], task: T, deadline: bo
     With `deadline`, the process exits when the task takes longer than `task.deadline_s`, even where native
     code hangs while it holds the GIL.
     """
-    started, meter = utc_now(), Meter()
+    meter = Meter()
+    begun = AttemptReport(task.attempt, task.shard, "failed", started=utc_now(), host=this_host())
     try:
-        with _notes(task, started, deadline):
+        with _notes(task, begun.started, deadline):
             try:
                 product = function(task, meter)
             except Exception as error:  # noqa: BLE001 - reported with its stack, whatever it is
-                return _failure(task, started, meter, error)
+                return _failure(begun, meter, error)
     except (OSError, JobCannotContinue) as error:  # from writing the note
-        return _failure(task, started, meter, error)
-    return AttemptReport(
-        attempt=task.attempt,
-        shard=task.shard,
+        return _failure(begun, meter, error)
+    return replace(
+        begun,
         outcome="committed" if product.won else "superseded",
-        started=started,
         ended=utc_now(),
         labels=product.labels,
         positives=product.positives,
         cost=product.cost,
-        host=this_host(),
     )
 
 
-def _failure(task: Task, started: str, meter: Meter, error: Exception) -> AttemptReport:
+def _failure(begun: AttemptReport, meter: Meter, error: Exception) -> AttemptReport:
     # An unreachable store or a full disk concerns every shard.
     final = error if isinstance(error, JobCannotContinue | StoreUnavailable) else machine_error(error, FULL)
     cause = " ".join(str(final or error).split())
-    return AttemptReport(
-        attempt=task.attempt,
-        shard=task.shard,
+    return replace(
+        begun,
         outcome="out_of_memory" if isinstance(error, MemoryError) else "failed",
         cause=cause if final else short_line(f"{type(error).__name__}: {cause}"),
         stack=traceback.format_exc()[-STACK_LIMIT:],
-        started=started,
         ended=utc_now(),
         cost=meter.cost(),
-        host=this_host(),
         ends_job=final is not None,
     )
 
 
 @contextmanager
 def _notes(task: Task, started: str, deadline: bool) -> Generator[None]:
-    """Write the note and the stack file of an attempt, and remove them after it."""
     if not task.notes:
         yield
         return

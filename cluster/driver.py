@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
-from datagen.cluster.executor import Executor
 from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.cluster.open_shards import OpenShards
 from datagen.cluster.retry_policy import (
@@ -37,7 +36,7 @@ from datagen.cluster.retry_policy import (
     window,
 )
 from datagen.cluster.stop_request import StopRequest
-from datagen.cluster.task import AttemptReport
+from datagen.cluster.task import AttemptReport, Executor
 from datagen.schemas.run_records import Commit, LedgerEntry, Outcome
 from datagen.schemas.shard_ranges import ShardRanges
 
@@ -56,35 +55,24 @@ class AttemptOrder:
 
 
 class Recorder(Protocol):
-    """Records of the ends of attempts and shards."""
+    """Records of the ends of attempts and shards. `missing` are neither committed nor quarantined now."""
 
     def close(self, entry: LedgerEntry) -> None: ...
-
     def quarantine(self, shard: int, trouble: ShardFailures) -> None: ...
-
-    def commit_of(self, shard: int) -> Commit | None:
-        """The shard's commit record, if there is one."""
-        ...
-
-    def missing(self) -> ShardRanges:
-        """Shards that are currently neither committed nor quarantined."""
-        ...
+    def commit_of(self, shard: int) -> Commit | None: ...
+    def missing(self) -> ShardRanges: ...
 
 
 class Events(Protocol):
-    """Events for a progress display."""
+    """Events for a progress display.
 
-    def ended(self, report: AttemptReport, action: str) -> None:
-        """An attempt was recorded; `action` is the policy's decision."""
-        ...
+    `ended`: an attempt was recorded; `action` is the policy's decision. `tick` is called often; the totals
+    are the driver's own and change. `stopping`: no new shard is started from now on.
+    """
 
-    def tick(self, totals: JobTotals) -> None:
-        """Called often; the totals are the driver's own and change."""
-        ...
-
-    def stopping(self, reason: str) -> None:
-        """No new shard is started from now on."""
-        ...
+    def ended(self, report: AttemptReport, action: str) -> None: ...
+    def tick(self, totals: JobTotals) -> None: ...
+    def stopping(self, reason: str) -> None: ...
 
 
 @dataclass
@@ -120,21 +108,19 @@ def drive(
         driver.kill_all("the driver ended")
 
 
+@dataclass
 class _Driver(Generic[T]):
-    def __init__(
-        self,
-        shards: Sequence[int],
-        make_task: Callable[[AttemptOrder], T],
-        executor: Executor[T],
-        recorder: Recorder,
-        policy: RetryPolicy,
-        events: Events,
-        stop: StopRequest,
-        clock: Callable[[], float],
-    ) -> None:
-        self._make_task, self._executor, self._books = make_task, executor, recorder
-        self._policy, self._events, self._stop, self._clock = policy, events, stop, clock
-        self._totals = JobTotals(len(shards))
+    _shards: Sequence[int]
+    _make_task: Callable[[AttemptOrder], T]
+    _executor: Executor[T]
+    _recorder: Recorder
+    _policy: RetryPolicy
+    _events: Events
+    _stop: StopRequest
+    _clock: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        self._totals = JobTotals(len(self._shards))
         self._flights: dict[str, _Flight] = {}
         self._troubled: dict[int, ShardFailures] = {}
         self._due: list[tuple[float, int]] = []  # heap of (time, shard) that wait for a retry
@@ -143,7 +129,7 @@ class _Driver(Generic[T]):
         self._lost_in_a_row = 0
         # Two drivers of one run must never give two attempts one name.
         self._name = secrets.token_hex(4)
-        self._open = OpenShards(shards, random.Random(self._name))
+        self._open = OpenShards(self._shards, random.Random(self._name))
         # The number of the first attempt after this driver last moved to other shards.
         self._here_since = 1
         self._look_s = float("inf")  # when to check other drivers; never before a sign of one
@@ -240,7 +226,7 @@ class _Driver(Generic[T]):
         )
         if report.outcome not in ("cancelled", "hung"):  # those have no worker's report
             self._lost_in_a_row = self._lost_in_a_row + 1 if report.outcome == "lost" else 0
-        self._books.close(_ledger_entry(report))
+        self._recorder.close(LedgerEntry.model_validate(report, from_attributes=True))
         self._totals.count(report)
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
@@ -253,11 +239,12 @@ class _Driver(Generic[T]):
             heapq.heappush(self._due, (self._clock() + decision.wait_s, shard))
         elif decision.action == "quarantine":
             self._troubled.pop(shard, None)
-            self._books.quarantine(shard, decision.trouble)
+            self._recorder.quarantine(shard, decision.trouble)
             self._totals.count_quarantined(shard)
             if ends_early(self._policy, self._totals.quarantined, self._totals.shards):
                 self._begin_end("failed", f"{self._totals.quarantined} shards are quarantined")
-        if decision.action == "abort" or (self._end is None and self._nothing_runs()):
+        is_futile = nothing_runs(self._policy, self._lost_in_a_row, self._width())
+        if decision.action == "abort" or (self._end is None and is_futile):
             again = "" if decision.action == "abort" else "every attempt is lost, the last by: "
             self._begin_end("aborted", again + report.cause)
             self.kill_all("the job cannot continue")
@@ -266,12 +253,9 @@ class _Driver(Generic[T]):
     def _width(self) -> int:
         return min(window(self._policy, self._executor.slots), self._totals.shards - self._totals.finished)
 
-    def _nothing_runs(self) -> bool:
-        return nothing_runs(self._policy, self._lost_in_a_row, self._width())
-
     def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
         """A worker may die, or miss the store's response, after its commit: the commit record decides."""
-        commit = self._books.commit_of(report.shard)
+        commit = self._recorder.commit_of(report.shard)
         if commit is None:
             return report
         if commit.attempt != report.attempt:
@@ -299,7 +283,7 @@ class _Driver(Generic[T]):
 
     def _look_for_others(self) -> None:
         start_s = self._clock()
-        dropped = self._open.keep(self._books.missing()) if len(self._open) else 0
+        dropped = self._open.keep(self._recorder.missing()) if len(self._open) else 0
         self._totals.elsewhere += dropped
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
@@ -353,21 +337,6 @@ class _Driver(Generic[T]):
             self._events.stopping(cause)
 
     def kill_all(self, cause: str) -> None:
-        """Kill the attempts in flight; they are reported as cancelled."""
         for flight in list(self._flights.values()):
             if flight.verdict is None:
                 self._kill(flight, "cancelled", cause)
-
-
-def _ledger_entry(report: AttemptReport) -> LedgerEntry:
-    return LedgerEntry(
-        attempt=report.attempt,
-        shard=report.shard,
-        outcome=report.outcome,
-        cause=report.cause,
-        stack=report.stack,
-        started=report.started,
-        ended=report.ended,
-        cost=report.cost,
-        host=report.host,
-    )

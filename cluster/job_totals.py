@@ -39,7 +39,6 @@ class JobTotals:
         return self.committed + self.superseded + self.elsewhere + self.quarantined
 
     def count(self, report: AttemptReport) -> None:
-        """Add one ended attempt."""
         self.outcomes[report.outcome] += 1
         wall_s, cpu_s = (report.cost.wall_s, report.cost.cpu_s) if report.cost else (0.0, 0.0)
         if report.outcome == "committed":
@@ -59,7 +58,6 @@ class JobTotals:
             self.quarantined_shards.append(shard)
 
     def plus(self, other: JobTotals) -> JobTotals:
-        """The sum of both, for one job over several runs."""
         sums = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(JobTotals)}
         sums["quarantined_shards"] = sums["quarantined_shards"][:_NAMED]
         return JobTotals(**sums)
@@ -82,7 +80,6 @@ class JobSummary:
 
     @property
     def remaining(self) -> int:
-        """Number of shards that are left to make."""
         return self.totals.shards - self.totals.finished
 
     @property

@@ -184,7 +184,6 @@ class RayExecutor(Generic[T]):
             self.others.put(end_attempts, notes, attempts, patience_s=0.0)  # without waiting
 
     def _lose_all(self, cause: str) -> list[AttemptReport]:
-        """Reports of all attempts of a dead cluster: finished ones, and lost ones."""
         refs = list(self._tasks)
         ended = [self._answer(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
         reports = [answer for answer in ended if not isinstance(answer, _Death)]

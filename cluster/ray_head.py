@@ -7,7 +7,6 @@ state folder.
 from __future__ import annotations
 
 import fcntl
-import http.client
 import os
 import re
 import subprocess
@@ -16,12 +15,12 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationError
 
 from datagen.cluster.cluster_folders import RAY, new_folder, remove_folder, write_private
 from datagen.cluster.environment import is_of_the_shell
+from datagen.cluster.ray_jobs import dashboard_status
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
 from datagen.schemas.errors import InputError
 from datagen.schemas.locked_folders import is_private
@@ -29,7 +28,6 @@ from datagen.schemas.run_records import StoredRecord
 
 _START_WITHIN_S = 300.0
 _KIND = "datagen-head-"
-_ANSWER_WITHIN_S = 10.0
 _URL = re.compile(r"http://127\.0\.0\.1:[0-9]{1,5}")
 _MAX_BYTES = 1 << 16
 
@@ -54,7 +52,7 @@ def state_folder() -> Path:
 def running_head() -> Head | None:
     """The running head of this machine; else None."""
     head = _read()
-    return head if head is not None and _answers(head) else None
+    return head if head is not None and dashboard_status(head.jobs_api, head.token) == 200 else None
 
 
 def ensure_head(workers: int) -> Head:
@@ -156,18 +154,6 @@ def _started(workers: int, folder: Path, until_s: float) -> Head | str:
     if code != 0 or found is None:
         return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
     return Head(jobs_api=found[0], token=token, group=process.pid, folder=str(folder))
-
-
-def _answers(head: Head) -> bool:
-    port = urlsplit(head.jobs_api).port
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_ANSWER_WITHIN_S)
-    try:
-        connection.request("GET", "/api/version", headers={"Authorization": f"Bearer {head.token}"})
-        return connection.getresponse().status == 200
-    except (OSError, http.client.HTTPException):
-        return False
-    finally:
-        connection.close()
 
 
 def _end(head: Head) -> None:

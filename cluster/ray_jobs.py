@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import http.client
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -15,7 +16,7 @@ from datagen.schemas.errors import InputError
 _FIX = "Give the cluster's dashboard, http://HOST:8265, and its token as RAY_AUTH_TOKEN where it requires one"
 # A newly started head has no agent yet.
 _AGENT_WITHIN_S = 60.0
-_ANSWER_WITHIN_S = 5.0
+_ANSWER_WITHIN_S = 10.0
 _WORK = ("PENDING", "RUNNING")
 ENDED = ("SUCCEEDED", "FAILED", "STOPPED")
 # Ray prefers these to the given address.
@@ -38,50 +39,49 @@ class RayJobs:
         if JOB_ENVIRONMENT in environment:
             runtime["worker_process_setup_hook"] = "datagen.cluster.environment.adopt_job_environment"
         until_s = time.monotonic() + _AGENT_WITHIN_S
-        while True:
-            try:
-                self._client.submit_job(entrypoint=entrypoint, submission_id=submission, runtime_env=runtime)
-                return
-            except RuntimeError as error:
-                if "No available agent" not in str(error) or time.monotonic() >= until_s:
-                    raise InputError(
-                        self.url, "", first_line(error), "See the cluster's dashboard"
-                    ) from error
-                time.sleep(0.5)
+        with self._refusing("", "See the cluster's dashboard"):
+            while True:
+                try:
+                    self._client.submit_job(
+                        entrypoint=entrypoint, submission_id=submission, runtime_env=runtime
+                    )
+                    return
+                except RuntimeError as error:
+                    if "No available agent" not in str(error) or time.monotonic() >= until_s:
+                        raise
+                    time.sleep(0.5)
 
     def state(self, submission: str) -> str:
         """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED; "" for an unknown job."""
-        try:
-            return str(self._client.get_job_status(submission).value)
-        except RuntimeError as error:
-            if "does not exist" in str(error):
-                return ""
-            raise InputError(self.url, submission, first_line(error), _FIX) from error
+        with self._refusing(submission, _FIX):
+            try:
+                return str(self._client.get_job_status(submission).value)
+            except RuntimeError as error:
+                if "does not exist" not in str(error):
+                    raise
+        return ""
 
     def message(self, submission: str) -> str:
-        """Ray's message on the job."""
         return " ".join(str(self._client.get_job_info(submission).message).split())
 
     def output(self, submission: str) -> str:
-        """The output of the command so far."""
-        try:
+        with self._refusing(submission, "The cluster does not keep this job any more"):
             return str(self._client.get_job_logs(submission))
-        except RuntimeError as error:
-            raise InputError(
-                self.url, submission, first_line(error), "The cluster does not keep this job any more"
-            ) from error
 
     def stop(self, submission: str) -> None:
         """Stop the command: SIGTERM, and SIGKILL some seconds later."""
-        try:
+        with self._refusing(submission, "See the cluster's dashboard"):
             self._client.stop_job(submission)
+
+    @contextmanager
+    def _refusing(self, submission: str, fix: str) -> Generator[None]:
+        """Raise InputError for an error of the Jobs API within the block."""
+        try:
+            yield
         except RuntimeError as error:
-            raise InputError(
-                self.url, submission, first_line(error), "See the cluster's dashboard"
-            ) from error
+            raise InputError(self.url, submission, first_line(error), fix) from error
 
     def at_work(self) -> list[str]:
-        """Commands of jobs that have not ended."""
         return [str(job.entrypoint) for job in self._client.list_jobs() if job.status.value in _WORK]
 
 
@@ -103,15 +103,14 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
             refuse_unreachable(address)
             # Asked for its dashboard, a cluster wants the token where it wants one at all.
             changed |= {} if address == "auto" else token_for(address)
-    if not token and (found := known_token()) and (not url or _turns_away(url)):
+    if not token and (found := known_token()) and (not url or dashboard_status(url) in (401, 403)):
         token = found[0]
     with changed_environment(changed):
         from ray.exceptions import RayError
         from ray.job_submission import JobSubmissionClient
 
-        headers = {"Authorization": f"Bearer {token}"} if token else None
         try:
-            client = JobSubmissionClient(url or address, headers=headers)
+            client = JobSubmissionClient(url or address, headers=_headers(token) or None)
         except (RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise InputError("--address", address, first_line(error), _FIX) from error
         return RayJobs(str(client.get_address()), client)
@@ -119,22 +118,22 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
 
 def _speaks_http(address: str) -> bool:
     """Whether HOST:PORT is a dashboard: other ports of a cluster do not respond to HTTP."""
-    return "://" not in address and address != "auto" and _status(f"http://{address}") is not None
+    return "://" not in address and address != "auto" and dashboard_status(f"http://{address}") is not None
 
 
-def _turns_away(url: str) -> bool:
-    return _status(url) in (401, 403)
-
-
-def _status(url: str) -> int | None:
-    """A dashboard's response to a request without a token; None where there is none."""
+def dashboard_status(url: str, token: str = "") -> int | None:
+    """A dashboard's response to a request, without a token by default; None where there is none."""
     parts = urlsplit(url)
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     connection = kind(parts.netloc, timeout=_ANSWER_WITHIN_S)
     try:
-        connection.request("GET", "/api/version")
+        connection.request("GET", "/api/version", headers=_headers(token))
         return connection.getresponse().status
     except (OSError, ValueError, http.client.HTTPException):
         return None
     finally:
         connection.close()
+
+
+def _headers(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"} if token else {}

@@ -111,7 +111,6 @@ class OtherNodes:
     def put(
         self, function: Callable[..., Any], *arguments: Any, patience_s: float, but: Sequence[str] = ()
     ) -> Question:
-        """Send a request to every machine that is not in `but`, without waiting."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         if function not in self._tasks:
@@ -158,7 +157,6 @@ def end_attempts(notes: str, attempts: Sequence[str]) -> None:
 
 
 def _kill_worker(pid: int) -> None:
-    """Kill a process of this machine if it is a Ray worker."""
     try:
         if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::"):
             os.kill(pid, signal.SIGKILL)

@@ -139,23 +139,15 @@ class Durations:
 
     def __init__(self) -> None:
         self._latest: deque[float] = deque(maxlen=256)
-        self._seen = 0
-        self._p95_s = 0.0
+        self.seen = 0
+        self.p95_s = 0.0
 
     def add(self, wall_s: float) -> None:
         self._latest.append(wall_s)
-        self._seen += 1
+        self.seen += 1
         # Sorting for every shard would be too slow.
-        if self._seen <= 32 or self._seen % 32 == 0:
-            self._p95_s = percentile_95(self._latest)
-
-    @property
-    def seen(self) -> int:
-        return self._seen
-
-    @property
-    def p95_s(self) -> float:
-        return self._p95_s
+        if self.seen <= 32 or self.seen % 32 == 0:
+            self.p95_s = percentile_95(self._latest)
 
 
 def percentile_95(values: Sequence[float] | deque[float]) -> float:

@@ -38,7 +38,6 @@ class RunRecorder:
             self._since_index, self._index_s = 0, end_s + _INDEX_FACTOR * (end_s - start_s)
 
     def quarantine(self, shard: int, trouble: ShardFailures) -> None:
-        """Quarantine a shard, with all that is needed to run it alone."""
         scenes = self._run.layout.scenes_per_shard
         self._run.quarantine(
             QuarantineRecord(
@@ -54,11 +53,9 @@ class RunRecorder:
         )
 
     def commit_of(self, shard: int) -> Commit | None:
-        """The shard's commit record, or None."""
         return self._run.commit_of(shard) if self._run.storage.exists(commit_key(shard)) else None
 
     def missing(self) -> ShardRanges:
-        """Planned shards that are neither committed nor quarantined, by listing."""
         return self._run.missing()
 
 

@@ -25,7 +25,6 @@ class StopRequest:
 
     @property
     def force(self) -> bool:
-        """Whether to kill the running attempts."""
         return self._asked >= 2
 
 

@@ -1,34 +1,32 @@
-"""Data sent to a worker and back: an immutable task, a small report."""
+"""Data sent to a worker and back, an immutable task and a small report; and the interface of executors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from datagen.schemas.run_records import Cost, Host, Layout, Outcome
 from datagen.schemas.specification import Specification
 
+T_contra = TypeVar("T_contra", contravariant=True)
+
 
 class Task(Protocol):
-    """The interface of tasks for executors and the guard."""
+    """The interface of tasks for executors and the guard.
+
+    `attempt` is a file name, unique over all drivers of the run. `notes` is the folder, within the machine's
+    temporary folder, for the worker's process id and stack, unique to the job; "" for none. An absolute path
+    is used as it is.
+    """
 
     @property
     def shard(self) -> int: ...
-
     @property
-    def attempt(self) -> str:
-        """Name of this attempt, unique over all drivers of the run, usable as a file name."""
-        ...
-
+    def attempt(self) -> str: ...
     @property
     def deadline_s(self) -> float: ...
-
     @property
-    def notes(self) -> str:
-        """Name of the folder, within the machine's temporary folder, for the worker's process id and
-        stack; "" for none. Unique to the job; an absolute path is used as it is.
-        """
-        ...
+    def notes(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,6 @@ class ShardTask:
 
     @property
     def scene_indices(self) -> range:
-        """Indices of this shard's scenes in the run."""
         first = self.shard * self.layout.scenes_per_shard
         return range(first, first + self.layout.scenes_per_shard)
 
@@ -80,6 +77,21 @@ class AttemptReport:
     host: Host | None = None
     # The job cannot continue: every attempt would fail (full disk, sources missing).
     ends_job: bool = False
+
+
+class Executor(Protocol[T_contra]):
+    """Runs attempts. Every submitted attempt gives one report, whatever happens to it.
+
+    `slots`: attempts that can run at the same time now. `wait` returns reports of ended attempts, as soon as
+    there is one, or none after the timeout. The report of a killed attempt has outcome `cancelled`.
+    """
+
+    @property
+    def slots(self) -> int: ...
+    def submit(self, task: T_contra, /) -> None: ...
+    def wait(self, timeout_s: float, /) -> list[AttemptReport]: ...
+    def has_begun(self, attempt: str, /) -> bool: ...
+    def kill(self, attempt: str, /) -> None: ...
 
 
 class JobCannotContinue(Exception):

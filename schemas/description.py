@@ -61,8 +61,7 @@ def described(specs: Sequence[Specification], samples: Sequence[int] = ()) -> di
     """The global attributes of a store over runs of these specifications, with `samples` each."""
     assets = list(dict.fromkeys(asset for spec in specs for asset in _assets(spec)))
     labels = _listed(spec.label_source for spec in specs)
-    houses = _listed(_house(spec).name for spec in specs)
-    objects = _listed(_object(spec).name for spec in specs)
+    houses, objects = (_listed(_assets(spec)[k].name for spec in specs) for k in (0, 1))
     return {
         "Conventions": CONVENTIONS,
         "title": f"Robot base poses labelled by {labels}, in {houses} with {objects}",
@@ -94,17 +93,12 @@ def cf_attributes(field: Field, table: Table) -> dict[str, Any]:
 
 
 def _assets(spec: Specification) -> list[_Asset]:
-    return [_house(spec), _object(spec), *([] if spec.arm is None else [_ROBOTS])]
-
-
-def _house(spec: Specification) -> _Asset:
-    kind = spec.houses.kind
-    return _HOUSES.get(kind, _Asset(f"{kind} houses", "as their source states", f"source {kind}"))
-
-
-def _object(spec: Specification) -> _Asset:
-    kind = spec.objects.kind
-    return _OBJECTS.get(kind, _Asset(f"{kind} objects", "as their source states", f"source {kind}"))
+    """Houses, objects and, for an arm, robots."""
+    found: list[_Asset] = []
+    for known, source, what in ((_HOUSES, spec.houses, "houses"), (_OBJECTS, spec.objects, "objects")):
+        other = _Asset(f"{source.kind} {what}", "as their source states", f"source {source.kind}")
+        found.append(known.get(source.kind, other))
+    return found if spec.arm is None else [*found, _ROBOTS]
 
 
 def _source(spec: Specification) -> str:

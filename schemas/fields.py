@@ -17,6 +17,7 @@ from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
 from datagen.schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
+TABLES: tuple[Table, Table] = ("scene", "sample")
 
 # Version of all schemas. New fields raise it and note it in `since`; fields are never removed or changed.
 SCHEMA_VERSION = 2
@@ -59,14 +60,18 @@ class RecordSchema:
     version: int
     scene_fields: tuple[Field, ...]
     sample_fields: tuple[Field, ...]
-    sizes: Mapping[str, int] = field(default_factory=dict)
+    sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
     later: frozenset[str] = frozenset()
 
     def table(self, table: Table) -> tuple[Field, ...]:
         return self.scene_fields if table == "scene" else self.sample_fields
 
+    @property
+    def fields(self) -> tuple[tuple[Table, Field], ...]:
+        """Every field with its table, scenes first."""
+        return tuple((table, f) for table in TABLES for f in self.table(table))
+
     def shape(self, f: Field, rows: int) -> tuple[int, ...]:
-        """Shape of the field's array with `rows` rows."""
         return (rows, *(self.sizes[d] for d in f.dims))
 
     def sized(self, **sizes: int) -> RecordSchema:
@@ -74,13 +79,8 @@ class RecordSchema:
         return replace(self, sizes={**self.sizes, **sizes})
 
     def at(self, version: int) -> RecordSchema:
-        """The schema as of that version."""
-        scene, sample = (
-            tuple(f for f in fields if f.since <= version)
-            for fields in (self.scene_fields, self.sample_fields)
-        )
-        kept = {f.name for f in (*scene, *sample)}
-        later = frozenset(f.name for f in (*self.scene_fields, *self.sample_fields)) - kept
+        scene, sample = (tuple(f for f in self.table(t) if f.since <= version) for t in TABLES)
+        later = frozenset(f.name for _, f in self.fields if f.since > version)
         return replace(self, version=version, scene_fields=scene, sample_fields=sample, later=later)
 
     def check(self, table: Table, rows: int, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:

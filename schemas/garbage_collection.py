@@ -66,7 +66,6 @@ class Swept:
     damaged: tuple[str, ...] = ()  # commits whose files were removed nevertheless
 
     def plus(self, other: Swept) -> Swept:
-        """The sum of both."""
         return Swept(
             self.files + other.files,
             self.bytes + other.bytes,
@@ -135,14 +134,11 @@ def _of_run(run: Run, before_s: float, seen: Seen) -> Iterator[Garbage]:
             # Only leftovers of a removal or a killed writer in the committed attempt's folder.
             left = [file for file in files if file.key == f"{key}/{REMOVING}" or _DRAFT.fullmatch(file.key)]
             yield from (_one(storage, "drafts", file) for file in left if file.modified_s < before_s)
-        elif newest_s < before_s and not (shard not in committed and _has_claim(shard, name, files)):
+        elif newest_s < before_s:
+            if shard not in committed and any(file.key == commit_copy_key(shard, name) for file in files):
+                continue  # its commit record may be lost: `repair` restores it from the copy
             size = sum(file.size for file in files)
             yield Garbage(storage, "attempts", key, len(files), size, True, (shard, name))
-
-
-def _has_claim(shard: int, name: str, files: Iterable[StoredFile]) -> bool:
-    """Whether the commit record may be lost: `repair` restores it from the copy in the folder."""
-    return any(file.key == commit_copy_key(shard, name) for file in files)
 
 
 def _winner(run: Run, shard: int) -> str | None:

@@ -91,7 +91,6 @@ class StoredJob:
         return self.record.id
 
     def silence(self, at: datetime | None = None) -> timedelta:
-        """Time since its last record."""
         heard = self.state.updated if self.state else self.record.started
         return max((at or datetime.now(UTC)) - _time_of(heard), timedelta())
 
@@ -113,13 +112,11 @@ class Jobs:
         self._place = place
 
     def begin(self, record: JobRecord) -> None:
-        """Record that a job begins."""
         if not self._place.put_new(f"jobs/{record.id}.json", encode_record(record)):
             where = f"{self._place.url}/jobs/{record.id}.json"
             raise InputError(where, "", "exists already", "Start the job again: it gets another name")
 
     def put_state(self, state: JobState) -> None:
-        """Replace the state of a job."""
         self._place.put(f"jobs/{state.id}.state.json", encode_record(state))
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
@@ -130,7 +127,6 @@ class Jobs:
             self._place.put(f"jobs/{job}.stop.json", encode_record(order))
 
     def stop_order(self, job: str) -> StopRecord | None:
-        """The stop request for a job, if any."""
         return self._passing(f"jobs/{job}.stop.json", StopRecord)
 
     def get(self, job: str) -> StoredJob | None:
@@ -148,7 +144,6 @@ class Jobs:
         return StoredJob(record, self._passing(f"jobs/{job}.state.json", JobState), self.stop_order(job))
 
     def all(self) -> list[StoredJob]:
-        """Every job, in order of time."""
         names = (_JOB_FILE.fullmatch(file.key) for file in self._place.list("jobs"))
         found = [job for name in names if name and (job := self.get(name[1])) is not None]
         # Names have seconds only, and two jobs may begin within one.

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import platform
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
-from typing import TypeVar
-
-from pydantic import BaseModel
+from collections.abc import Iterator, Mapping
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
+from datagen.schemas.record_files import encode_record, read_record, read_records, utc_now
 from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
 from datagen.schemas.storage import Storage
 
 MAX_STACK_CHARS = 20_000
 LOST_CAUSE = "it left no end record, and its shard was decided without it"
-Record = TypeVar("Record", bound=BaseModel)
 
 
 class Ledger:
@@ -58,11 +54,9 @@ class Ledger:
         return True
 
     def attempts(self) -> set[str]:
-        """Names of all attempts that began or ended, by listing."""
         return {name.removesuffix(".start") for name in self.stamps()}
 
     def start_of(self, attempt: str) -> AttemptStart | None:
-        """The start record of an attempt; None where there is none."""
         return read_record(self._storage, start_key(attempt), AttemptStart)
 
     def end_of(self, attempt: str) -> LedgerEntry | None:
@@ -70,15 +64,15 @@ class Ledger:
         return read_record(self._storage, end_key(attempt), LedgerEntry)
 
     def ends(self) -> Iterator[LedgerEntry]:
-        """End records of all attempts, in order of their names."""
         names = sorted(name for name in self.stamps() if not name.endswith(".start"))
-        yield from self._read(names, LedgerEntry)
+        return read_records(self._storage, map(end_key, names), LedgerEntry)
 
     def unfinished(self, stamps: Mapping[str, str] | None = None) -> list[AttemptStart]:
         """Start records of attempts without an end: running, or lost. `stamps` saves a listing."""
         names = self.stamps() if stamps is None else stamps
-        open_ = sorted(n for n in names if n.endswith(".start") and n.removesuffix(".start") not in names)
-        return list(self._read(open_, AttemptStart))
+        began = (name.removesuffix(".start") for name in names if name.endswith(".start"))
+        open_ = sorted(attempt for attempt in began if attempt not in names)
+        return list(read_records(self._storage, map(start_key, open_), AttemptStart))
 
     def stamps(self) -> dict[str, str]:
         """Change stamps of all records by their names, by listing; those of starts end in `.start`."""
@@ -87,12 +81,6 @@ class Ledger:
             for file in self._storage.list("ledger")
             if file.key.endswith(".json")
         }
-
-    def _read(self, names: Iterable[str], model: type[Record]) -> Iterator[Record]:
-        keys = (f"ledger/{name}.json" for name in names)
-        for key, data in self._storage.get_many(keys, MAX_RECORD_BYTES):
-            if data is not None:
-                yield decode_record(f"{self._storage.url}/{key}", data, model)
 
 
 def end_from_commit(commit: Commit, started: str) -> LedgerEntry:

@@ -70,7 +70,6 @@ class Origins:
 
     @property
     def is_merged(self) -> bool:
-        """Whether the run has a lineage."""
         return bool(self.named)
 
     def of(self, shard: int) -> ShardOrigin:

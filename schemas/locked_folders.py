@@ -8,15 +8,16 @@ import shutil
 import tempfile
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
-
-def _remove_tree(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
+_remove_tree = partial(shutil.rmtree, ignore_errors=True)
 
 
 @contextmanager
-def locked_folder(kind: str, parent: Path, remove: Callable[[Path], None] = _remove_tree) -> Generator[Path]:
+def locked_folder(
+    kind: str, parent: Path, remove: Callable[[Path], object] = _remove_tree
+) -> Generator[Path]:
     """Give a new folder of mode 0700, whose name begins with `kind`; `remove` removes it after the block.
 
     First removes folders of killed processes of this user, whose locks the kernel has released.

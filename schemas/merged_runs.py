@@ -8,9 +8,9 @@ from pathlib import Path
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
-from datagen.schemas.record_files import read_record
+from datagen.schemas.record_files import read_record, refuse_other_format
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import FORMAT_VERSION, Merged, other_value
+from datagen.schemas.run_records import Merged, other_value
 from datagen.schemas.storage import Storage, open_storage
 
 
@@ -23,13 +23,7 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
     merged = read_record(storage, MERGED, Merged)
     if merged is None:
         return [Run.open(storage)]
-    if merged.format_version != FORMAT_VERSION:
-        raise InputError(
-            f"{storage.url}/{MERGED}",
-            "format_version",
-            f"is {merged.format_version}, but this program reads {FORMAT_VERSION}",
-            "Use the version of datagen that made the run",
-        )
+    refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
     runs = [Run.open(storage.below(part_folder(spec_hash))) for spec_hash in merged.parts]
     for run, spec_hash in zip(runs, merged.parts, strict=True):
         if found := other_value(run.manifest, spec_hash=spec_hash):
@@ -39,7 +33,7 @@ def open_runs(place: Storage | Path | str) -> list[Run]:
 
 @dataclass(frozen=True)
 class LabelCounts:
-    """LabelCounts and committed labels of runs, and the number of missing shards."""
+    """Planned and committed labels of runs, and the number of missing shards."""
 
     n: int
     labels: int

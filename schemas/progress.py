@@ -117,7 +117,6 @@ class Progress:
             print(line, file=self._console.file, flush=True)
 
     def close(self) -> None:
-        """Show the last state, and release the terminal."""
         self._end_row()
         if self._live:
             self._bar.stop()

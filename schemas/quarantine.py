@@ -33,18 +33,16 @@ def lift_quarantine(run: Run) -> list[int]:
 
 def lifted_records(run: Run) -> list[QuarantineRecord]:
     """Records of released shards, in order of shard and time. InputError as `read_record`."""
-    found: list[tuple[int, int]] = []
-    for file in run.storage.list("quarantine"):
-        if name := _LIFTED.fullmatch(file.key):
-            found.append((int(name[1]), int(name[2])))
+    names = (_LIFTED.fullmatch(file.key) for file in run.storage.list("quarantine"))
     records: list[QuarantineRecord] = []
-    for shard, k in sorted(found):
-        record = read_record(run.storage, _lifted_key(shard, k), QuarantineRecord)
-        if record is not None and record.shard != shard:
-            place = f"{run.storage.url}/{_lifted_key(shard, k)}"
-            raise InputError(place, "shard", f"is {record.shard}, not {shard}", "Remove this foreign file")
-        if record is not None:
-            records.append(record)
+    for shard, k in sorted((int(name[1]), int(name[2])) for name in names if name):
+        key = _lifted_key(shard, k)
+        if (record := read_record(run.storage, key, QuarantineRecord)) is None:
+            continue
+        if record.shard != shard:
+            problem = f"is {record.shard}, not {shard}"
+            raise InputError(f"{run.storage.url}/{key}", "shard", problem, "Remove this foreign file")
+        records.append(record)
     return records
 
 

@@ -1,10 +1,13 @@
-"""JSON records of a run as files: indented, with their own digest, and validated when read."""
+"""JSON records of a run as files: indented, with their own digest, and validated when read.
+
+Records at a run's root are written once, with a second copy.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any, TypeVar
@@ -12,7 +15,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from datagen.schemas.errors import InputError
+from datagen.schemas.run_records import FORMAT_VERSION, Manifest
 from datagen.schemas.storage import Storage
+from datagen.schemas.storage.errors import NotARegularFile
 
 MAX_RECORD_BYTES = 16 * 2**20
 _FIX = "Repair it with `datagen repair`, or restore the file from a copy"
@@ -71,6 +76,13 @@ def read_record(storage: Storage, key: str, model: type[Record]) -> Record | Non
     return None if data is None else decode_record(f"{storage.url}/{key}", data, model)
 
 
+def read_records(storage: Storage, keys: Iterable[str], model: type[Record]) -> Iterator[Record]:
+    """Read the records that exist, in the order of their keys. InputError as `decode_record`."""
+    for key, data in storage.get_many(keys, MAX_RECORD_BYTES):
+        if data is not None:
+            yield decode_record(f"{storage.url}/{key}", data, model)
+
+
 def different_fields(ours: object, theirs: object, path: str = "") -> list[tuple[str, object, object]]:
     """(path, ours, theirs) of every leaf that differs between two JSON values; None where one lacks it."""
     if isinstance(ours, dict) and isinstance(theirs, dict):
@@ -79,3 +91,55 @@ def different_fields(ours: object, theirs: object, path: str = "") -> list[tuple
             rows += different_fields(ours.get(key), theirs.get(key), f"{path}.{key}" if path else str(key))
         return rows
     return [] if ours == theirs else [(path, ours, theirs)]
+
+
+def copy_key(key: str) -> str:
+    """Key of the copy of a record at the run's root."""
+    return f"copies/{key}"
+
+
+def publish(storage: Storage, key: str, record: bytes) -> None:
+    """Write a record at the run's root once: its copy first, then the record with the copy's bytes.
+
+    The copy decides races, so that both are equal; after a kill in between, the next call completes it.
+    """
+    storage.put_new(copy_key(key), record)
+    kept = storage.get(copy_key(key), MAX_RECORD_BYTES)
+    storage.put_new(key, record if kept is None else kept)
+
+
+def refuse_other_format(place: str, version: int) -> None:
+    """Raise InputError for a record of another format, at `place`."""
+    if version != FORMAT_VERSION:
+        problem = f"is {version}, but this program reads {FORMAT_VERSION}"
+        raise InputError(place, "format_version", problem, "Use the version of datagen that made the run")
+
+
+def refuse_foreign(storage: Storage, *also: str) -> None:
+    """Raise InputError for a folder with other files than a run's; `also` are further allowed prefixes."""
+    ours = ("manifest.json", "plans/", "copies/", "shards/", "commits/", "ledger/", ".probe-", *also)
+    problem, fix = "holds other files than those of a run", "Choose a new --out"
+    try:
+        for file in storage.list(""):
+            if not file.key.startswith(ours):
+                raise InputError(storage.url, file.key, problem, fix)
+    except NotARegularFile as e:
+        raise InputError(e.place, "", problem, fix) from e
+
+
+def refuse_other(place: str, there: Manifest, asked: Manifest) -> None:
+    """Raise InputError for a run of another specification, with every field that differs."""
+    # Without the schema version: a run keeps the one it was started with.
+    ours, theirs = (
+        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (asked, there)
+    )
+    rows = different_fields(ours, theirs)
+    where, each = f"{place}/manifest.json", there.layout.candidates_per_scene
+    if each != asked.layout.candidates_per_scene:
+        problem = f"is {each}, not {asked.layout.candidates_per_scene}"
+        raise InputError(where, "layout.candidates_per_scene", problem, "Choose another --out")
+    if rows:
+        shown = [f"{path.removeprefix('spec.')}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]
+        more = f"; and {len(rows) - 20} more" if len(rows) > 20 else ""
+        problem = "has another specification (" + "; ".join(shown) + more + ")"
+        raise InputError(where, "", problem, "Choose another --out, or give the same options")

@@ -19,10 +19,19 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import RecordSchema, sized_schema
 from datagen.schemas.keys import MERGED, REMOVING, commit_copy_key, commit_key, part_folder, shard_folder
 from datagen.schemas.ledger import MAX_STACK_CHARS, Ledger
-from datagen.schemas.record_files import MAX_RECORD_BYTES, decode_record, encode_record, read_record, utc_now
-from datagen.schemas.root_records import publish, refuse_foreign, refuse_other
+from datagen.schemas.record_files import (
+    MAX_RECORD_BYTES,
+    decode_record,
+    encode_record,
+    publish,
+    read_record,
+    read_records,
+    refuse_foreign,
+    refuse_other,
+    refuse_other_format,
+    utc_now,
+)
 from datagen.schemas.run_records import (
-    FORMAT_VERSION,
     Commit,
     FileEntry,
     Layout,
@@ -42,8 +51,6 @@ _NUMBERED = re.compile(r"([0-9]{1,18})\.json")
 Removal = Literal["removed", "spared", "damaged"]
 _MOST_PLANS = 10**9
 AGAIN = "Run the same command again after `datagen gc` has ended: it makes the missing shards"
-# A commit with its file entries takes some 30 kB of memory.
-_COMMITS_KEPT = 1000
 
 
 class Run:
@@ -56,7 +63,6 @@ class Run:
         self.storage = storage
         self.manifest = manifest
         self.ledger = Ledger(storage)
-        self._commits: dict[int, Commit] = {}  # the most recently read; immutable once written
 
     def __repr__(self) -> str:
         return f"Run({self.storage.url!r})"
@@ -91,25 +97,14 @@ class Run:
                 raise InputError(storage.url, "", problem, f"Name one of its parts: {parts}{more}")
             raise InputError(storage.url, "manifest.json", "not a run: no such file", "Name a run's folder")
         where = f"{storage.url}/manifest.json"
-        if manifest.format_version != FORMAT_VERSION:
-            raise InputError(
-                where,
-                "format_version",
-                f"is {manifest.format_version}, but this program reads {FORMAT_VERSION}",
-                "Use the version of datagen that made the run",
-            )
+        refuse_other_format(where, manifest.format_version)
         if manifest.spec.hash() != manifest.spec_hash:
-            raise InputError(
-                where,
-                "spec_hash",
-                "is not the hash of the specification in the record",
-                "The manifest was edited: restore it from a copy",
-            )
+            problem = "is not the hash of the specification in the record"
+            raise InputError(where, "spec_hash", problem, "The manifest was edited: restore it from a copy")
         return cls(storage, manifest)
 
     @property
     def layout(self) -> Layout:
-        """How scenes are cut into shards."""
         return self.manifest.layout
 
     @property
@@ -128,7 +123,6 @@ class Run:
 
     @property
     def n(self) -> int:
-        """Number of samples in the newest plan."""
         return self._newest_plan()[1]
 
     def grow(self, n: int, created: str | None = None) -> None:
@@ -168,11 +162,9 @@ class Run:
     # Shards and commits.
 
     def planned(self) -> range:
-        """Indices of the shards that hold the wanted samples."""
         return range(self.layout.shards_for(self.n))
 
     def committed(self) -> set[int]:
-        """Indices of committed shards, by listing."""
         return self._numbers("commits")
 
     def commit_stamps(self) -> dict[str, str]:
@@ -186,16 +178,12 @@ class Run:
 
     def commit_of(self, shard: int) -> Commit:
         """The commit record of a committed shard, checked against the manifest."""
-        if shard not in self._commits:
-            key = commit_key(shard)
-            data = self.storage.get(key, MAX_RECORD_BYTES)
-            if data is None:
-                place = f"{self.storage.url}/{key}"
-                raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
-            while len(self._commits) >= _COMMITS_KEPT:
-                del self._commits[next(iter(self._commits))]
-            self._commits[shard] = self.decode_commit(shard, data)
-        return self._commits[shard]
+        key = commit_key(shard)
+        data = self.storage.get(key, MAX_RECORD_BYTES)
+        if data is None:
+            place = f"{self.storage.url}/{key}"
+            raise InputError(place, "", "no such commit", "Make the shard with `datagen resume`")
+        return self.decode_commit(shard, data)
 
     def decode_commit(self, shard: int, data: bytes) -> Commit:
         """The commit record in the bytes of a shard's file, checked against the manifest."""
@@ -206,7 +194,6 @@ class Run:
         return commit
 
     def commits(self) -> Iterator[Commit]:
-        """Commit records of all committed shards, in order of their shards."""
         shards = sorted(self.committed())
         for shard, (_, data) in zip(
             shards, self.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES), strict=True
@@ -334,10 +321,8 @@ class Run:
         return self._numbers("quarantine") - self.committed()
 
     def quarantine_records(self) -> list[QuarantineRecord]:
-        """Records of the quarantined shards, in order."""
         keys = [f"quarantine/{shard:06d}.json" for shard in sorted(self.quarantined())]
-        found = (read_record(self.storage, key, QuarantineRecord) for key in keys)
-        return [record for record in found if record is not None]
+        return list(read_records(self.storage, keys, QuarantineRecord))
 
     def _numbers(self, folder: str, width: int = 6) -> set[int]:
         return {int(name) for name, _ in self._numbered(folder, width)}

@@ -2,9 +2,8 @@
 
 All arrays of both tables are at the group's root; their first dimension is "scene" or "sample". Chunks are
 bytes (or vlen-utf8) -> zstd -> crc32c, every chunk is written, and its key has no folders ("c.0.0"), so
-that a shard has one folder per array. zarr-python makes the metadata once per layout; chunks are encoded
-directly, because creating 50 arrays with zarr-python takes more than 0.1 s per shard. Tests compare the
-bytes with those that zarr-python writes.
+that a shard has one folder per array. zarr-python makes the metadata once per layout, which takes 3 ms per
+array; chunks are encoded directly. Tests compare the bytes with those that zarr-python writes.
 """
 
 from __future__ import annotations
@@ -24,20 +23,15 @@ from zarr.codecs import BytesCodec, Crc32cCodec, VLenUTF8Codec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import Field, RecordSchema, Table
+from datagen.schemas.fields import TABLES, Field, RecordSchema, Table
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.run_records import Layout
 
 Array = npt.NDArray[Any]
-# Name, version and fields of a schema; its axis lengths; scenes per shard and candidates per scene.
-_Key = tuple[str, int, tuple[Field, ...], tuple[Field, ...]]
-_Sizes = tuple[tuple[str, int], ...]
-_Cut = tuple[int, int]
 
 ZSTD_LEVEL = 3
 MAX_CHUNK_BYTES = 4 * 2**20  # of uncompressed numbers; keeps random reads of single clouds cheap
 MAX_TEXT_BYTES = 4096  # of one name
-TABLES: tuple[Table, Table] = ("scene", "sample")
 
 
 def rows_per_shard(layout: Layout, table: Table) -> int:
@@ -60,6 +54,13 @@ def chunk_rows(schema: RecordSchema, field: Field, rows: int) -> int:
 def chunk_key(field: Field, index: int) -> str:
     """Name of a field's chunk: its index along the rows, and 0 along the field's own axes."""
     return ".".join(["c", str(index), *("0" for _ in field.dims)])
+
+
+def chunk_paths(schema: RecordSchema, layout: Layout, table: Table, field: Field) -> tuple[str, ...]:
+    """Paths of an array's chunks in a shard's folder, in order of rows."""
+    rows = rows_per_shard(layout, table)
+    count = rows // chunk_rows(schema, field, rows)
+    return tuple(f"{field.name}/{chunk_key(field, i)}" for i in range(count))
 
 
 def fill_value(field: Field) -> Any:
@@ -88,14 +89,20 @@ def encode_shard(
     """
     files = dict(group_metadata(schema, layout, spec_hash))
     for table, arrays in zip(TABLES, (scene_arrays, sample_arrays), strict=True):
-        rows = rows_per_shard(layout, table)
-        schema.check(table, rows, arrays)
+        schema.check(table, rows_per_shard(layout, table), arrays)
         for field in schema.table(table):
-            step = chunk_rows(schema, field, rows)
-            for i in range(rows // step):
-                part = arrays[field.name][i * step : (i + 1) * step]
-                files[f"{field.name}/{chunk_key(field, i)}"] = encode_chunk(field, part)
+            files |= encode_array(schema, layout, table, field, arrays[field.name])
     return files
+
+
+def encode_array(
+    schema: RecordSchema, layout: Layout, table: Table, field: Field, values: Array
+) -> dict[str, bytes]:
+    """Return the chunks of one array of a full shard, by path."""
+    paths = chunk_paths(schema, layout, table, field)
+    step = len(values) // len(paths)
+    parts = (values[first : first + step] for first in range(0, len(values), step))
+    return {path: encode_chunk(field, part) for path, part in zip(paths, parts, strict=True)}
 
 
 def encode_chunk(field: Field, values: Array) -> bytes:
@@ -108,14 +115,9 @@ def encode_chunk(field: Field, values: Array) -> bytes:
     return packed + google_crc32c.value(packed).to_bytes(4, "little")
 
 
+@lru_cache(maxsize=16)
 def group_metadata(schema: RecordSchema, layout: Layout, spec_hash: str) -> Mapping[str, bytes]:
     """Every zarr.json of a shard by path: the root's, with the schema's name, and each array's."""
-    return _group_metadata(*_key(schema, layout), spec_hash)
-
-
-@lru_cache(maxsize=16)
-def _group_metadata(key: _Key, sizes: _Sizes, cut: _Cut, spec_hash: str) -> Mapping[str, bytes]:
-    schema, layout = _from_key(key, sizes, cut)
     rows: dict[str, int] = {table: rows_per_shard(layout, table) for table in TABLES}
     return zarr_metadata(schema, layout, rows, root_attributes(schema, layout, spec_hash))
 
@@ -141,11 +143,10 @@ def zarr_metadata(
 ) -> dict[str, bytes]:
     """Return the zarr.json files of a group with `rows` per table, chunked like the layout's shards.
 
-    `of_arrays` are further attributes of arrays, by name. zarr-python takes 3 ms per array, so it is called
-    once per layout; rows and attributes are filled in.
+    `of_arrays` are further attributes of arrays, by name.
     """
     files: dict[str, bytes] = {}
-    for path, data in _made_by_zarr(*_key(schema, layout)).items():
+    for path, data in _made_by_zarr(schema, layout).items():
         meta = json.loads(data)
         if path == "zarr.json":
             meta["attributes"] = dict(attributes)
@@ -157,50 +158,41 @@ def zarr_metadata(
 
 
 @lru_cache(maxsize=16)
-def _made_by_zarr(key: _Key, sizes: _Sizes, cut: _Cut) -> Mapping[str, bytes]:
+def _made_by_zarr(schema: RecordSchema, layout: Layout) -> Mapping[str, bytes]:
     """Metadata by zarr-python for a group with one shard's rows."""
-    schema, layout = _from_key(key, sizes, cut)
     store: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(store), zarr_format=3, attributes={"": ""})
-    for table in TABLES:
+    for table, field in schema.fields:
         rows = rows_per_shard(layout, table)
-        for field in schema.table(table):
-            codec = VLenUTF8Codec() if field.is_text else BytesCodec(endian="little")
-            group.create_array(
-                field.name,
-                shape=schema.shape(field, rows),
-                chunks=schema.shape(field, chunk_rows(schema, field, rows)),
-                dtype=field.dtype,
-                fill_value=fill_value(field),
-                serializer=codec,
-                compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
-                filters=None,
-                chunk_key_encoding={"name": "default", "separator": "."},
-                dimension_names=(table, *field.dims),
-                attributes=field_attributes(field),
-                config={"write_empty_chunks": True},
-            )
+        codec = VLenUTF8Codec() if field.is_text else BytesCodec(endian="little")
+        group.create_array(
+            field.name,
+            shape=schema.shape(field, rows),
+            chunks=schema.shape(field, chunk_rows(schema, field, rows)),
+            dtype=field.dtype,
+            fill_value=fill_value(field),
+            serializer=codec,
+            compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
+            filters=None,
+            chunk_key_encoding={"name": "default", "separator": "."},
+            dimension_names=(table, *field.dims),
+            attributes=field_attributes(field),
+            config={"write_empty_chunks": True},
+        )
     return {path: buffer.to_bytes() for path, buffer in store.items()}
-
-
-def _key(schema: RecordSchema, layout: Layout) -> tuple[_Key, _Sizes, _Cut]:
-    """Cache key of metadata."""
-    fields = (schema.name, schema.version, schema.scene_fields, schema.sample_fields)
-    return fields, tuple(sorted(schema.sizes.items())), (layout.scenes_per_shard, layout.candidates_per_scene)
-
-
-def _from_key(key: _Key, sizes: _Sizes, cut: _Cut) -> tuple[RecordSchema, Layout]:
-    layout = Layout(scenes_per_shard=cut[0], candidates_per_scene=cut[1])
-    return RecordSchema(*key, dict(sizes)), layout
 
 
 def field_attributes(field: Field) -> dict[str, Any]:
     """An array's attributes, with CF names where they exist."""
-    attributes: dict[str, Any] = {"long_name": field.doc, "units": field.unit, "frame": field.frame}
-    bounds = {"valid_min": field.low, "valid_max": field.high}
-    # CF attribute for the meaning of the codes 0, 1, ...
-    codes = {"flag_meanings": " ".join(field.codes)}
-    return {k: v for k, v in {**attributes, **bounds, **codes}.items() if v not in (None, "")}
+    attributes = {
+        "long_name": field.doc,
+        "units": field.unit,
+        "frame": field.frame,
+        "valid_min": field.low,
+        "valid_max": field.high,
+        "flag_meanings": " ".join(field.codes),
+    }
+    return {name: value for name, value in attributes.items() if value not in (None, "")}
 
 
 def _checked_text(field: Field, values: Array) -> Array:

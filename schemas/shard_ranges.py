@@ -36,27 +36,19 @@ class ShardRanges(Sequence[int]):
         last = numbers[np.concatenate([breaks, [len(numbers) - 1]])]
         return cls(np.stack([first, last + 1], axis=1))
 
-    def without(self, others: ShardRanges) -> ShardRanges:
-        """The shards of this set that are not in the other."""
-        return self._where(others, +1, -1)
-
     def within(self, others: ShardRanges) -> ShardRanges:
-        """The shards of both sets."""
-        return self._where(others, +1, +1)
+        return self.without(self.without(others))
 
-    def _where(self, others: ShardRanges, ours: int, theirs: int) -> ShardRanges:
-        # Sweep over all bounds: an interval counts where its depth has the wanted value.
-        wanted = ours + max(theirs, 0)
-        places = np.concatenate(
-            [self.bounds[:, 0], self.bounds[:, 1], others.bounds[:, 0], others.bounds[:, 1]]
-        )
-        steps = np.repeat([ours, -ours, theirs, -theirs], [len(self.bounds)] * 2 + [len(others.bounds)] * 2)
-        order = np.argsort(places, kind="stable")
-        places, depth = places[order], np.cumsum(steps[order])
-        last = np.append(places[1:] != places[:-1], True) if len(places) else np.empty(0, bool)
-        places, inside = places[last], (depth[last] == wanted)
+    def without(self, others: ShardRanges) -> ShardRanges:
+        # Sweep over all bounds: +1 within this set and -1 within the other, so 1 where only this one is.
+        numbers = np.concatenate([*self.bounds.T, *others.bounds.T])
+        steps = np.repeat([1, -1, -1, 1], [len(self.bounds)] * 2 + [len(others.bounds)] * 2)
+        order = np.argsort(numbers, kind="stable")
+        numbers, depth = numbers[order], np.cumsum(steps[order])
+        last = np.append(numbers[1:] != numbers[:-1], True) if len(numbers) else np.empty(0, bool)
+        numbers, inside = numbers[last], (depth[last] == 1)
         edges = np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8))
-        first, past = places[np.flatnonzero(edges == 1)], places[np.flatnonzero(edges == -1)]
+        first, past = numbers[np.flatnonzero(edges == 1)], numbers[np.flatnonzero(edges == -1)]
         return ShardRanges(np.stack([first, past], axis=1).reshape(-1, 2))
 
     def __len__(self) -> int:
@@ -80,6 +72,11 @@ class ShardRanges(Sequence[int]):
         at = index % len(self)
         row = int(np.searchsorted(self._ends, at, side="right"))
         return int(self.bounds[row, 1] - (self._ends[row] - at))
+
+    def position_of(self, shard: int) -> int:
+        """The position of one of its shards, in ascending order."""
+        row = int(np.searchsorted(self.bounds[:, 1], shard, side="right"))
+        return int(self._ends[row] - (self.bounds[row, 1] - shard))
 
     def __contains__(self, shard: object) -> bool:
         if not isinstance(shard, int):

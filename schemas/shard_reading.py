@@ -49,7 +49,6 @@ class StoredArray:
 
     @property
     def is_text(self) -> bool:
-        """Whether it holds text instead of numbers."""
         return self.dtype == "string"
 
 
@@ -159,7 +158,6 @@ class ShardPlace:
             yield path, place, data
 
     def _paths(self, array: StoredArray) -> list[str]:
-        """Paths of the chunks that hold the wanted rows."""
         scene = array.dims[0] == "scene"
         full, rows = (self.full_scenes, self.scenes) if scene else (self.full_samples, self.samples)
         count = full // array.chunk_rows

@@ -122,7 +122,6 @@ class CandidateParams(_Frozen):
 
     @property
     def count(self) -> int:
-        """Candidates of one scene."""
         return self.grid_cells**2 if self.per_scene == "grid" else self.per_scene
 
 

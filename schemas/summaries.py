@@ -15,6 +15,7 @@ from contextlib import suppress
 from functools import cached_property, partial
 from hashlib import sha256
 from itertools import chain, islice
+from typing import TypeVar
 
 from pydantic import Field, ValidationError
 
@@ -65,6 +66,7 @@ class EndSummary(StoredRecord):
 
 
 Summary = CommitSummary | EndSummary
+Kind = TypeVar("Kind", CommitSummary, EndSummary)
 # By a record's key: its change stamp, and its summary as JSON.
 Rows = dict[str, tuple[str, str]]
 
@@ -93,24 +95,23 @@ class Summaries:
 
     @property
     def shards(self) -> set[int]:
-        """Committed shards."""
         return {int(name) for name in self._committed}
 
     def commits(self) -> Iterator[CommitSummary]:
         """Summaries of commits, in order of their shards. InputError as `Run.commit_of`."""
         keys = [f"commits/{name}.json" for name in sorted(self._committed, key=int)]
-        return (found for found in self._in_order(keys) if isinstance(found, CommitSummary))
+        return self._in_order(keys, CommitSummary)
 
     def ends(self) -> Iterator[EndSummary]:
         """Summaries of ended attempts, in order of their names. InputError as `Ledger.end_of`."""
         keys = [f"ledger/{name}.json" for name in sorted(self._ledger) if not name.endswith(".start")]
-        return (found for found in self._in_order(keys) if isinstance(found, EndSummary))
+        return self._in_order(keys, EndSummary)
 
     def unfinished(self) -> list[AttemptStart]:
         """Start records of attempts without an end: running, or lost."""
         return self._run.ledger.unfinished(self._ledger)
 
-    def _in_order(self, keys: Sequence[str]) -> Iterator[Summary]:
+    def _in_order(self, keys: Sequence[str], kind: type[Kind]) -> Iterator[Kind]:
         run, indexed = self._run, self._indexed
         absent = (key for key in keys if key not in indexed)
         read = run.storage.concurrent_map(partial(_read, run), absent)
@@ -120,16 +121,15 @@ class Summaries:
             found = next(read) if text is None else _decode(run, key, text) or _read(run, key)
             if isinstance(found, InputError):
                 raise found
-            if found is not None:  # else its record was removed since the listing
+            if isinstance(found, kind):  # else its record was removed since the listing
                 yield found
 
 
 def refresh(run: Run) -> int:
     """Update the index with the run's records; return the number of added ones.
 
-    Unreadable records are omitted. Small files, and those with mostly stale rows, are joined, so that the
-    index has few files and at most one row per record. Of several concurrent updates each adds a file, and
-    the next update joins them.
+    Unreadable records are omitted. Small files, and those with mostly stale rows, are joined, also those of
+    concurrent updates, so that the index has few files and one row per record.
     """
     stamps = _stamps_by_key(run.ledger.stamps(), run.commit_stamps())
     known, kept, replaced = set[str](), Rows(), set(index_files(run))

@@ -12,19 +12,17 @@ from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.driver import AttemptOrder, drive
-from datagen.cluster.executor import Executor
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_monitor import JobMonitor
+from datagen.cluster.job_progress import JobMonitor, JobProgress
 from datagen.cluster.job_totals import JobSummary, JobTotals, empty_summary
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
-from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import RayExecutor, ray_executor
 from datagen.cluster.retry_policy import RetryPolicy, too_many_quarantined
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
-from datagen.cluster.task import ShardTask
+from datagen.cluster.task import Executor, ShardTask
 from datagen.console.command_lines import command_line
 from datagen.jobs.job_recorder import JobRecorder
 from datagen.jobs.job_result import JobResult

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from datagen.cluster.job_monitor import JobStatus, StopMode
+from datagen.cluster.job_progress import JobStatus, StopMode
 from datagen.cluster.job_totals import End, JobSummary, JobTotals
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState

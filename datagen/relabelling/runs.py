@@ -10,8 +10,8 @@ from typing import Any
 from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
+from datagen.cluster.job_progress import JobProgress
 from datagen.cluster.job_totals import JobSummary, empty_summary
-from datagen.cluster.progress import JobProgress
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
@@ -22,8 +22,7 @@ from datagen.relabelling.shards import Flips, RelabelTask, relabel_shard
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.progress import Progress
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
-from datagen.schemas.root_records import publish, refuse_foreign
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, publish, refuse_foreign
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Merged
 from datagen.schemas.sealing import seal

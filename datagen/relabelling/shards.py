@@ -17,7 +17,7 @@ from datagen.schemas.keys import shard_folder
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
-from datagen.schemas.shard_files import chunk_key, chunk_rows, encode_chunk, group_metadata
+from datagen.schemas.shard_files import encode_array, group_metadata
 from datagen.schemas.shard_reading import read_committed
 from datagen.workers.labels import distance_visibility_score as formula
 
@@ -114,13 +114,9 @@ def _made_files(run: Run, made: Columns) -> dict[str, bytes]:
     """Metadata and chunks of the columns, by path within the attempt's folder."""
     schema, layout = run.schema, run.layout
     files = dict(group_metadata(schema, layout, run.manifest.spec_hash))
-    rows = layout.samples_per_shard
     for field in schema.sample_fields:
         if field.name in made:
-            step = chunk_rows(schema, field, rows)
-            for i in range(rows // step):
-                part = made[field.name][i * step : (i + 1) * step]
-                files[f"{field.name}/{chunk_key(field, i)}"] = encode_chunk(field, part)
+            files |= encode_array(schema, layout, "sample", field, made[field.name])
     return files
 
 

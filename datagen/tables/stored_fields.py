@@ -8,7 +8,6 @@ from pathlib import Path
 from datagen.schemas.errors import InputError, choices
 from datagen.schemas.fields import SCHEMAS, Field, Table
 from datagen.schemas.merged_runs import open_runs
-from datagen.schemas.shard_files import TABLES
 from datagen.train.run_parts import is_sealed_store, open_sealed
 
 Paths = Sequence[str | Path]
@@ -24,7 +23,7 @@ def fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
         schema = SCHEMAS[sealed.schema].at(sealed.schema_version)
     else:
         schema = open_runs(str(path))[0].schema
-    return {field.name: (table, field) for table in TABLES for field in schema.table(table)}
+    return {field.name: (table, field) for table, field in schema.fields}
 
 
 def refuse_no_path(paths: Paths, function: str) -> None:

@@ -19,10 +19,11 @@ from datagen.schemas.storage import Storage, StoredFile
 
 _ROUNDING = 1e-6
 _ROUNDING_S = 1e-3  # of clocks
+ODD_COST_FIX = "Find out which program wrote it: the record is undamaged"
 
 
 @dataclass(frozen=True, eq=False)
-class CommittedShard:
+class CheckedShard:
     """A shard that is or was committed, with its commit where one of the two files is undamaged."""
 
     shard: int
@@ -30,36 +31,36 @@ class CommittedShard:
     findings: tuple[Finding, ...]
 
 
-def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> CommittedShard:
+def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> CheckedShard:
     """Check the shard's commit and its copy, among the files listed below the shard's folder.
 
     Without a commit file, a copy counts only where the caller knows that there was a commit.
     """
-    ours = read(run.storage, commit_key(shard), Commit, lambda c: foreign_to(run, shard, c))
+    ours = read(run.storage, commit_key(shard), Commit, lambda c: _foreign_to(run, shard, c))
     if ours.record is not None:
         attempt = ours.record.attempt
         copy = _copy(run, shard, attempt)
         is_won = copy.data == ours.data or _says_committed(run, shard, attempt)
-        copies = [] if is_won else sound_copies(run, shard, listed)
+        copies = [] if is_won else _sound_copies(run, shard, listed)
         if not any(c.record and _says_committed(run, shard, c.record.attempt) for c in copies):
-            return CommittedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
+            return CheckedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
         # The record of a superseded attempt, or of another run of the specification, replaced it.
         ours = Read(ours.key, ours.data, None, "is not that of the committed attempt")
-    copies = sound_copies(run, shard, listed)
+    copies = _sound_copies(run, shard, listed)
     if len(copies) > 1:  # killed superseded attempts left theirs too
         copies = [c for c in copies if c.record and _says_committed(run, shard, c.record.attempt)]
     if len(copies) == 1:
-        return CommittedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
+        return CheckedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
-        return CommittedShard(shard, None, ())  # there is nothing to commit
+        return CheckedShard(shard, None, ())  # there is nothing to commit
     fix = "Restore the file from a backup; or remove it, and `datagen resume` makes the shard again"
     if ours.data is None and ours.problem == "missing":
         fix = "Make the shard again with `datagen resume`"
     problem = f"{ours.problem}, and {'there is no copy' if not copies else 'several attempts left copies'}"
-    return CommittedShard(shard, None, (Finding(ours.key, "lost", problem, fix, shard),))
+    return CheckedShard(shard, None, (Finding(ours.key, "lost", problem, fix, shard),))
 
 
-def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Read[Commit]]:
+def _sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Read[Commit]]:
     """The undamaged copies of commits in the folders of a shard's attempts."""
     found: list[Read[Commit]] = []
     for key in sorted(listed):
@@ -73,15 +74,13 @@ def sound_copies(run: Run, shard: int, listed: dict[str, StoredFile]) -> list[Re
 
 def _copy(run: Run, shard: int, attempt: str) -> Read[Commit]:
     def refuse(commit: Commit) -> str:
-        return foreign_to(run, shard, commit) or "is another attempt's" * (commit.attempt != attempt)
+        return _foreign_to(run, shard, commit) or "is another attempt's" * (commit.attempt != attempt)
 
     return read(run.storage, commit_copy_key(shard, attempt), Commit, refuse)
 
 
-def foreign_to(run: Run, shard: int, commit: Commit) -> str:
-    """Why a commit cannot belong to this shard, or ""."""
-    found = foreign_field(run.manifest, shard, commit)
-    return ": ".join(found) if found else ""
+def _foreign_to(run: Run, shard: int, commit: Commit) -> str:
+    return ": ".join(foreign_field(run.manifest, shard, commit) or ())
 
 
 def check_account(run: Run, commit: Commit) -> list[Finding]:
@@ -112,8 +111,7 @@ def check_account(run: Run, commit: Commit) -> list[Finding]:
         known = start_from_end(end_from_commit(commit, end.record.started if end.record else ""))
         findings.append(account_finding(run.storage, start, problem, known, shard))
     if odd := odd_cost(commit.cost):
-        fix = "Find out which program wrote it: the record is undamaged"
-        findings.append(Finding(commit_key(shard), "account", odd, fix, shard))
+        findings.append(Finding(commit_key(shard), "account", odd, ODD_COST_FIX, shard))
     return findings
 
 

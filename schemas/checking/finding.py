@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from datagen.schemas.run import Run
@@ -66,6 +67,11 @@ class Finding:
     def is_damage(self) -> bool:
         """Whether data is damaged; an outdated sealed store is not damage."""
         return self.kind != "stale"
+
+
+def below(prefix: str, findings: Iterable[Finding]) -> Iterator[Finding]:
+    """The findings with keys relative to the merged runs, which hold their run in the folder `prefix`."""
+    return (replace(finding, key=prefix + finding.key) for finding in findings)
 
 
 def curable(key: str, kind: Kind, problem: str, cure: Cure, shard: int | None = None) -> Finding:

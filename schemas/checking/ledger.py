@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
-from datagen.schemas.checking.commits import account_finding, odd_cost
+from datagen.schemas.checking.commits import ODD_COST_FIX, account_finding, odd_cost
 from datagen.schemas.checking.finding import Finding, Restore, curable
-from datagen.schemas.checking.records import read
-from datagen.schemas.ledger import lost_end, start_from_end
+from datagen.schemas.checking.records import Read, read
+from datagen.schemas.ledger import end_key, lost_end, start_from_end, start_key
 from datagen.schemas.quarantine import name_before
 from datagen.schemas.record_files import encode_record, utc_now
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import AttemptStart, LedgerEntry, QuarantineRecord, other_value
 
+Ledgered = TypeVar("Ledgered", AttemptStart, LedgerEntry)
 _GONE = "Restore the file from a backup; or remove it: its attempt then counts as lost, with unknown cost"
 
 
@@ -38,35 +40,28 @@ def check_rest(run: Run, committed: Mapping[int, str], totals: LedgerTotals) -> 
             names.add(name.removesuffix(".json"))
         elif not name.endswith(".part"):  # left by a killed writer
             yield Finding(file.key, "foreign", "is not a record of the ledger", "Move it out of the run")
-    done = set(committed.values())
-    ends = {name for name in names if not name.endswith(".start")}
-    starts = {name.removesuffix(".start") for name in names if name.endswith(".start")}
-    quarantined = run.quarantined()
-    for attempt in sorted(ends - done):
-        yield from _check_end(run, attempt, attempt in starts, committed, totals)
-    for attempt in sorted(starts - ends - done):
-        yield from _check_unfinished(run, attempt, committed, quarantined, totals)
+    decided = committed.keys() | run.quarantined()
+    attempts = {name.removesuffix(".start") for name in names} - set(committed.values())
+    for attempt in sorted(attempts):
+        if attempt in names:
+            yield from _check_end(run, attempt, committed, totals)
+        else:
+            yield from _check_unfinished(run, attempt, decided, totals)
+        totals.attempts += 1
 
 
 def _check_end(
-    run: Run, attempt: str, has_start: bool, committed: Mapping[int, str], totals: LedgerTotals
+    run: Run, attempt: str, committed: Mapping[int, str], totals: LedgerTotals
 ) -> Iterator[Finding]:
-    end = read(run.storage, f"ledger/{attempt}.json", LedgerEntry, lambda e: _misnamed(e.attempt, attempt))
-    start = read(
-        run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
-    )
-    totals.attempts += 1
+    end, start = _read(run, attempt, end_key, LedgerEntry), _read(run, attempt, start_key, AttemptStart)
     if end.record is None:
-        yield Finding(end.key, "account", end.problem, _GONE)
-        if start.record is None:
-            yield Finding(start.key, "account", start.problem, _GONE)
+        yield from (Finding(one.key, "account", one.problem, _GONE) for one in (end, start) if one.problem)
         return
     noted = end.record
     if start.record is None:
         yield account_finding(run.storage, start, start.problem, start_from_end(noted), noted.shard)
     if odd := odd_cost(noted.cost):
-        fix = "Find out which program wrote it: the record is undamaged"
-        yield Finding(end.key, "account", odd, fix, noted.shard)
+        yield Finding(end.key, "account", odd, ODD_COST_FIX, noted.shard)
     totals.without_account += noted.cost is None
     totals.wasted_wall_s += noted.cost.wall_s if noted.cost else 0.0
     if noted.outcome == "committed" and noted.shard not in committed:
@@ -74,22 +69,22 @@ def _check_end(
 
 
 def _check_unfinished(
-    run: Run, attempt: str, committed: Mapping[int, str], quarantined: set[int], totals: LedgerTotals
+    run: Run, attempt: str, decided: Container[int], totals: LedgerTotals
 ) -> Iterator[Finding]:
-    start = read(
-        run.storage, f"ledger/{attempt}.start.json", AttemptStart, lambda s: _misnamed(s.attempt, attempt)
-    )
-    totals.attempts += 1
+    start = _read(run, attempt, start_key, AttemptStart)
     if start.record is None:
         yield Finding(start.key, "account", start.problem, _GONE)
-    elif start.record.shard in committed or start.record.shard in quarantined:
-        shard = start.record.shard
-        problem = "missing, but its shard is decided; the cost is unknown"
+    elif start.record.shard in decided:
         totals.without_account += 1
+        problem = "missing, but its shard is decided; the cost is unknown"
         cure = Restore(encode_record(lost_end(start.record, utc_now())), is_guess=True)
-        yield curable(f"ledger/{attempt}.json", "account", problem, cure, shard)
+        yield curable(end_key(attempt), "account", problem, cure, start.record.shard)
     else:
         totals.unfinished += 1
+
+
+def _read(run: Run, attempt: str, key_of: Callable[[str], str], model: type[Ledgered]) -> Read[Ledgered]:
+    return read(run.storage, key_of(attempt), model, lambda record: _misnamed(record.attempt, attempt))
 
 
 def check_quarantine(run: Run) -> Iterator[Finding]:

@@ -5,7 +5,7 @@ Every file is replaced by one atomic put of verified bytes, so that an interrupt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -13,14 +13,14 @@ from hashlib import sha256
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding, Regenerate, Reseal, Restore
 from datagen.schemas.checking.roots import open_roots
-from datagen.schemas.checking.sealed import SealedSlice, read_root, slices_of
+from datagen.schemas.checking.sealed import read_root, runs_named
 from datagen.schemas.checking.shards import form_of
 from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry
 from datagen.schemas.sealing import SEALED, seal
-from datagen.schemas.sealing.contents import read_contents
+from datagen.schemas.sealing.contents import SealedRun, read_contents
 from datagen.schemas.sealing.metadata import ROOT
 from datagen.schemas.shard_files import chunk_key
 from datagen.schemas.shard_reading import ShardPlace
@@ -31,6 +31,7 @@ _PASSES = 5
 # Findings that decide which rows there are.
 _UNDECIDED = ("record", "lost", "foreign", "sealed")
 
+_BadFile = tuple[Finding, Regenerate]
 RegenerateShard = Callable[[Run, int], Mapping[str, bytes]]
 Seen = Callable[[int, int], None]
 
@@ -52,7 +53,6 @@ class Repaired:
 
     @property
     def written(self) -> set[str]:
-        """Keys of all written files."""
         return {*self.records, *self.copied_files, *self.regenerated_files, *self.sealed_files}
 
 
@@ -65,23 +65,26 @@ def repair_runs(
     concurrently. A regenerated file is written only if all bad files of its shard have the committed digests.
     The result holds the remaining findings. InputError as `check_runs`.
     """
-    repaired = Repaired()
+    repair = _Repair(place, regenerate, workers)
+    repaired = repair.result
     before = {file.key: _state(file) for file in place.list("")}
-    refused: dict[str, str] = {}  # key -> reason; not tried again
     for _ in range(_PASSES):
-        found = _pass(place, regenerate, workers, seen, repaired, refused)
-        if not found:
+        if not repair.run_pass(seen):
             break
+
+    def is_ours(key: str) -> bool:
+        return key in written or (repaired.resealed and key.startswith(f"{SEALED}/"))
+
     written = repaired.written
     for file in place.list(""):  # a second dictionary of all files would not fit into memory for a large run
         state = before.pop(file.key, None)
-        if state is None or _is_ours(file.key, written, repaired.resealed):
+        if state is None or is_ours(file.key):
             continue
         if state == _state(file):
             repaired.untouched += 1
         else:
             repaired.changed.append(file.key)
-    repaired.changed += [key for key in before if not _is_ours(key, written, repaired.resealed)]
+    repaired.changed += [key for key in before if not is_ours(key)]
     return repaired
 
 
@@ -90,207 +93,164 @@ def _state(file: StoredFile) -> int:
     return hash((file.modified_s, file.size))
 
 
-def _is_ours(key: str, written: Container[str], resealed: bool) -> bool:
-    return key in written or (resealed and key.startswith(f"{SEALED}/"))
+@dataclass
+class _Repair:
+    """A repair in several passes. `refused` says why a file, or the sealed store, is not tried again."""
 
+    place: Storage
+    regenerate: RegenerateShard
+    workers: int
+    result: Repaired = field(default_factory=Repaired)
+    refused: dict[str, str] = field(default_factory=dict[str, str])
 
-def _pass(
-    place: Storage,
-    regenerate: RegenerateShard,
-    workers: int,
-    seen: Seen,
-    repaired: Repaired,
-    refused: dict[str, str],
-) -> bool:
-    """Check once and repair the findings; return whether any was repaired."""
-    repaired.checked, repaired.left = Checked(), []
-    bad: dict[tuple[str, int], list[Finding]] = {}
-    sealed: list[Finding] = []
-    done = False
-    for finding in check_runs(place, repaired.checked, seen):
-        cure = finding.cure
-        if isinstance(cure, Restore):
-            done |= _put(place, finding, cure.data, repaired.records, repaired, refused, cure.is_guess)
-        elif isinstance(cure, Regenerate) and finding.key not in refused:
-            bad.setdefault((cure.run.storage.url, cure.shard), []).append(finding)
-        elif isinstance(cure, Reseal) and SEALED not in refused:
-            sealed.append(finding)
-        else:
-            repaired.left.append(_refused(finding, refused))
-    files = 0
-    if bad:
-        files = _repair_files(place, regenerate, workers, bad, repaired, refused)
-    relink = bool(files) and repaired.checked.is_sealed and place.folder is not None
-    if any(finding.kind in _UNDECIDED for finding in repaired.left):
-        why = "Repair the other findings first: the run cannot be sealed before"
-        repaired.left += [replace(finding, fix=why, cure=None) for finding in sealed]
-    elif sealed or relink:
-        done |= _repair_sealed(place, sealed, repaired, refused)
-    return done or bool(files)
-
-
-def _refused(finding: Finding, refused: Mapping[str, str]) -> Finding:
-    why = refused.get(SEALED if isinstance(finding.cure, Reseal) else finding.key)
-    if why is None:
-        return finding
-    return Finding(finding.key, finding.kind, finding.problem, why, finding.shard)
-
-
-def _put(
-    place: Storage,
-    finding: Finding,
-    data: bytes,
-    noted: list[str],
-    repaired: Repaired,
-    refused: dict[str, str],
-    is_guess: bool = False,
-) -> bool:
-    """Write the restored bytes; return whether a file changed. A guess does not replace an existing file."""
-    if finding.key not in refused:
-        try:
-            if is_guess:
-                is_put = place.put_new(finding.key, data)
+    def run_pass(self, seen: Seen) -> bool:
+        """Check once and repair the findings; return whether any was repaired."""
+        result = self.result
+        result.checked, result.left = Checked(), []
+        bad: dict[tuple[str, int], list[_BadFile]] = {}
+        sealed: list[Finding] = []
+        done = False
+        for finding in check_runs(self.place, result.checked, seen):
+            cure = finding.cure
+            if isinstance(cure, Restore):
+                done |= self._put(finding, cure.data, result.records, cure.is_guess)
+            elif isinstance(cure, Regenerate) and finding.key not in self.refused:
+                bad.setdefault((cure.run.storage.url, cure.shard), []).append((finding, cure))
+            elif isinstance(cure, Reseal) and SEALED not in self.refused:
+                sealed.append(finding)
             else:
-                place.put(finding.key, data)
-                place.sync([finding.key])
+                self._leave(finding)
+        files = self._repair_files(bad.values()) if bad else 0
+        relink = bool(files) and result.checked.is_sealed and self.place.folder is not None
+        if any(finding.kind in _UNDECIDED for finding in result.left):
+            why = "Repair the other findings first: the run cannot be sealed before"
+            result.left += [replace(finding, fix=why, cure=None) for finding in sealed]
+        elif sealed or relink:
+            done |= self._repair_sealed(sealed)
+        return done or bool(files)
+
+    def _leave(self, finding: Finding) -> None:
+        """List a finding as left, with the reason why its repair was refused."""
+        why = self.refused.get(SEALED if isinstance(finding.cure, Reseal) else finding.key)
+        self.result.left.append(finding if why is None else replace(finding, fix=why, cure=None))
+
+    def _put(self, finding: Finding, data: bytes, noted: list[str], is_guess: bool = False) -> bool:
+        """Write the restored bytes; return whether it succeeded. A guess replaces no existing file."""
+        if finding.key not in self.refused:
+            try:
                 is_put = True
-        except InputError as error:
-            refused[finding.key] = f"{error.problem}. {error.fix}"
-        else:
-            noted += [finding.key] * is_put
-            return True
-    repaired.left.append(_refused(finding, refused))
-    return False
+                if is_guess:
+                    is_put = self.place.put_new(finding.key, data)
+                else:
+                    self.place.put(finding.key, data)
+                    self.place.sync([finding.key])
+                noted += [finding.key] * is_put
+                return True
+            except InputError as error:
+                self.refused[finding.key] = f"{error.problem}. {error.fix}"
+        self._leave(finding)
+        return False
 
-
-def _repair_files(
-    place: Storage,
-    regenerate: RegenerateShard,
-    workers: int,
-    bad: Mapping[tuple[str, int], list[Finding]],
-    repaired: Repaired,
-    refused: dict[str, str],
-) -> int:
-    """Restore files of shards from the sealed store, from the schema, or regenerated; return their number."""
-    slices, put = _slices(place), 0
-    to_make: list[tuple[Run, int, list[Finding]]] = []
-    for (_, shard), findings in bad.items():
-        rest: list[Finding] = []
-        for finding in findings:
-            data = _second_source(place, slices, finding)
-            if data is None:
-                rest.append(finding)
+    def _repair_files(self, bad: Iterable[list[_BadFile]]) -> int:
+        """Restore files of shards from the sealed store, from the schema, or regenerated; count them."""
+        sealed, put = self._sealed_runs(), 0
+        to_make: list[list[_BadFile]] = []
+        for files in bad:
+            rest: list[_BadFile] = []
+            for finding, cure in files:
+                data = _second_source(self.place, sealed.get(cure.run.manifest.spec_hash), cure)
+                if data is None:
+                    rest.append((finding, cure))
+                else:
+                    put += self._put(finding, data, self.result.copied_files)
+            if rest:
+                to_make.append(rest)
+        for files, made in self._regenerated(to_make):
+            if isinstance(made, str):
+                self.refused |= {finding.key: made for finding, _ in files}
+                for finding, _ in files:
+                    self._leave(finding)
             else:
-                put += _put(place, finding, data, repaired.copied_files, repaired, refused)
-        if rest and isinstance(rest[0].cure, Regenerate):
-            to_make.append((rest[0].cure.run, shard, rest))
-    for _, shard, findings, files in _regenerated(regenerate, to_make, workers):
-        why = files if isinstance(files, str) else _unlike(findings, files)
-        for finding in findings:
-            if why:
-                refused[finding.key] = why
-                repaired.left.append(_refused(finding, refused))
-            elif isinstance(finding.cure, Regenerate) and not isinstance(files, str):
-                data = files[finding.cure.entry.path]
-                put += _put(place, finding, data, repaired.regenerated_files, repaired, refused)
-        if not why:
-            repaired.regenerated_shards.append(shard)
-    return put
+                for finding, cure in files:
+                    put += self._put(finding, made[cure.entry.path], self.result.regenerated_files)
+                self.result.regenerated_shards.append(files[0][1].shard)
+        return put
+
+    def _sealed_runs(self) -> Mapping[str, SealedRun]:
+        runs = open_roots(self.place).runs
+        root, _ = read_root(self.place, runs, {run.manifest.spec_hash: run.n for run in runs})
+        return runs_named(root, runs) if root else {}
+
+    def _regenerated(
+        self, to_make: list[list[_BadFile]]
+    ) -> Iterator[tuple[list[_BadFile], Mapping[str, bytes] | str]]:
+        """Yield each shard's bad files with its regenerated files, or with the reason not to write them."""
+
+        def make(files: list[_BadFile]) -> Mapping[str, bytes] | str:
+            _, first = files[0]
+            try:
+                made = self.regenerate(first.run, first.shard)
+            except InputError as error:
+                return str(error)
+            except Exception as error:  # noqa: BLE001 - a simulator's failure concerns this shard alone
+                return f"Making the shard again failed ({type(error).__name__}: {error})"
+            if all(_has_digest(made.get(cure.entry.path), cure.entry) for _, cure in files):
+                return made
+            return "Restore the file from a backup: on this machine the remade shard has other bytes"
+
+        if self.workers <= 1 or len(to_make) <= 1:
+            yield from ((files, make(files)) for files in to_make)
+            return
+        with ThreadPoolExecutor(self.workers) as pool:
+            # Bounds the number of results in memory.
+            yield from zip(to_make, concurrent_map(pool, self.workers, make, to_make), strict=True)
+
+    def _repair_sealed(self, findings: list[Finding]) -> bool:
+        """Repair the sealed store: at once where one rename does it, else file by file."""
+        roots = {SEALED, f"{SEALED}/{ROOT}"}
+        try:
+            _refuse_fewer_rows(self.place)
+            if self.place.folder is not None or any(
+                f.key in roots and isinstance(f.cure, Reseal) and f.cure.data is None for f in findings
+            ):
+                seal(self.place)
+                self.result.resealed = True
+                return True
+            # The root last: it makes the store readable.
+            for finding in sorted(findings, key=lambda f: f.key in roots):
+                if isinstance(finding.cure, Reseal):
+                    _repair_one(self.place, finding.key, finding.cure)
+                    self.result.sealed_files.append(finding.key)
+        except InputError as error:
+            self.refused[SEALED] = str(error)
+            for finding in findings:
+                self._leave(finding)
+            return False
+        return True
 
 
-def _slices(place: Storage) -> Mapping[str, SealedSlice]:
-    """Shards in the sealed store, by specification hash."""
-    runs = open_roots(place).runs
-    root, _ = read_root(place, runs, {run.manifest.spec_hash: run.n for run in runs})
-    return slices_of(root, runs) if root else {}
-
-
-def _second_source(place: Storage, slices: Mapping[str, SealedSlice], finding: Finding) -> bytes | None:
+def _second_source(place: Storage, sealed: SealedRun | None, cure: Regenerate) -> bytes | None:
     """The committed bytes of a file where they can be restored without making the shard again."""
-    cure = finding.cure
-    if not isinstance(cure, Regenerate):
-        return None
-    run, entry = cure.run, cure.entry
-    form = form_of(run)
-    data = form.metadata.get(entry.path)
-    if data is not None and _has_digest(data, entry):
+    entry, form = cure.entry, form_of(cure.run)
+    if _has_digest(data := form.metadata.get(entry.path), entry):
         return data
-    slice_ = slices.get(run.manifest.spec_hash)
-    if slice_ is None or cure.shard not in slice_.positions:
-        return None
     name = entry.path.split("/")[0]
-    fields = {f.name: f for f in (*form.schema.scene_fields, *form.schema.sample_fields)}
     paths = form.chunks.get(name, ())
-    if entry.path not in paths or entry.size > form.most_bytes(entry.path):
+    if sealed is None or cure.shard not in sealed.shards or entry.path not in paths:
         return None
-    number = slice_.positions[cure.shard] * len(paths) + paths.index(entry.path)
+    if entry.size > form.most_bytes(entry.path):
+        return None
+    number = sealed.position_of(cure.shard) * len(paths) + paths.index(entry.path)
+    array = next(f for _, f in form.schema.fields if f.name == name)
     try:
-        data = place.get(f"{SEALED}/{name}/{chunk_key(fields[name], number)}", entry.size)
+        data = place.get(f"{SEALED}/{name}/{chunk_key(array, number)}", entry.size)
     except InputError:
         return None
-    return data if data is not None and _has_digest(data, entry) else None
+    return data if _has_digest(data, entry) else None
 
 
-def _has_digest(data: bytes, entry: FileEntry) -> bool:
-    return len(data) == entry.size and sha256(data).hexdigest() == entry.sha256
-
-
-def _regenerated(
-    regenerate: RegenerateShard, to_make: Iterable[tuple[Run, int, list[Finding]]], workers: int
-) -> Iterator[tuple[Run, int, list[Finding], Mapping[str, bytes] | str]]:
-    """Yield each shard with its regenerated files, or with the reason why there are none."""
-
-    def make(one: tuple[Run, int, list[Finding]]) -> Mapping[str, bytes] | str:
-        try:
-            return regenerate(one[0], one[1])
-        except InputError as error:
-            return str(error)
-        except Exception as error:  # noqa: BLE001 - a simulator's failure concerns this shard alone
-            return f"Making the shard again failed ({type(error).__name__}: {error})"
-
-    shards = list(to_make)
-    if workers <= 1 or len(shards) <= 1:
-        yield from ((*one, make(one)) for one in shards)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        # Bounds the number of results in memory.
-        for one, files in zip(shards, concurrent_map(pool, workers, make, shards), strict=True):
-            yield (*one, files)
-
-
-def _unlike(findings: Iterable[Finding], files: Mapping[str, bytes]) -> str:
-    """Why regenerated files must not be written, or ""."""
-    for finding in findings:
-        if isinstance(finding.cure, Regenerate):
-            data = files.get(finding.cure.entry.path)
-            if data is None or not _has_digest(data, finding.cure.entry):
-                return "Restore the file from a backup: on this machine the remade shard has other bytes"
-    return ""
-
-
-def _repair_sealed(
-    place: Storage, findings: list[Finding], repaired: Repaired, refused: dict[str, str]
-) -> bool:
-    """Repair the sealed store: at once where one rename does it, else file by file."""
-    roots = {SEALED, f"{SEALED}/{ROOT}"}
-    try:
-        _refuse_fewer_rows(place)
-        if place.folder is not None or any(
-            f.key in roots and isinstance(f.cure, Reseal) and f.cure.data is None for f in findings
-        ):
-            seal(place)
-            repaired.resealed = True
-            return True
-        # The root last: it makes the store readable.
-        for finding in sorted(findings, key=lambda f: f.key in roots):
-            if isinstance(finding.cure, Reseal):
-                _repair_one(place, finding.key, finding.cure)
-                repaired.sealed_files.append(finding.key)
-    except InputError as error:
-        refused[SEALED] = str(error)
-        repaired.left += [_refused(finding, refused) for finding in findings]
-        return False
-    return True
+def _has_digest(data: bytes | None, entry: FileEntry) -> bool:
+    return data is not None and len(data) == entry.size and sha256(data).hexdigest() == entry.sha256
 
 
 def _refuse_fewer_rows(place: Storage) -> None:
@@ -310,7 +270,7 @@ def _refuse_fewer_rows(place: Storage) -> None:
 
 def _repair_one(place: Storage, key: str, cure: Reseal) -> None:
     if cure.source:
-        place.link_or_copy(cure.source, key)
+        place.adopt(place, cure.source, key)
     elif cure.data is not None:
         place.put(key, cure.data)
     else:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from datagen.schemas.checking.finding import Finding, Restore, curable
+from datagen.schemas.checking.finding import Finding, Restore, below, curable
 from datagen.schemas.checking.records import AnyRecord, compare, read, sound
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.lineage import LINEAGE, Lineage
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.root_records import copy_key
+from datagen.schemas.record_files import copy_key, encode_record, refuse_other_format
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FORMAT_VERSION, Commit, Manifest, Merged, Plan, other_value
 from datagen.schemas.storage import Storage
@@ -52,19 +51,10 @@ def open_roots(place: Storage) -> Roots:
             run, found = _open_run(place.below(folder), spec_hash)
         if run is None and not found:
             found = [Finding(_MANIFEST, "record", "missing, as is its copy", "Merge the runs again")]
-        roots.findings += [below(folder + "/", finding) for finding in found]
+        roots.findings += below(f"{folder}/", found)
         if run is not None:
             roots.runs.append(run)
     return roots
-
-
-def below(prefix: str, finding: Finding) -> Finding:
-    """The finding with its key relative to the merged runs, which hold this run in the folder `prefix`."""
-    if not prefix:
-        return finding
-    return Finding(
-        prefix + finding.key, finding.kind, finding.problem, finding.fix, finding.shard, finding.cure
-    )
 
 
 def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
@@ -72,7 +62,7 @@ def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]
     ours, copy = read(place, MERGED, Merged), read(place, copy_key(MERGED), Merged)
     merged = sound(ours, copy)
     if merged is not None:
-        _refuse_other_format(place, MERGED, merged.format_version)
+        refuse_other_format(f"{place.url}/{MERGED}", merged.format_version)
         return merged.parts, compare(ours, copy, fix=_BROKEN_OFF)
     hashes: set[str] = set()
     for folder in sorted({"/".join(f.key.split("/")[:2]) for f in place.list("parts")}):
@@ -95,7 +85,9 @@ def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | Non
     def refuse(manifest: Manifest) -> str:
         if spec_hash not in (None, manifest.spec_hash):
             return "belongs to another run"
-        return _bad_hash(manifest)
+        if manifest.format_version == FORMAT_VERSION and manifest.spec.hash() != manifest.spec_hash:
+            return "spec_hash: is not the hash of the specification in the record"
+        return ""
 
     ours = read(storage, _MANIFEST, Manifest, refuse)
     copy = read(storage, copy_key(_MANIFEST), Manifest, refuse)
@@ -106,28 +98,14 @@ def _open_run(storage: Storage, spec_hash: str | None = None) -> tuple[Run | Non
             return _open_run(storage, named.pop())
     if manifest is None:
         return None, compare(ours, copy)
-    _refuse_other_format(storage, _MANIFEST, manifest.format_version)
+    refuse_other_format(f"{storage.url}/{_MANIFEST}", manifest.format_version)
     return Run(storage, manifest), compare(ours, copy)
 
 
 def _named(storage: Storage) -> set[str]:
-    """The specification hashes in the commits and plans of a run."""
     commits = (read(storage, file.key, Commit).record for file in storage.list("commits"))
     plans = (read(storage, file.key, Plan).record for file in storage.list("plans"))
     return {record.spec_hash for record in (*commits, *plans) if record and record.spec_hash}
-
-
-def _bad_hash(manifest: Manifest) -> str:
-    if manifest.format_version == FORMAT_VERSION and manifest.spec.hash() != manifest.spec_hash:
-        return "spec_hash: is not the hash of the specification in the record"
-    return ""
-
-
-def _refuse_other_format(storage: Storage, key: str, version: int) -> None:
-    if version != FORMAT_VERSION:
-        problem = f"{version}, and this program reads {FORMAT_VERSION}"
-        fix = "Use the version of the program that made the run"
-        raise InputError(f"{storage.url}/{key}", "format_version", problem, fix)
 
 
 def check_plans(run: Run) -> tuple[int, list[Finding]]:
@@ -145,9 +123,9 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
         problem = f"plan {max(numbers)} among {len(numbers)} files"
         return 0, [Finding("plans", "record", problem, "Move it out of the run")]
     for number in range(1, max(numbers) + 1):
-        key = f"plans/{number}.json"
+        key, expected = f"plans/{number}.json", {"spec_hash": run.manifest.spec_hash, "number": number}
         ours, copy = (
-            read(run.storage, k, Plan, lambda plan, number=number: _foreign_plan(run, number, plan))
+            read(run.storage, k, Plan, lambda plan, e=expected: ": ".join(other_value(plan, **e) or ()))
             for k in (key, copy_key(key))
         )
         found, plan = compare(ours, copy), sound(ours, copy)
@@ -163,14 +141,9 @@ def check_plans(run: Run) -> tuple[int, list[Finding]]:
     return n, findings
 
 
-def _foreign_plan(run: Run, number: int, plan: Plan) -> str:
-    return ": ".join(other_value(plan, spec_hash=run.manifest.spec_hash, number=number) or ())
-
-
 def check_notes(storage: Storage) -> Iterator[Finding]:
     """Check records that no row depends on: of jobs, and of the origins of merged shards."""
-    key = LINEAGE
-    lineage, copy = read(storage, key, Lineage), read(storage, copy_key(key), Lineage)
+    lineage, copy = read(storage, LINEAGE, Lineage), read(storage, copy_key(LINEAGE), Lineage)
     if {lineage.problem, copy.problem} != {"missing"}:
         yield from compare(lineage, copy, fix=_BROKEN_OFF)
     fix = "Restore the file from a backup, or remove it: no sample depends on it"

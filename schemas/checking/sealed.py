@@ -7,31 +7,27 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 
+from datagen.schemas.checking.commits import CheckedShard
 from datagen.schemas.checking.finding import Finding, Reseal, curable
 from datagen.schemas.checking.shards import ShardForm, same_json
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import TABLES
 from datagen.schemas.keys import shard_folder
 from datagen.schemas.record_files import MAX_RECORD_BYTES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit
-from datagen.schemas.sealing.contents import MOST_SHARDS, Contents, RowsDigest, SealedRun, SealedShard
+from datagen.schemas.sealing.contents import (
+    MOST_SHARDS,
+    Contents,
+    RowsDigest,
+    SealedRun,
+    SealedShard,
+    with_last,
+)
 from datagen.schemas.sealing.metadata import ROOT, SEALED, SealedRoot, sealed_metadata, sealed_root
-from datagen.schemas.shard_files import TABLES, chunk_key, rows_per_shard
+from datagen.schemas.shard_files import chunk_key, rows_per_shard
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
-
-
-@dataclass(frozen=True)
-class SealedSlice:
-    """The shards of one run that the store names: the position of each, and the cut of the last."""
-
-    n: int
-    missing: tuple[int, ...]
-    positions: Mapping[int, int]  # shard -> its position in the store
-    cut: Mapping[int, tuple[int, int]]  # shard -> (scenes, samples) where it is cut
-
-    def wanted(self, shard: int, run: Run) -> tuple[int, int]:
-        """(scenes, samples) of a shard in the store."""
-        return self.cut.get(shard, (run.layout.scenes_per_shard, run.layout.samples_per_shard))
 
 
 @dataclass
@@ -43,14 +39,15 @@ class SealedTally:
     lost: int = 0  # shards without a commit
     unknown: int = 0  # shards without any file
 
-    def add(self, run: Run, slice_: SealedSlice, shard: int, commit: Commit | None, known: bool) -> None:
-        """Count one shard of the store; `known` where it has files but no commit."""
-        if commit is None:
-            self.lost, self.unknown = self.lost + known, self.unknown + (not known)
+    def add(self, sealed: SealedRun, looked: CheckedShard) -> None:
+        """Count one shard of the store; without a commit it has findings where it has files."""
+        if looked.commit is None:
+            has_files = bool(looked.findings)
+            self.lost, self.unknown = self.lost + has_files, self.unknown + (not has_files)
             return
-        scenes, samples = slice_.wanted(shard, run)
-        self.shards.append(SealedShard(shard_folder(shard, commit.attempt), scenes, samples))
-        self.digest.add(run.manifest.spec_hash, commit)
+        folder = shard_folder(looked.shard, looked.commit.attempt)
+        self.shards.append(SealedShard(folder, *sealed.rows_of(looked.shard)))
+        self.digest.add(sealed.run.manifest.spec_hash, looked.commit)
 
 
 def read_root(
@@ -71,7 +68,7 @@ def read_root(
             return None, [curable(key, "sealed", "missing, or without the list of its shards", Reseal())]
         return None, []
     told = {part.spec_hash: part.n for part in root.parts}
-    if told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
+    if not told or told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
         problem = "names rows that no plan wants"
         return None, [curable(key, "sealed", problem, Reseal())]
     layouts = {run.manifest.spec_hash: run.layout for run in runs}
@@ -82,53 +79,39 @@ def read_root(
     return root, []
 
 
-def slices_of(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedSlice]:
-    """The shards of each run in the store, by specification hash."""
-    found: dict[str, SealedSlice] = {}
+def runs_named(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedRun]:
+    """The runs that the store names, with their shards in it, by specification hash."""
+    found: list[SealedRun] = []
     before = 0
-    last: tuple[str, int] | None = None
-    held: dict[str, tuple[Run, int, tuple[int, ...], dict[int, int]]] = {}
     for run in runs:
-        part = root.part(run.manifest.spec_hash)
-        if part is None:
+        if (part := root.part(run.manifest.spec_hash)) is None:
             continue
-        missing = set(part.missing_shards)
-        shards = [k for k in range(run.layout.shards_for(part.n)) if k not in missing]
-        positions = {shard: before + i for i, shard in enumerate(shards)}
-        before += len(shards)
-        held[run.manifest.spec_hash] = (run, part.n, tuple(sorted(missing)), positions)
-        if shards:
-            last = run.manifest.spec_hash, shards[-1]
-    for spec_hash, (run, n, missing, positions) in held.items():
-        cut: dict[int, tuple[int, int]] = {}
-        if last is not None and last[0] == spec_hash:
-            cut[last[1]] = run.layout.rows_wanted(last[1], n)
-        found[spec_hash] = SealedSlice(n, missing, positions, cut)
-    return found
+        planned = range(run.layout.shards_for(part.n))
+        missing = ShardRanges.of(k for k in part.missing_shards if k in planned)
+        held = ShardRanges.of(planned).without(missing)
+        found.append(SealedRun(run, part.n, held, missing, before))
+        before += len(found[-1].shards)
+    return {part.run.manifest.spec_hash: part for part in with_last(found)}
 
 
 def check_chunks(
-    place: Storage, prefix: str, run: Run, form: ShardForm, slice_: SealedSlice, commit: Commit
+    place: Storage, prefix: str, form: ShardForm, sealed: SealedRun, commit: Commit
 ) -> Iterator[Finding]:
     """Check the store's chunks of one shard: links to its files, or equal bytes."""
     folder = f"{prefix}{shard_folder(commit.shard, commit.attempt)}"
     entries = {entry.path: entry for entry in commit.files}
-    wanted = dict(zip(TABLES, slice_.wanted(commit.shard, run), strict=True))
-    for table in TABLES:
-        rows = rows_per_shard(run.layout, table)
-        for array in form.schema.table(table):
-            paths = form.chunks[array.name]
-            step = rows // len(paths)
-            for i in range(-(-wanted[table] // step)):
-                number = slice_.positions[commit.shard] * len(paths) + i
-                key = f"{SEALED}/{array.name}/{chunk_key(array, number)}"
-                entry = entries.get(paths[i])
-                if entry is None or _is_link(place, key, f"{folder}/{entry.path}"):
-                    continue
-                most = min(entry.size, form.most_bytes(paths[i]))
-                if problem := _other_bytes(place, key, most, entry.sha256):
-                    cure = Reseal(source=f"{folder}/{entry.path}")
-                    yield curable(key, "sealed", problem, cure, commit.shard)
+    wanted = dict(zip(TABLES, sealed.rows_of(commit.shard), strict=True))
+    position = sealed.position_of(commit.shard)
+    for table, array in form.schema.fields:
+        paths = form.chunks[array.name]
+        step = rows_per_shard(sealed.run.layout, table) // len(paths)
+        for i, path in enumerate(paths[: -(-wanted[table] // step)]):
+            key = f"{SEALED}/{array.name}/{chunk_key(array, position * len(paths) + i)}"
+            entry = entries.get(path)
+            if entry is None or _is_link(place, key, f"{folder}/{path}"):
+                continue
+            if problem := _other_bytes(place, key, min(entry.size, form.most_bytes(path)), entry.sha256):
+                yield curable(key, "sealed", problem, Reseal(source=f"{folder}/{path}"), commit.shard)
 
 
 def _is_link(place: Storage, key: str, source: str) -> bool:
@@ -155,7 +138,7 @@ def check_store(
     place: Storage,
     runs: list[Run],
     wanted: Mapping[str, int],
-    slices: Mapping[str, SealedSlice],
+    sealed: Mapping[str, SealedRun],
     tally: SealedTally,
 ) -> Iterator[Finding]:
     """Check the store's metadata, extra files, and whether it is outdated."""
@@ -168,14 +151,9 @@ def check_store(
         yield Finding(SEALED, "sealed", problem, fix)
     if tally.unknown or tally.lost:
         return
-    sealed = tuple(
-        SealedRun(run, part.n, tuple(part.positions), part.missing)
-        for run in runs
-        if (part := slices.get(run.manifest.spec_hash)) is not None
-    )
-    first = sealed[0].run
-    digests = (tally.digest.hexdigest(),)
-    contents = Contents(place, sealed, tuple(tally.shards), digests, first.schema, first.layout)
+    parts = tuple(sealed.values())
+    first, digests = parts[0].run, (tally.digest.hexdigest(),)
+    contents = Contents(place, parts, tuple(tally.shards), digests, first.schema, first.layout)
     older = sealed_metadata(contents, for_readers=False)
     for path, data in sealed_metadata(contents).items():
         key = f"{SEALED}/{path}"
@@ -189,25 +167,21 @@ def check_store(
         if problem:
             yield curable(key, "sealed", problem, Reseal(data=data))
     yield from _foreign_files(contents)
-    if any(_is_behind(run, wanted[run.manifest.spec_hash], slices) for run in runs):
+    if any(_is_behind(run, wanted[run.manifest.spec_hash], sealed) for run in runs):
         fix = "Run datagen seal to update it; nothing is damaged"
         yield Finding(SEALED, "stale", "is older than the committed shards", fix)
 
 
-def _is_behind(run: Run, n: int, slices: Mapping[str, SealedSlice]) -> bool:
-    part = slices.get(run.manifest.spec_hash)
-    return part is None or part.n != n or bool(run.committed() & set(part.missing))
+def _is_behind(run: Run, n: int, sealed: Mapping[str, SealedRun]) -> bool:
+    part = sealed.get(run.manifest.spec_hash)
+    return part is None or part.n != n or any(k in part.missing_shards for k in run.committed())
 
 
 def _foreign_files(contents: Contents) -> Iterator[Finding]:
-    known = {f"{SEALED}/{ROOT}"}
-    counts: dict[str, int] = {}
-    fields = {f.name: f for table in TABLES for f in contents.schema.table(table)}
-    for table in TABLES:
-        for array in contents.schema.table(table):
-            known.add(f"{SEALED}/{array.name}/zarr.json")
-            # Only the last shard is cut, so chunks are numbered without gaps.
-            counts[array.name] = sum(1 for _ in contents.chunks(array))
+    fields = {f.name: f for _, f in contents.schema.fields}
+    known = {f"{SEALED}/{ROOT}", *(f"{SEALED}/{name}/{ROOT}" for name in fields)}
+    # Only the last shard is cut, so chunks are numbered without gaps.
+    counts = {name: sum(1 for _ in contents.chunks(field)) for name, field in fields.items()}
     for file in contents.place.list(SEALED):
         if file.key in known:
             continue
@@ -215,5 +189,4 @@ def _foreign_files(contents: Contents) -> Iterator[Finding]:
         number = names[2].split(".")[1] if len(names) == 3 and names[2].startswith("c.") else ""
         array = fields.get(names[1]) if number.isascii() and number.isdigit() and len(number) < 16 else None
         if array is None or names[2] != chunk_key(array, int(number)) or int(number) >= counts[array.name]:
-            problem = "is not a file of the sealed store"
-            yield curable(file.key, "sealed", problem, Reseal())
+            yield curable(file.key, "sealed", "is not a file of the sealed store", Reseal())

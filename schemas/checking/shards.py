@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import Any
 
@@ -19,14 +19,7 @@ from datagen.schemas.keys import commit_key, shard_folder
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, FileEntry
-from datagen.schemas.shard_files import (
-    MAX_TEXT_BYTES,
-    TABLES,
-    chunk_key,
-    chunk_rows,
-    group_metadata,
-    rows_per_shard,
-)
+from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_paths, group_metadata, rows_per_shard
 from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from datagen.schemas.storage import StoredFile
 
@@ -45,7 +38,6 @@ class ShardForm:
     arrays: Mapping[str, StoredArray]
 
     def most_bytes(self, path: str) -> int:
-        """An upper bound of the size of a file."""
         array = self.arrays.get(path.split("/")[0])
         if array is None or path in self.metadata:
             return MAX_META_BYTES
@@ -55,7 +47,6 @@ class ShardForm:
 
     @property
     def paths(self) -> frozenset[str]:
-        """Every file of a shard."""
         return frozenset((*self.metadata, *(path for paths in self.chunks.values() for path in paths)))
 
 
@@ -63,103 +54,87 @@ def form_of(run: Run) -> ShardForm:
     """The required form of this run's shards."""
     schema, layout = run.schema, run.layout
     metadata = group_metadata(schema, layout, run.manifest.spec_hash)
-    chunks: dict[str, tuple[str, ...]] = {}
-    arrays: dict[str, StoredArray] = {}
-    for table in TABLES:
-        rows = rows_per_shard(layout, table)
-        for field in schema.table(table):
-            count = rows // chunk_rows(schema, field, rows)
-            chunks[field.name] = tuple(f"{field.name}/{chunk_key(field, i)}" for i in range(count))
-            path = f"{field.name}/zarr.json"
-            arrays[field.name] = parse_metadata(path, field.name, metadata[path])
+    chunks = {f.name: chunk_paths(schema, layout, table, f) for table, f in schema.fields}
+    paths = {name: f"{name}/zarr.json" for name in chunks}
+    arrays = {name: parse_metadata(path, name, metadata[path]) for name, path in paths.items()}
     return ShardForm(schema, metadata, chunks, arrays)
 
 
-def check_shard(
-    run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, StoredFile]
-) -> Iterator[Finding]:
+def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, StoredFile]) -> list[Finding]:
     """Check every file of a committed shard against its entry, and the rows against the schema.
 
-    `listed` are the files below the shard's folder; drafts of killed writers (.part) are left to `gc`. Holds
-    at most one shard's arrays in memory.
+    `listed` are the files below the attempt's folder; drafts of killed writers (.part) are left to `gc`.
+    Holds at most one shard's arrays in memory.
     """
-    folder = shard_folder(commit.shard, commit.attempt)
+    folder, shard = shard_folder(commit.shard, commit.attempt), commit.shard
     entries = {entry.path: entry for entry in commit.files}
+    findings: list[Finding] = []
     if odd := sorted(form.paths ^ entries.keys()):
         problem = f"files: {len(odd)} missing or extra, first {odd[0]}"
-        yield Finding(commit_key(commit.shard), "rows", problem, _WRITTEN_SO, commit.shard)
+        findings.append(Finding(commit_key(shard), "rows", problem, _WRITTEN_SO, shard))
+    known = {f"{folder}/{path}" for path in ("commit.json", *entries)}
     for key in listed:
-        path = key.removeprefix(f"{folder}/")
-        if path != key and path not in entries and path != "commit.json" and not path.endswith(".part"):
+        if key not in known and not key.endswith(".part"):
             problem = "is in a committed attempt's folder, but in no record"
-            yield Finding(key, "foreign", problem, "Move it out of the run: nothing reads it", commit.shard)
+            findings.append(
+                Finding(key, "foreign", problem, "Move it out of the run: nothing reads it", shard)
+            )
+
+    def read(paths: Iterable[str]) -> dict[str, bytes]:
+        """The bytes of committed files; missing and changed ones become findings."""
+        found: dict[str, bytes] = {}
+        for path in paths:
+            if path in entries:
+                data, finding = _bytes_of(run, form, commit, entries[path], listed.get(f"{folder}/{path}"))
+                findings.extend([finding] if finding else [])
+                found |= {} if data is None else {path: data}
+        return found
+
+    for path, data in read(form.metadata).items():
+        if not same_json(data, form.metadata[path]):
+            problem = "differs from the metadata of the schema"
+            findings.append(Finding(f"{folder}/{path}", "rows", problem, _WRITTEN_SO, shard))
     kept: dict[str, Array] = {}
     whole = True
-    if "zarr.json" in entries:
-        data, findings = _bytes_of(run, form, commit, entries["zarr.json"], listed)
-        yield from findings
-        yield from _check_metadata(form, folder, "zarr.json", data, commit.shard)
-    for table in TABLES:
-        for field in form.schema.table(table):
-            names = (f"{field.name}/zarr.json", *form.chunks[field.name])
-            read: dict[str, bytes] = {}
-            for path in names:
-                if path in entries:
-                    data, findings = _bytes_of(run, form, commit, entries[path], listed)
-                    yield from findings
-                    if data is not None:
-                        read[path] = data
-            yield from _check_metadata(form, folder, names[0], read.pop(names[0], None), commit.shard)
-            if len(read) != len(names) - 1:
-                whole = False
-                continue
-            values, problem = _decode(run, form, table, field, list(read.values()))
-            if problem:
-                whole = False
-                yield Finding(f"{folder}/{field.name}", "rows", problem, _WRITTEN_SO, commit.shard)
-            elif values is not None and field.name in _KEYS:
-                kept[field.name] = values
+    for table, field in form.schema.fields:
+        paths = form.chunks[field.name]
+        chunks = read(paths)
+        values, problem = None, ""
+        if len(chunks) == len(paths):
+            values, problem = _decode(run, form, table, field, list(chunks.values()))
+        if problem:
+            findings.append(Finding(f"{folder}/{field.name}", "rows", problem, _WRITTEN_SO, shard))
+        if values is None:
+            whole = False
+        elif field.name in _KEYS:
+            kept[field.name] = values
     if whole:
         for name, problem in _row_problems(run, commit, kept):
-            yield Finding(f"{folder}/{name}", "rows", problem, _WRITTEN_SO, commit.shard)
+            findings.append(Finding(f"{folder}/{name}", "rows", problem, _WRITTEN_SO, shard))
+    return findings
 
 
 def _bytes_of(
-    run: Run, form: ShardForm, commit: Commit, entry: FileEntry, listed: Mapping[str, StoredFile]
-) -> tuple[bytes | None, list[Finding]]:
-    """A file's bytes where they are the committed ones, or the problem."""
+    run: Run, form: ShardForm, commit: Commit, entry: FileEntry, there: StoredFile | None
+) -> tuple[bytes | None, Finding | None]:
+    """A file's bytes where they are the committed ones, or the finding."""
     key = f"{shard_folder(commit.shard, commit.attempt)}/{entry.path}"
-    there = listed.get(key)
-    data, problem = None, ""
     if entry.size > form.most_bytes(entry.path):
         problem = f"has {entry.size} bytes by its commit, more than such a file can have"
-        return None, [Finding(key, "rows", problem, _WRITTEN_SO, commit.shard)]
-    if there is None:
-        problem = "missing"
-    elif there.size != entry.size:
+        return None, Finding(key, "rows", problem, _WRITTEN_SO, commit.shard)
+    data, problem = None, "missing"
+    if there is not None and there.size != entry.size:
         problem = f"has {there.size} bytes, but {entry.size} were committed"
-    else:
+    elif there is not None:
         try:
             data = run.storage.get(key, entry.size)
         except InputError as error:
             problem = error.problem
-        else:
-            if data is None:
-                problem = "missing"
-            elif sha256(data).hexdigest() != entry.sha256:
-                data, problem = None, "sha256: differs from the committed bytes"
-    if not problem:
-        return data, []
-    return None, [curable(key, "file", problem, Regenerate(run, commit.shard, entry), commit.shard)]
-
-
-def _check_metadata(
-    form: ShardForm, folder: str, path: str, data: bytes | None, shard: int
-) -> Iterator[Finding]:
-    if data is None or same_json(data, form.metadata.get(path, b"")):
-        return
-    problem = "differs from the metadata of the schema"
-    yield Finding(f"{folder}/{path}", "rows", problem, _WRITTEN_SO, shard)
+    if data is not None:
+        if sha256(data).hexdigest() == entry.sha256:
+            return data, None
+        problem = "sha256: differs from the committed bytes"
+    return None, curable(key, "file", problem, Regenerate(run, commit.shard, entry), commit.shard)
 
 
 def same_json(data: bytes, wanted: bytes) -> bool:
@@ -177,7 +152,7 @@ def _decode(
 ) -> tuple[Array | None, str]:
     """An array of the shard, checked for dtype, shape and range; or the problem."""
     rows = rows_per_shard(run.layout, table)
-    alone = RecordSchema(form.schema.name, form.schema.version, (field,), (field,), form.schema.sizes)
+    alone = replace(form.schema, scene_fields=(field,), sample_fields=(field,))
     try:
         parts = [decode_chunk(field.name, form.arrays[field.name], data) for data in chunks]
         values = parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -12,8 +12,7 @@ from datagen.schemas.merged_runs import label_counts, open_runs
 from datagen.schemas.merging.plan import Union, plan_union, refuse_incompatible
 from datagen.schemas.merging.resharding import common_layout
 from datagen.schemas.merging.writing import WrittenUnion, begin_union, replace_record, write_union
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
-from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record, refuse_foreign
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, Merged
 from datagen.schemas.sealing import SEALED, seal, sealed_metadata
@@ -61,8 +60,9 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
     if not places:
         raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
     place = _place(out)
-    existing = open_runs(place) if place is not None and _holds_runs(place) else []
-    sources = _distinct([run for place in places for run in open_runs(place)])
+    has_runs = place is not None and any(map(place.exists, ("manifest.json", MERGED)))
+    existing = open_runs(place) if place is not None and has_runs else []
+    sources = list({_identity(run.storage): run for path in places for run in open_runs(path)}.values())
     refuse_incompatible(sources)
     if existing:
         refuse_incompatible([existing[0], *sources])
@@ -122,14 +122,6 @@ def _place(out: str) -> Storage | None:
         if e.problem == "no such folder":
             return None
         raise
-
-
-def _holds_runs(place: Storage) -> bool:
-    return place.exists("manifest.json") or place.exists(MERGED)
-
-
-def _distinct(runs: Sequence[Run]) -> list[Run]:
-    return list({_identity(run.storage): run for run in runs}.values())
 
 
 def _identity(storage: Storage) -> str:

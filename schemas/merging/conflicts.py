@@ -23,13 +23,9 @@ def refuse_different_rows(one: Run, shard_one: int, other: Run, shard_other: int
     It names both runs, the shard, the first differing file and the first differing sample. InputError also
     for a damaged file.
     """
-    first = max(
-        run.layout.scenes_per_shard * shard for run, shard in ((one, shard_one), (other, shard_other))
-    )
-    end = min(
-        run.layout.scenes_per_shard * (shard + 1) for run, shard in ((one, shard_one), (other, shard_other))
-    )
-    scenes = range(first, end)
+    size, size_other = one.layout.scenes_per_shard, other.layout.scenes_per_shard
+    first = max(size * shard_one, size_other * shard_other)
+    scenes = range(first, min(size * (shard_one + 1), size_other * (shard_other + 1)))
     for ours, theirs in zip(read_scenes(one, scenes), read_scenes(other, scenes), strict=True):
         found = _first_difference(one.schema, ours, theirs)
         if found is None:

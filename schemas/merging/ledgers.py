@@ -6,29 +6,16 @@ with them, each piece with its share of the cost; unsuccessful ones are kept who
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Container
 from dataclasses import dataclass
-from itertools import islice
 
-from datagen.schemas.keys import commit_key
-from datagen.schemas.ledger import LOST_CAUSE, end_from_commit, end_key, lost_end, start_key
+from datagen.schemas.ledger import LOST_CAUSE, end_from_commit, lost_end
 from datagen.schemas.merging.plan import Holding, Union
-from datagen.schemas.record_files import MAX_RECORD_BYTES, Record, decode_record, encode_record
-from datagen.schemas.run_records import AttemptStart, Commit, LedgerEntry
-from datagen.schemas.storage import Storage
+from datagen.schemas.record_files import encode_record
+from datagen.schemas.run_records import AttemptStart, LedgerEntry
 
 SPARE_CAUSE = "merged: this shard is kept from another attempt"
 GUESS_CAUSE = f"merged: {LOST_CAUSE}"  # of a guess made here, which a recorded one replaces
-_AT_ONCE = 256  # attempts whose records are in memory
-
-
-@dataclass(frozen=True)
-class UnitedAttempt:
-    """The records of one attempt in the union; `end` is None while it has not ended."""
-
-    name: str
-    start: AttemptStart | None
-    end: LedgerEntry | None
 
 
 @dataclass(frozen=True)
@@ -40,28 +27,43 @@ class _NamedAttempt:
     piece: int | None  # shard of the union; None for the whole attempt
 
 
-def united_attempts(union: Union, given_up: Container[int] = ()) -> Iterator[UnitedAttempt]:
-    """Yield every attempt of the union in order of names; records are read some hundreds at a time.
+class UnitedLedger:
+    """The ledger of a union, whose attempts have `names`.
 
     An attempt without an end is lost, with unknown cost, where its shard is kept or in `given_up`.
     """
-    spare = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
-    kept = {holding.name: holding for holding in union.kept.values()}
-    places = _places(union)
-    names = iter(sorted(places))
-    while some := list(islice(names, _AT_ONCE)):
-        held = {name: kept.get(name) or spare.get(name) for name in some}
-        records = _Records(union, [place for name in some for place in places[name]], held.values())
-        for name in some:
-            starts, ends = records.starts(name, places[name]), records.ends(name, places[name])
-            start = min(starts, key=encode_record) if starts else None
-            if (holding := held[name]) is not None:
-                end = _end_of_held(union, holding, records.commit_of(holding), start, ends, name in kept)
-                yield UnitedAttempt(name, start, end)
-                continue
-            if start is not None and not ends and (start.shard in union.kept or start.shard in given_up):
-                ends.append(lost_end(start, cause=GUESS_CAUSE))
-            yield UnitedAttempt(name, start, min(ends, key=_account_first) if ends else None)
+
+    def __init__(self, union: Union, given_up: Container[int]) -> None:
+        self._union, self._given_up = union, given_up
+        self._kept = {holding.name: holding for holding in union.kept.values()}
+        self._spare = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
+        self._places = _places(union)
+        self.names = sorted(self._places)
+
+    def records(self, name: str) -> tuple[AttemptStart | None, LedgerEntry | None]:
+        """Read the start and the end of an attempt; None for one that is missing in every source."""
+        union = self._union
+        starts: list[AttemptStart] = []
+        ends: list[LedgerEntry] = []
+        for place in self._places[name]:
+            ledger, cut = union.runs[place.source].ledger, union.cut(place.source)
+            start, end = ledger.start_of(place.attempt), ledger.end_of(place.attempt)
+            if start is not None:
+                shard = cut.first(start.shard) if place.piece is None else place.piece
+                starts.append(start.model_copy(update={"attempt": name, "shard": shard}))
+            if end is not None:
+                shard = cut.first(end.shard) if place.piece is None else place.piece
+                cost = (
+                    end.cost if place.piece is None or end.cost is None else cut.cost(end.cost, place.piece)
+                )
+                ends.append(end.model_copy(update={"attempt": name, "shard": shard, "cost": cost}))
+        start = min(starts, key=encode_record) if starts else None
+        held = self._kept.get(name) or self._spare.get(name)
+        if held is not None:
+            return start, _end_of_held(union, held, start, ends, name in self._kept)
+        if start is not None and not ends and (start.shard in union.kept or start.shard in self._given_up):
+            ends.append(lost_end(start, cause=GUESS_CAUSE))
+        return start, min(ends, key=_account_first) if ends else None
 
 
 def _places(union: Union) -> dict[str, list[_NamedAttempt]]:
@@ -84,80 +86,11 @@ def _places(union: Union) -> dict[str, list[_NamedAttempt]]:
     return found
 
 
-class _Records:
-    """Records of some attempts in the sources, and their commits."""
-
-    def __init__(
-        self, union: Union, places: Iterable[_NamedAttempt], holdings: Iterable[Holding | None]
-    ) -> None:
-        self._union = union
-        self._starts: dict[tuple[int, str], AttemptStart] = {}
-        self._ends: dict[tuple[int, str], LedgerEntry] = {}
-        self._commits: dict[tuple[int, int], Commit] = {}
-        named, made = sorted({(p.source, p.attempt) for p in places}), {h for h in holdings if h is not None}
-        for source, run in enumerate(union.runs):
-            attempts = [attempt for of, attempt in named if of == source]
-            for attempt, start in _read(run.storage, attempts, start_key, AttemptStart):
-                self._starts[source, attempt] = start
-            for attempt, end in _read(run.storage, attempts, end_key, LedgerEntry):
-                self._ends[source, attempt] = end
-            shards = sorted({holding.of for holding in made if holding.source == source})
-            found = run.storage.get_many(map(commit_key, shards), MAX_RECORD_BYTES)
-            for shard, (_, data) in zip(shards, found, strict=True):
-                if data is not None:
-                    self._commits[source, shard] = run.decode_commit(shard, data)
-
-    def commit_of(self, holding: Holding) -> Commit:
-        """The source's commit of a holding. InputError where it was removed meanwhile."""
-        found = self._commits.get((holding.source, holding.of))
-        return self._union.commit_of(holding) if found is None else found
-
-    def starts(self, name: str, places: Iterable[_NamedAttempt]) -> list[AttemptStart]:
-        """The start record of an attempt from the sources, with the union's name and shard number."""
-        found: list[AttemptStart] = []
-        for place in places:
-            start = self._starts.get((place.source, place.attempt))
-            if start is not None:
-                shard = place.piece
-                if shard is None:
-                    shard = self._union.cut(place.source).first(start.shard)
-                found.append(start.model_copy(update={"attempt": name, "shard": shard}))
-        return found
-
-    def ends(self, name: str, places: Iterable[_NamedAttempt]) -> list[LedgerEntry]:
-        """The end record of an attempt from the sources, with the union's name and shard number."""
-        found: list[LedgerEntry] = []
-        for place in places:
-            end = self._ends.get((place.source, place.attempt))
-            if end is None:
-                continue
-            cut, shard, cost = self._union.cut(place.source), place.piece, end.cost
-            if shard is None:
-                shard = cut.first(end.shard)
-            elif cost is not None:
-                cost = cut.cost(cost, shard)
-            found.append(end.model_copy(update={"attempt": name, "shard": shard, "cost": cost}))
-        return found
-
-
-def _read(
-    storage: Storage, attempts: Sequence[str], key_of: Callable[[str], str], model: type[Record]
-) -> Iterator[tuple[str, Record]]:
-    found = storage.get_many(map(key_of, attempts), MAX_RECORD_BYTES)
-    for attempt, (key, data) in zip(attempts, found, strict=True):
-        if data is not None:
-            yield attempt, decode_record(f"{storage.url}/{key}", data, model)
-
-
 def _end_of_held(
-    union: Union,
-    holding: Holding,
-    commit: Commit,
-    start: AttemptStart | None,
-    ends: list[LedgerEntry],
-    is_kept: bool,
+    union: Union, holding: Holding, start: AttemptStart | None, ends: list[LedgerEntry], is_kept: bool
 ) -> LedgerEntry:
     """The end record of an attempt that made a shard, with its commit's cost, also without a ledger entry."""
+    commit = union.commit_of(holding)
     truth = {
         "outcome": "committed" if is_kept else "superseded",
         "cause": "" if is_kept else SPARE_CAUSE,

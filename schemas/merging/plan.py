@@ -81,7 +81,6 @@ class Union:
 
     @property
     def layout(self) -> Layout:
-        """The layout of the union."""
         return self.manifest.layout
 
     def cut(self, source: int) -> Cut:
@@ -89,11 +88,9 @@ class Union:
         return Cut(self.runs[source].layout.scenes_per_shard, self.layout.scenes_per_shard)
 
     def commit_of(self, holding: Holding) -> Commit:
-        """The source's commit of a holding."""
         return self.runs[holding.source].commit_of(holding.of)
 
     def cost_of(self, holding: Holding, commit: Commit) -> Cost:
-        """A holding's cost, from its source's commit."""
         return self.cut(holding.source).cost(commit.cost, holding.shard)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 
@@ -61,19 +61,13 @@ class Cut:
         def seconds(value: float) -> float:
             return _share(round(value * _NS), self.scenes, offset, self.into) / _NS
 
-        def by_stage(values: Mapping[str, float]) -> dict[str, float]:
-            return {stage: seconds(value) for stage, value in values.items()}
-
-        return Cost(
-            wall_s=seconds(cost.wall_s),
-            cpu_s=seconds(cost.cpu_s),
-            stage_wall_s=by_stage(cost.stage_wall_s),
-            stage_cpu_s=by_stage(cost.stage_cpu_s),
-            stage_gpu_s=by_stage(cost.stage_gpu_s),
-            source_s={clock: seconds(value) for clock, value in cost.source_s.items()},
-            peak_rss_bytes=cost.peak_rss_bytes,
-            written_bytes=_share(cost.written_bytes, self.scenes, offset, self.into),
-        )
+        by_name = {
+            field: {name: seconds(value) for name, value in getattr(cost, field).items()}
+            for field in ("stage_wall_s", "stage_cpu_s", "stage_gpu_s", "source_s")
+        }
+        written = _share(cost.written_bytes, self.scenes, offset, self.into)
+        whole = {"wall_s": seconds(cost.wall_s), "cpu_s": seconds(cost.cpu_s), "written_bytes": written}
+        return cost.model_copy(update=whole | by_name)
 
 
 def base_name(attempt: str) -> str:

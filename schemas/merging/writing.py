@@ -13,11 +13,10 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.keys import shard_folder
 from datagen.schemas.ledger import end_key, start_key
 from datagen.schemas.lineage import LINEAGE, Origins, ShardOrigin, encode_lineage
-from datagen.schemas.merging.ledgers import UnitedAttempt, united_attempts
+from datagen.schemas.merging.ledgers import UnitedLedger
 from datagen.schemas.merging.plan import Holding, Union
 from datagen.schemas.outcomes import REDRAW_CAUSES
-from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
-from datagen.schemas.root_records import copy_key, publish
+from datagen.schemas.record_files import MAX_RECORD_BYTES, copy_key, encode_record, publish
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, QuarantineRecord
 from datagen.schemas.scene_rows import read_shard
@@ -88,9 +87,13 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUni
 def replace_record(storage: Storage, key: str, record: bytes) -> None:
     """Write a record that may change, its copy first; unchanged ones are not written."""
     for name in (copy_key(key), key):
-        if storage.get(name, MAX_RECORD_BYTES) != record:
-            storage.put(name, record)
-            storage.sync([name])
+        _replace(storage, name, record)
+
+
+def _replace(storage: Storage, key: str, record: bytes) -> None:
+    if storage.get(key, MAX_RECORD_BYTES) != record:
+        storage.put(key, record)
+        storage.sync([key])
 
 
 def _link(union: Union, run: Run, holding: Holding) -> bool:
@@ -145,7 +148,6 @@ def _is_lost(run: Run, holding: Holding) -> bool:
 
 
 def _without(union: Union, lost: Iterable[Holding]) -> Union:
-    """The union after other processes committed some of its shards."""
     kept, spare = dict(union.kept), dict(union.spare)
     for holding in lost:
         spare[holding.shard] = (*spare.get(holding.shard, ()), kept.pop(holding.shard))
@@ -154,25 +156,21 @@ def _without(union: Union, lost: Iterable[Holding]) -> Union:
 
 def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) -> int:
     there = {file.key for file in run.storage.list("ledger")}
+    ledger = UnitedLedger(union, given_up)
 
-    def put(attempt: UnitedAttempt) -> None:
-        for key, record in ((start_key(attempt.name), attempt.start), (end_key(attempt.name), attempt.end)):
-            if record is not None:
-                _put(run.storage, key, encode_record(record), key in there)
+    def write(name: str) -> None:
+        for key, record in zip((start_key(name), end_key(name)), ledger.records(name), strict=True):
+            if record is not None and key in there:
+                _replace(run.storage, key, encode_record(record))  # it may have less information
+            elif record is not None:
+                run.storage.put_new(key, encode_record(record))
 
-    count = 0
-    for _ in run.storage.concurrent_map(put, united_attempts(union, given_up)):
-        count += 1
+    storages = [run.storage, *(source.storage for source in union.runs)]
+    # Several at once where any of them is remote.
+    storage = next((one for one in storages if one.folder is None), run.storage)
+    for _ in storage.concurrent_map(write, ledger.names):
         tick()
-    return count
-
-
-def _put(storage: Storage, key: str, record: bytes, is_there: bool) -> None:
-    if not is_there:
-        storage.put_new(key, record)
-    elif storage.get(key, MAX_RECORD_BYTES) != record:  # the existing record has less information
-        storage.put(key, record)
-        storage.sync([key])
+    return len(ledger.names)
 
 
 def _given_up(union: Union) -> dict[int, QuarantineRecord]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from hashlib import sha256
+from itertools import chain
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field, RecordSchema, Table
@@ -12,7 +13,7 @@ from datagen.schemas.keys import part_folder, shard_folder
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Commit, Layout
-from datagen.schemas.shard_files import TABLES, chunk_key, chunk_rows, group_metadata, rows_per_shard
+from datagen.schemas.shard_files import chunk_key, chunk_paths, group_metadata, rows_per_shard
 from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.storage import Storage
 
@@ -31,14 +32,26 @@ class SealedShard:
     samples: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SealedRun:
     """The shards of one run in the store. `n` is read once: the run may grow meanwhile."""
 
     run: Run
     n: int
-    shards: tuple[int, ...]
-    missing_shards: tuple[int, ...]
+    shards: ShardRanges
+    missing_shards: ShardRanges
+    first: int  # position of its first shard in the store
+    is_last: bool = False  # its last shard is the store's, and cut to n
+
+    def position_of(self, shard: int) -> int:
+        return self.first + self.shards.position_of(shard)
+
+    def rows_of(self, shard: int) -> tuple[int, int]:
+        """(scenes, samples) of a shard in the store."""
+        layout = self.run.layout
+        if self.is_last and shard == self.shards[-1]:
+            return layout.rows_wanted(shard, self.n)
+        return layout.scenes_per_shard, layout.samples_per_shard
 
 
 class RowsDigest:
@@ -54,7 +67,6 @@ class RowsDigest:
             self._digest.update(f"{entry.path} {entry.sha256}\n".encode())
 
     def hexdigest(self) -> str:
-        """The digest so far."""
         return self._digest.hexdigest()
 
 
@@ -71,23 +83,20 @@ class Contents:
 
     @property
     def is_merged(self) -> bool:
-        """Whether the store has several runs."""
         return len(self.runs) > 1
 
     def rows(self, table: Table) -> int:
-        """Rows of a table in the whole store."""
         return sum(shard.scenes if table == "scene" else shard.samples for shard in self.shards)
 
     def chunks(self, field: Field) -> Iterator[tuple[int, str, str]]:
         """Yield every chunk of an array: (position of its shard, key of its file, file name in the store)."""
         table: Table = "scene" if field in self.schema.scene_fields else "sample"
-        rows = rows_per_shard(self.layout, table)
-        step = chunk_rows(self.schema, field, rows)
+        paths = chunk_paths(self.schema, self.layout, table, field)
+        step = rows_per_shard(self.layout, table) // len(paths)
         for position, shard in enumerate(self.shards):
             wanted = shard.scenes if table == "scene" else shard.samples
-            for i in range(-(-wanted // step)):
-                source = f"{shard.folder}/{field.name}/{chunk_key(field, i)}"
-                yield position, source, chunk_key(field, position * (rows // step) + i)
+            for i, path in enumerate(paths[: -(-wanted // step)]):
+                yield position, f"{shard.folder}/{path}", chunk_key(field, position * len(paths) + i)
 
 
 def read_contents(place: Storage, check: bool = True) -> Contents:
@@ -104,34 +113,41 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
     for run in runs[1:]:
         _refuse_other_arrays(first, run)
     sealed: list[SealedRun] = []
-    shards: list[SealedShard] = []
+    folders: list[tuple[int, str]] = []
     digest = RowsDigest()
     digests = [digest.hexdigest()]
     for run in runs:
-        n, done = run.n, list[int]()
+        n, first_position = run.n, len(folders)
         below = f"{part_folder(run.manifest.spec_hash)}/" if len(runs) > 1 else ""
         expected = _files_of_a_shard(run)
         planned = (commit for commit in run.commits() if commit.shard < run.layout.shards_for(n))
         for commit in _checked(run, planned) if check else planned:
             _refuse_odd_files(run, commit, expected)
-            done.append(commit.shard)
-            shards.append(
-                SealedShard(below + shard_folder(commit.shard, commit.attempt), commit.scenes, commit.samples)
-            )
+            folders.append((commit.shard, below + shard_folder(commit.shard, commit.attempt)))
             digest.add(run.manifest.spec_hash, commit)
             digests.append(digest.hexdigest())
-        absent = ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(done))
+        done = ShardRanges.of(shard for shard, _ in folders[first_position:])
+        absent = ShardRanges.of(range(run.layout.shards_for(n))).without(done)
         if len(absent) > _MOST_MISSING:
             problem = f"{len(absent)} planned shards are missing, but a store lists at most {_MOST_MISSING}"
             fix = "Make more of them with `datagen resume`, or make a smaller run"
             raise InputError(run.storage.url, "plans", problem, fix)
-        sealed.append(SealedRun(run, n, tuple(done), tuple(absent)))
-    if not shards:
+        sealed.append(SealedRun(run, n, done, absent, first_position))
+    if not folders:
         raise InputError(place.url, "commits", "no shard is committed", "Make some with `datagen resume`")
-    last = next(part for part in reversed(sealed) if part.shards)
-    scenes, samples = last.run.layout.rows_wanted(last.shards[-1], last.n)
-    shards[-1] = SealedShard(shards[-1].folder, scenes, samples)
-    return Contents(place, tuple(sealed), tuple(shards), tuple(digests), first.schema, first.layout)
+    sealed = with_last(sealed)
+    shards = tuple(
+        SealedShard(folder, *part.rows_of(shard))
+        for part in sealed
+        for shard, folder in folders[part.first : part.first + len(part.shards)]
+    )
+    return Contents(place, tuple(sealed), shards, tuple(digests), first.schema, first.layout)
+
+
+def with_last(sealed: Sequence[SealedRun]) -> list[SealedRun]:
+    """The runs of a store with the last one that has shards marked as such."""
+    last = next((part for part in reversed(sealed) if part.shards), None)
+    return [replace(part, is_last=part is last) for part in sealed]
 
 
 def _checked(run: Run, commits: Iterator[Commit]) -> Iterator[Commit]:
@@ -163,13 +179,9 @@ def _refuse_other_arrays(first: Run, run: Run) -> None:
 
 
 def _files_of_a_shard(run: Run) -> frozenset[str]:
-    files = set(group_metadata(run.schema, run.layout, run.manifest.spec_hash))
-    for table in TABLES:
-        rows = rows_per_shard(run.layout, table)
-        for field in run.schema.table(table):
-            count = rows // chunk_rows(run.schema, field, rows)
-            files |= {f"{field.name}/{chunk_key(field, i)}" for i in range(count)}
-    return frozenset(files)
+    schema, layout = run.schema, run.layout
+    chunks = (chunk_paths(schema, layout, table, field) for table, field in schema.fields)
+    return frozenset(chain(group_metadata(schema, layout, run.manifest.spec_hash), *chunks))
 
 
 def _refuse_odd_files(run: Run, commit: Commit, expected: frozenset[str]) -> None:

@@ -15,9 +15,9 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.fields import Field
 from datagen.schemas.sealing.contents import Contents
 from datagen.schemas.sealing.metadata import SEALED
-from datagen.schemas.shard_files import TABLES
 from datagen.schemas.storage import storage_error
 from datagen.schemas.storage.errors import CANNOT_EXCHANGE, TAKEN
+from datagen.schemas.whole_files import sync_folder
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -31,15 +31,15 @@ def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes])
     supported, the old one is renamed first, and a kill between the two renames leaves none. InputError when
     the disk fails.
     """
-    draft = draft_of(folder)
+    draft, place = draft_of(folder), contents.place
     try:
-        _write(draft, metadata)
-        for table in TABLES:
-            for field in contents.schema.table(table):
-                _link(contents, field, draft)
-        _sync_folders(draft)
+        files = {f"{draft.name}/{path}": data for path, data in metadata.items()}
+        place.put_many(files)
+        for _, field in contents.schema.fields:
+            _link(contents, field, draft)
+        place.sync(files)  # with every folder of the store, since each has metadata
         old = _take_the_name(draft, folder / SEALED)
-        _sync_folder(folder)
+        sync_folder(folder)
         remove_tree(old)
     except OSError as e:
         raise storage_error(e.filename or draft, e) from e
@@ -52,7 +52,7 @@ def unseal_folder(folder: Path) -> None:
     draft = draft_of(folder)
     try:
         (folder / SEALED).rename(draft)
-        _sync_folder(folder)
+        sync_folder(folder)
     except FileNotFoundError:
         pass  # there is none, or another process was first
     except OSError as e:
@@ -74,19 +74,9 @@ def remove_tree(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _write(draft: Path, files: Mapping[str, bytes]) -> None:
-    for path, data in files.items():
-        target = draft / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with target.open("xb") as f:
-            f.write(data)
-            f.flush()
-            os.fsync(f.fileno())
-
-
 def _link(contents: Contents, field: Field, draft: Path) -> None:
     for _, source, name in contents.chunks(field):
-        contents.place.link_or_copy(source, f"{draft.name}/{field.name}/{name}")
+        contents.place.adopt(contents.place, source, f"{draft.name}/{field.name}/{name}")
         target = draft / field.name / name
         mode = target.lstat().st_mode
         if not stat.S_ISREG(mode):
@@ -94,19 +84,6 @@ def _link(contents: Contents, field: Field, draft: Path) -> None:
             raise InputError(place, "", "is not a regular file", "Restore the file from a copy")
         if mode & 0o777 != 0o444:
             target.chmod(0o444)
-
-
-def _sync_folders(draft: Path) -> None:
-    for path in (*(p for p in draft.iterdir() if p.is_dir()), draft):
-        _sync_folder(path)
-
-
-def _sync_folder(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _take_the_name(draft: Path, sealed: Path) -> Path:

@@ -12,9 +12,10 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from datagen.schemas.description import cf_attributes, described
+from datagen.schemas.fields import TABLES
 from datagen.schemas.record_files import MAX_RECORD_BYTES
 from datagen.schemas.sealing.contents import Contents, SealedRun
-from datagen.schemas.shard_files import TABLES, root_attributes, zarr_metadata
+from datagen.schemas.shard_files import root_attributes, zarr_metadata
 from datagen.schemas.storage import Storage
 
 SEALED = "data.zarr"
@@ -37,7 +38,6 @@ class SealedRoot(BaseModel):
     rows_sha256: str = ""
 
     def part(self, spec_hash: str) -> SealedPart | None:
-        """The entry of one run; None where there is none."""
         return next((part for part in self.parts if part.spec_hash == spec_hash), None)
 
 
@@ -73,9 +73,7 @@ def sealed_metadata(contents: Contents, for_readers: bool = True) -> dict[str, b
     if for_readers:
         specs = [part.run.manifest.spec for part in contents.runs]
         attributes = described(specs, [part.n for part in contents.runs]) | attributes
-        of_arrays = {
-            f.name: cf_attributes(f, table) for table in TABLES for f in contents.schema.table(table)
-        }
+        of_arrays = {f.name: cf_attributes(f, table) for table, f in contents.schema.fields}
     files = zarr_metadata(contents.schema, contents.layout, rows, attributes, of_arrays)
     make = default_buffer_prototype().buffer.from_bytes
     store = {path: make(data) for path, data in files.items()}

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from datagen.schemas.fields import Field
 from datagen.schemas.sealing.contents import Contents
 from datagen.schemas.sealing.metadata import ROOT, SEALED, sealed_root
-from datagen.schemas.shard_files import TABLES
 from datagen.schemas.storage import Storage
 
 
@@ -48,11 +47,10 @@ def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
 
     Chunks of a killed seal beyond those may belong to other shards, and are copied again.
     """
-    for table in TABLES:
-        for field in contents.schema.table(table):
-            odd = _copy_array(contents, field, kept)
-            if tidy:
-                contents.place.delete(odd)
+    for _, field in contents.schema.fields:
+        odd = _copy_array(contents, field, kept)
+        if tidy:
+            contents.place.delete(odd)
 
 
 def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:

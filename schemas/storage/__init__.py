@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from datagen.schemas.concurrent_map import concurrent_map
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.storage.errors import FileTooLarge, storage_error
-from datagen.schemas.storage.local_files import LocalFiles
-from datagen.schemas.storage.stored_file import StoredFile
+from datagen.schemas.storage.local_files import LocalFiles, StoredFile
 
 if TYPE_CHECKING:
     from datagen.schemas.storage.remote_objects import RemoteObjects
@@ -67,7 +66,6 @@ class Storage:
         self._try(key, lambda: self._files.put(key, data))
 
     def put_many(self, files: Mapping[str, bytes]) -> None:
-        """Write many files as `put` does; several at once on remote storage."""
         for key in files:
             _checked(self.url, key)
         _exhaust(self.concurrent_map(lambda item: self.put(*item), files.items()))
@@ -93,10 +91,7 @@ class Storage:
         return self._try(key, lambda: self._files.get(key, limit_bytes))
 
     def get_many(self, keys: Iterable[str], limit_bytes: int) -> Iterator[tuple[str, bytes | None]]:
-        """Yield (key, bytes) of many files as `get` does, in the order of the keys.
-
-        Remote storage reads several at once; at most some tens of files are in memory.
-        """
+        """Yield (key, bytes) of many files as `get` does, in the order of keys; some tens are in memory."""
         return self.concurrent_map(lambda key: (key, self.get(key, limit_bytes)), keys)
 
     def concurrent_map(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -110,7 +105,6 @@ class Storage:
         return concurrent_map(_threads(), _AT_ONCE, do, items)
 
     def exists(self, key: str) -> bool:
-        """Whether the file exists."""
         return self._try(key, lambda: self._files.exists(key))
 
     def list(self, prefix: str) -> Iterator[StoredFile]:
@@ -135,10 +129,6 @@ class Storage:
         files = self._files
         if isinstance(files, LocalFiles):
             self._try(folder, lambda: files.remove_empty(folder))
-
-    def link_or_copy(self, source: str, target: str) -> None:
-        """Link or copy a file to a second key, which is replaced. See `adopt`."""
-        self.adopt(self, source, target)
 
     def adopt(self, source: Storage, source_key: str, key: str, limit_bytes: int = 2**31) -> None:
         """Link or copy a file of another storage, replacing an existing one. Not durable before `sync`.
@@ -165,19 +155,12 @@ class Storage:
             raise InputError(f"{source.url}/{source_key}", "", "no such file", fix) from e
 
     def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
-        """Link or copy many files of another storage, given as (its key, key here), as `adopt` does.
-
-        Several at once where one of the two is remote.
-        """
+        """Link or copy many files of another storage, given as (its key, key here), as `adopt` does."""
         asked = source if isinstance(self._files, LocalFiles) else self
         _exhaust(asked.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files and their folders durable.
-
-        On a disk this calls fsync on each file and on each folder up to the root; an object store is durable
-        when a put returns.
-        """
+        """Make files and their folders up to the root durable; objects of a store are already."""
         files = self._files
         if isinstance(files, LocalFiles):
             files.sync(_checked(self.url, key) for key in keys)

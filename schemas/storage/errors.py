@@ -66,7 +66,6 @@ class RequestFailure:
     passing: bool
 
     def at(self, place: str) -> StoreUnavailable:
-        """The error for this failure."""
         return StoreUnavailable(place, "", self.problem, self.fix)
 
 

@@ -13,6 +13,7 @@ import secrets
 import stat
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.schemas.storage.errors import (
@@ -22,7 +23,7 @@ from datagen.schemas.storage.errors import (
     storage_error,
     too_large,
 )
-from datagen.schemas.storage.stored_file import StoredFile
+from datagen.schemas.whole_files import sync_folder
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Enough to traverse a folder, without permission to read it.
@@ -41,8 +42,22 @@ _KINDS = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class StoredFile:
+    """One listed file: its key below the storage's root, its size in bytes, and its change stamp.
+
+    Equal stamps of one key mean equal bytes: the store's entity tag, or inode, time of change and size of a
+    file. `modified_s` is the time of the last write, in seconds since 1970 UTC.
+    """
+
+    key: str
+    size: int
+    stamp: str = ""
+    modified_s: float = 0.0
+
+
 class LocalFiles:
-    """The files below `root`/`prefix`. The root itself, given by the user, may be a link."""
+    """The methods of `Storage` for a folder. The root itself, given by the user, may be a link."""
 
     def __init__(self, root: Path, prefix: tuple[str, ...] = ()) -> None:
         self.root, self.prefix = root, prefix
@@ -50,30 +65,19 @@ class LocalFiles:
 
     @staticmethod
     def make_root(folder: Path) -> None:
-        """Create a folder durably."""
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         for path in missing:
-            fd = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
-                os.fsync(fd)
-            finally:
-                os.close(fd)
+            sync_folder(path.parent)
 
     def below(self, key: str) -> LocalFiles:
-        """The files of a subfolder, which need not exist, from the same root."""
         return LocalFiles(self.root, (*self.prefix, *key.split("/")))
 
     def put(self, key: str, data: bytes) -> None:
-        """Write a file, or replace it."""
         folders, name = _split(key)
-        here = self._walk(folders, make=True)
-        try:
-            with _drafted(name, here) as draft:
-                _write(draft, data, here, durably=False)
-                os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
-        finally:
-            os.close(here)
+        with _closing(self._walk(folders, make=True)) as here, _drafted(name, here) as draft:
+            _write(draft, data, here, durably=False)
+            os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
 
     def create(self, key: str, data: bytes) -> bool:
         """Write a file durably unless the name exists; False where it does.
@@ -81,95 +85,69 @@ class LocalFiles:
         The bytes are on disk before the name, so that a power cut cannot leave an empty file.
         """
         folders, name = _split(key)
-        here = self._walk(folders, make=True)
-        try:
-            with _drafted(name, here) as draft:
-                _write(draft, data, here, durably=True)
-                try:
-                    os.link(draft, name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=False)
-                except FileExistsError:
-                    return False
-        finally:
-            os.close(here)
+        with _closing(self._walk(folders, make=True)) as here, _drafted(name, here) as draft:
+            _write(draft, data, here, durably=True)
+            try:
+                os.link(draft, name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=False)
+            except FileExistsError:
+                return False
         self._sync_folders(_with_parents(folders))
         return True
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        """The file's bytes, or None where it does not exist. InputError above the limit."""
         try:
             fd = self._open_file(key)
         except FileNotFoundError:
             return None
-        try:
+        with _closing(fd):
             size = os.fstat(fd).st_size
             if size > limit_bytes:
                 raise too_large(f"{self.folder}/{key}", size, limit_bytes)
             return _read(fd, size)
-        finally:
-            os.close(fd)
 
     def exists(self, key: str) -> bool:
-        """Whether the file exists."""
         folders, name = _split(key)
         try:
-            here = self._walk(folders)
+            with _closing(self._walk(folders)) as here:
+                mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
         except FileNotFoundError:
             return False
-        try:
-            mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
-        except FileNotFoundError:
-            return False
-        finally:
-            os.close(here)
         self._refuse_odd(mode, key)
         return stat.S_ISREG(mode)
 
     def list(self, prefix: str) -> Iterator[StoredFile]:
         """All files below a folder; none when it does not exist. InputError for links, pipes, devices."""
-        folders = tuple(prefix.split("/")) if prefix else ()
         try:
-            here = self._walk(folders, flags=_FOLDER)
+            here = self._walk(prefix.split("/") if prefix else (), flags=_FOLDER)
         except FileNotFoundError:
             return
-        try:
+        with _closing(here):
             yield from self._list(here, f"{prefix}/" if prefix else "", 0)
-        finally:
-            os.close(here)
 
     def delete(self, keys: Iterable[str]) -> None:
         """Remove files; missing ones are ignored. Of a link, the link is removed."""
         for key in keys:
             folders, name = _split(key)
-            with suppress(FileNotFoundError):
-                here = self._walk(folders)
-                try:
-                    os.unlink(name, dir_fd=here)
-                finally:
-                    os.close(here)
+            with suppress(FileNotFoundError), _closing(self._walk(folders)) as here:
+                os.unlink(name, dir_fd=here)
 
     def remove_empty(self, folder: str) -> None:
         """Remove a folder and its subfolders, where they hold no file."""
         folders, name = _split(folder)
-        with suppress(FileNotFoundError):
-            here = self._walk(folders)
-            try:
-                for _, below, _, fd in os.fwalk(name, topdown=False, dir_fd=here):
-                    for child in below:
-                        _remove_folder(child, fd)
-                _remove_folder(name, here)
-            finally:
-                os.close(here)
+        with suppress(FileNotFoundError), _closing(self._walk(folders)) as here:
+            for _, below, _, fd in os.fwalk(name, topdown=False, dir_fd=here):
+                for child in below:
+                    _remove_folder(child, fd)
+            _remove_folder(name, here)
 
     def take(self, source: LocalFiles, source_key: str, key: str) -> None:
         """Hard-link a file of `source`, or copy it where that is impossible; replaces an existing file."""
         from_folders, from_name = _split(source_key)
         folders, name = _split(key)
-        there = source._walk(from_folders)
-        try:
+        with _closing(source._walk(from_folders)) as there:
             seen = os.stat(from_name, dir_fd=there, follow_symlinks=False)
             source._refuse_odd(seen.st_mode, source_key)
-            here = self._walk(folders, make=True)
-            try:
+            with _closing(self._walk(folders, make=True)) as here:
                 with suppress(FileNotFoundError):
                     if os.path.samestat(seen, os.stat(name, dir_fd=here, follow_symlinks=False)):
                         return
@@ -181,10 +159,6 @@ class LocalFiles:
                             raise
                         source._copy(source_key, draft, here)
                     os.rename(draft, name, src_dir_fd=here, dst_dir_fd=here)
-            finally:
-                os.close(here)
-        finally:
-            os.close(there)
 
     def sync(self, keys: Iterable[str]) -> None:
         """Call fsync on each file, and on each folder from there up to the root, leaves first.
@@ -203,11 +177,8 @@ class LocalFiles:
 
     def _sync(self, key: str, open_it: Callable[[], int]) -> None:
         try:
-            fd = open_it()
-            try:
+            with _closing(open_it()) as fd:
                 os.fsync(fd)
-            finally:
-                os.close(fd)
         except OSError as e:
             raise storage_error(self.folder / key, e) from e
 
@@ -230,15 +201,12 @@ class LocalFiles:
 
     def _open_file(self, key: str) -> int:
         folders, name = _split(key)
-        here = self._walk(folders)
-        try:
+        with _closing(self._walk(folders)) as here:
             mode = os.stat(name, dir_fd=here, follow_symlinks=False).st_mode
             if not stat.S_ISREG(mode):
                 self._refuse_odd(mode, key)
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), key)
             return os.open(name, _FILE, dir_fd=here)
-        finally:
-            os.close(here)
 
     def _list(self, folder: int, prefix: str, depth: int) -> Iterator[StoredFile]:
         if depth > _MAX_DEPTH:
@@ -254,17 +222,14 @@ class LocalFiles:
                 except FileNotFoundError:
                     continue  # removed since the listing
                 if is_folder:
-                    try:
+                    with _closing(below):
                         yield from self._list(below, f"{key}/", depth + 1)
-                    finally:
-                        os.close(below)
                 else:
                     self._refuse_odd(seen.st_mode, key)
                     stamp = f"{seen.st_ino:x}-{seen.st_ctime_ns:x}-{seen.st_size:x}"
                     yield StoredFile(key, seen.st_size, stamp, seen.st_mtime)
 
     def _refuse_odd(self, mode: int, key: str, where: str = "") -> None:
-        """Raise NotARegularFile for anything but a file or a folder."""
         kind = _KINDS.get(stat.S_IFMT(mode))
         if kind is not None:
             place = f"{self.folder}/{key}"
@@ -272,21 +237,25 @@ class LocalFiles:
             raise NotARegularFile(place, "", f"{where or 'is '}{kind}, which a run never has", fix)
 
     def _copy(self, key: str, draft: str, into: int) -> None:
-        fd = self._open_file(key)
-        try:
-            target = os.open(draft, _DRAFT, 0o666, dir_fd=into)
-            try:
-                while data := os.read(fd, _COPIED_AT_ONCE):
-                    _write_all(target, data)
-            finally:
-                os.close(target)
-        finally:
-            os.close(fd)
+        with (
+            _closing(self._open_file(key)) as fd,
+            _closing(os.open(draft, _DRAFT, 0o666, dir_fd=into)) as target,
+        ):
+            while data := os.read(fd, _COPIED_AT_ONCE):
+                _write_all(target, data)
+
+
+@contextmanager
+def _closing(fd: int) -> Generator[int]:
+    """Give an open descriptor, and close it when the block ends."""
+    try:
+        yield fd
+    finally:
+        os.close(fd)
 
 
 @contextmanager
 def _drafted(name: str, folder: int) -> Generator[str]:
-    """Give the name of a draft in a file's folder; it is removed when the block ends."""
     draft = f"{name}.{secrets.token_hex(8)}.part"
     try:
         yield draft
@@ -309,7 +278,6 @@ def _remove_folder(name: str, here: int) -> None:
 
 
 def _with_parents(folders: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """A folder and all above it, up to the root."""
     return (folders[:depth] for depth in range(len(folders) + 1))
 
 
@@ -337,13 +305,10 @@ def _read(fd: int, size: int) -> bytes:
 
 
 def _write(draft: str, data: bytes, folder: int, durably: bool) -> None:
-    fd = os.open(draft, _DRAFT, 0o666, dir_fd=folder)
-    try:
+    with _closing(os.open(draft, _DRAFT, 0o666, dir_fd=folder)) as fd:
         _write_all(fd, data)
         if durably:
             os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _write_all(fd: int, data: bytes) -> None:

@@ -20,8 +20,8 @@ from obstore.store import S3Store
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.storage.errors import RequestFailure, store_trouble, too_large
+from datagen.schemas.storage.local_files import StoredFile
 from datagen.schemas.storage.remote_settings import bucket_and_prefix, connection_settings, timeout_s
-from datagen.schemas.storage.stored_file import StoredFile
 
 PATIENCE = 1.5  # timeouts for which a request is retried, at least once
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 3.0
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 
 class RemoteObjects:
-    """The objects below `s3://bucket/prefix`. A failure is an `InputError` with the object and the fix."""
+    """The methods of `Storage` for `s3://bucket/prefix`. A failure is an `InputError` with the object."""
 
     def __init__(self, url: str) -> None:
         self.bucket, self.prefix = bucket_and_prefix(url)
@@ -41,11 +41,9 @@ class RemoteObjects:
         self._store = self._open(self.prefix)
 
     def below(self, key: str) -> RemoteObjects:
-        """The objects below a longer prefix."""
         return RemoteObjects(f"{self.url}/{key}")
 
     def put(self, key: str, data: bytes) -> None:
-        """Write an object, or replace it."""
         self._try(key, lambda: obstore.put(self._store, key, data, use_multipart=False))
 
     def create(self, key: str, data: bytes) -> bool:
@@ -67,8 +65,6 @@ class RemoteObjects:
         return self._try(key, put)
 
     def get(self, key: str, limit_bytes: int) -> bytes | None:
-        """The object's bytes, or None where it does not exist. InputError above the limit."""
-
         def get() -> bytes:
             found = obstore.get(self._store, key)
             size = int(found.meta["size"])
@@ -85,7 +81,6 @@ class RemoteObjects:
             return None
 
     def exists(self, key: str) -> bool:
-        """Whether the object exists."""
         try:
             self._try(key, lambda: obstore.head(self._store, key))
         except FileNotFoundError:
@@ -114,7 +109,6 @@ class RemoteObjects:
                 yield StoredFile(last, int(entry["size"]), str(stamp), entry["last_modified"].timestamp())
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove objects; missing ones are ignored."""
         left = iter(keys)
         while some := list(islice(left, _DELETED_AT_ONCE)):
             try:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from datagen.cluster.driver import drive
-from datagen.cluster.job_monitor import JobMonitor, JobStatus, StopMode
+from datagen.cluster.job_progress import JobMonitor, JobStatus, StopMode
 from datagen.cluster.job_totals import JobSummary
 from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.stop_request import StopRequest

@@ -7,8 +7,8 @@ import json
 
 from rich.console import Console
 
+from datagen.cluster.job_progress import JobProgress
 from datagen.cluster.job_totals import JobTotals
-from datagen.cluster.progress import JobProgress
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Progress
 from tests.cluster.simulated import FakeClock

@@ -20,8 +20,7 @@ from datagen.schemas.garbage_collection import find_garbage
 from datagen.schemas.keys import MERGED, part_folder
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.merging import merge_runs, plan_merge
-from datagen.schemas.record_files import encode_record
-from datagen.schemas.root_records import publish
+from datagen.schemas.record_files import encode_record, publish
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout, LedgerEntry, Merged, QuarantineRecord
 from datagen.schemas.sealing import SEALED, seal, unseal

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
+from datagen.cluster.job_progress import JobProgress
 from datagen.cluster.post_mortem import notes_of_a_job
-from datagen.cluster.progress import JobProgress
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import ray_executor
 from datagen.cluster.retry_policy import RetryPolicy

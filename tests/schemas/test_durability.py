@@ -119,7 +119,7 @@ def test_a_sealed_store_gets_its_name_when_it_lasts(disk: Disk, tmp_path: Path) 
     with disk.watched(tmp_path, str(tmp_path / "data.zarr")) as lost, pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda fd: (synced.add(os.fstat(fd).st_ino), plain(fd)))
         seal(run.storage)
-    assert len(lost) == 1 and {path.count("/") for path in lost[0]} == {0}  # the draft's own name
+    assert lost == [set()]
     assert disk.lost(tmp_path) == set()
     metadata = list((tmp_path / "data.zarr").rglob("zarr.json"))
     assert metadata and {path.stat().st_ino for path in metadata} <= synced

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.record_files import encode_record, signed_json
-from datagen.schemas.root_records import copy_key, publish
+from datagen.schemas.record_files import copy_key, encode_record, publish, signed_json
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import FileEntry, Layout, LedgerEntry, Plan, QuarantineRecord
 from datagen.schemas.storage import open_storage

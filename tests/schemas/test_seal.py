@@ -27,7 +27,7 @@ from tests.made_runs import check_digests, files_of, make_run, rows_of, small_sp
 
 
 def clear_metadata() -> None:
-    shard_files._group_metadata.cache_clear()
+    shard_files.group_metadata.cache_clear()
     shard_files._made_by_zarr.cache_clear()
 
 

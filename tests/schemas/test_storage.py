@@ -29,7 +29,7 @@ def test_files_come_back_and_listing_tells_their_sizes(tmp_path: Path):
     assert s.get("a/none", 10) is None
     assert [(f.key, f.size) for f in s.list("a")] == [("a/b", 3)]
     assert list(s.list("none")) == []
-    s.link_or_copy("a/b", "x/y")
+    s.adopt(s, "a/b", "x/y")
     assert (tmp_path / "x/y").samefile(tmp_path / "a/b")
     s.delete(["a/b", "a/none"])
     assert (s.exists("a/b"), s.exists("x/y")) == (False, True)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.root_records import refuse_foreign
+from datagen.schemas.record_files import refuse_foreign
 from datagen.schemas.storage import Storage, local_files, open_storage
 from tests.made_runs import files_of
 
@@ -21,7 +21,7 @@ VERBS: dict[str, Callable[[Storage, str], object]] = {
     "get_many": lambda s, key: list(s.get_many([key], 10**6)),
     "exists": lambda s, key: s.exists(key),
     "sync": lambda s, key: s.sync([key]),
-    "link": lambda s, key: s.link_or_copy(key, "taken"),
+    "link": lambda s, key: s.adopt(s, key, "taken"),
     "put_new": lambda s, key: s.put_new(key, b"x"),
     "below": lambda s, key: s.below(key).get("x", 9),
 }

@@ -47,7 +47,7 @@ def test_the_verbs_are_those_of_a_folder(bucket: str):
     assert [(f.key, f.size) for f in s.list("a")] == [("a/b", 3)]
     assert sorted(f.key for f in s.list("")) == ["a/b", "ab/c"]
     assert list(s.list("none")) == []
-    s.link_or_copy("a/b", "x/y")
+    s.adopt(s, "a/b", "x/y")
     s.delete(["a/b", "a/none"])
     assert (s.exists("a/b"), s.exists("x/y")) == (False, True)
     again: Storage = pickle.loads(pickle.dumps(s))
@@ -146,7 +146,7 @@ def test_what_was_done_and_answered_by_an_error_is_done(behind: Behind):
         for verb in (
             lambda: s.put("p", b"1"),
             lambda: s.delete(["p", "none"]),
-            lambda: s.link_or_copy("c/0", "copy"),
+            lambda: s.adopt(s, "c/0", "copy"),
             lambda: s.exists("c/0"),
         ):
             faults.script = ["lost_answer"]
@@ -165,7 +165,7 @@ def test_answers_that_break_off_are_asked_for_again(behind: Behind):
         faults.script = ["cut", "error", "lost_answer"] * 4
         assert len(dict(s.get_many([f"k/{i}" for i in range(20)], 2000))) == 20
         faults.late_error_of_copies = 1
-        s.link_or_copy("k/1", "copy")
+        s.adopt(s, "k/1", "copy")
         assert s.get("copy", 2000) == b"1" * 1000
 
 

@@ -88,8 +88,9 @@ def test_rows_that_are_not_those_of_their_place(
 def test_sums_in_a_commit_that_its_rows_do_not_have(tmp_path: Path):
     run = make_run(tmp_path / "run", 20)
     folder = folder_of(run)
+    positives = run.commit_of(1).positives + 1
     for key in (commit_key(1), commit_copy_key(1, "a-1")):
-        edit(folder / key, positives=run.commit_of(1).positives + 1, redraws={"fell_off": 3})
+        edit(folder / key, positives=positives, redraws={"fell_off": 3})
     prefix = "shards/000001/a-1"
     assert found(folder) == [("rows", f"{prefix}/label"), ("rows", f"{prefix}/redraws")]
 
