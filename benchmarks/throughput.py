@@ -85,7 +85,7 @@ def run(
         )
         made = Run.create_or_open(open_storage(out), manifest, n)
         work = JobRun(made, absolute(options.houses), absolute(options.objects))
-        plan = JobPlan(made.storage, out, [work], JobOptions(workers=workers), time.monotonic(), ())
+        plan = JobPlan(made.storage, out, [work], JobOptions(workers=workers), time.monotonic(), (), ())
         started_s = time.perf_counter()
         summary = make_missing(plan, open_recorder(plan))
         ended_s = time.perf_counter()
