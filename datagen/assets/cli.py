@@ -33,11 +33,15 @@ app = App(name="assets", help="List, fetch, lock and verify houses and objects."
 
 @app.command(name="list")
 def list_assets(
-    folder: Annotated[Path | None, Parameter(help="List the files in the lock file of this folder.")] = None,
+    folder: Path | None = None,
     *,
     json: AsJson = False,
 ) -> int:
-    """List the assets that can be fetched or, with a folder, the files in its lock file."""
+    """List the assets that can be fetched or, with a folder, the files in its lock file.
+
+    Args:
+        folder: List the files in the lock file of this folder.
+    """
     if folder is None:
         rows = [{k: v for k, v in asdict(asset).items() if k != "archive"} for asset in CATALOGUE.values()]
         if json:
@@ -68,11 +72,16 @@ def list_assets(
 def lock(
     folder: Folder,
     *,
-    licence: Annotated[str | None, Parameter(help="Licence of all files [unchanged].")] = None,
-    source: Annotated[str | None, Parameter(help="Origin of all files [unchanged].")] = None,
+    licence: str | None = None,
+    source: str | None = None,
     json: AsJson = False,
 ) -> int:
-    """Write the sha256, size, licence and source of every file to assets.lock.json."""
+    """Write the sha256, size, licence and source of every file to assets.lock.json.
+
+    Args:
+        licence: Licence of all files [unchanged].
+        source: Origin of all files [unchanged].
+    """
     written = locks.lock(folder, licence, source)
     total = sum(entry.size for entry in written.files)
     if json:
@@ -104,17 +113,24 @@ def verify(folder: Folder, *, json: AsJson = False) -> int:
 
 @app.command(name="fetch")
 def fetch_assets(
-    *names: Annotated[str, Parameter(help="Assets or groups of `datagen assets list`.")],
-    out: Annotated[Path, Parameter(help="Folder for the assets.")] = Path("assets"),
-    mirror: Annotated[str | None, Parameter(help="http(s) address of a folder with the same files.")] = None,
-    offline: Annotated[bool, Parameter(negative=(), help="Use only the cache.")] = False,
-    cache: Annotated[Path | None, Parameter(help="Folder of kept downloads.")] = None,
+    *names: str,
+    out: Path = Path("assets"),
+    mirror: str | None = None,
+    offline: bool = False,
+    cache: Path | None = None,
     json: AsJson = False,
 ) -> int:
     """Download, check and unpack assets, and record them in the folder's lock file.
 
     An interrupted download continues where it stopped. Files without a published digest are trusted on first
     use: their digest is recorded in the lock file, and later downloads must match it.
+
+    Args:
+        names: Assets or groups of `datagen assets list`.
+        out: Folder for the assets.
+        mirror: http(s) address of a folder with the same files.
+        offline: Use only the cache.
+        cache: Folder of kept downloads.
     """
     if not names:
         raise InputError("datagen assets fetch", "NAME", "is missing", choices(groups()))

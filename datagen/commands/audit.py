@@ -31,15 +31,10 @@ _FIDELITY = ("heuristic", "plan", "sim")
 
 
 def audit(
-    runs: Annotated[
-        list[str], Parameter(name="RUN...", negative=(), help="Runs of one or several label sources.")
-    ],
+    runs: Annotated[list[str], Parameter(name="RUN...")],
     /,
     *,
-    candidates: Annotated[
-        Literal["grid", "clear", "in-range"],
-        Parameter(help="Candidates whose outcomes and agreement are counted; grid: all."),
-    ] = "grid",
+    candidates: Literal["grid", "clear", "in-range"] = "grid",
     json: AsJson = False,
 ) -> int:
     """Show the cost of labels by stage, the waste, and a projection to 180,000 labels.
@@ -48,6 +43,10 @@ def audit(
     labels of the same candidates (--scenes-from) are compared pair by pair.
 
     For example: datagen audit runs/first
+
+    Args:
+        runs: Runs of one or several label sources.
+        candidates: Candidates whose outcomes and agreement are counted; grid: all.
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")

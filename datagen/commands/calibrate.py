@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
+from datagen.console.options import AllowIncomplete, AsJson, Whole, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.merged_runs import open_runs
@@ -44,25 +43,17 @@ class _Calibrated:
 
 
 def calibrate(
-    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs of sim or plan labels.")],
+    runs: Annotated[list[str], Parameter(name="RUN...")],
     /,
     *,
-    out: Annotated[Path, Parameter(help="The .toml file to write; it must not exist.")],
-    candidates: Annotated[Sets, Parameter(help="The candidates to fit on.")] = "clear",
-    distance: Annotated[
-        Literal[Form, "any"], Parameter(help="Distance that the score depends on; any: the best.")
-    ] = "planar",
-    objective: Annotated[
-        Literal["balanced", "accuracy"], Parameter(help="What is maximised: balanced accuracy or accuracy.")
-    ] = "balanced",
-    fit_alpha: Annotated[
-        bool, Parameter(negative=(), help="Also fit the weight of the visibility score.")
-    ] = False,
-    split_check: Annotated[
-        bool, Parameter(negative=(), help="Fail, instead of warn, where a run is not of --split val.")
-    ] = False,
-    bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the folds and the resamples.")] = 0,
+    out: Path,
+    candidates: Sets = "clear",
+    distance: Literal[Form, "any"] = "planar",
+    objective: Literal["balanced", "accuracy"] = "balanced",
+    fit_alpha: bool = False,
+    split_check: bool = False,
+    bootstrap: Whole = 1000,
+    seed: Whole = 0,
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
@@ -73,6 +64,17 @@ def calibrate(
     --config FILE` and `datagen relabel RUN --config FILE` accept.
 
     For example: datagen calibrate runs/sim-val --out rule.toml
+
+    Args:
+        runs: Runs of sim or plan labels.
+        out: The .toml file to write; it must not exist.
+        candidates: The candidates to fit on.
+        distance: Distance that the score depends on; any: the best.
+        objective: What is maximised: balanced accuracy or accuracy.
+        fit_alpha: Also fit the weight of the visibility score.
+        split_check: Fail, instead of warn, where a run is not of --split val.
+        bootstrap: Resamples of scenes for each interval.
+        seed: Seed of the folds and the resamples.
     """
     _refuse_odd(out, bootstrap, seed)
     specs, warnings = _specifications(runs, candidates, split_check)

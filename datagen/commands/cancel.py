@@ -29,16 +29,10 @@ _GIVE_UP_S = 180.0
 
 
 def cancel(
-    run: Annotated[
-        str | None, Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")
-    ] = None,
+    run: Annotated[str | None, Parameter(name="RUN")] = None,
     *,
-    now: Annotated[
-        bool, Parameter(negative=(), help="Kill the running attempts instead of letting them commit.")
-    ] = False,
-    head: Annotated[
-        bool, Parameter(negative=(), help="Stop the Ray head of this machine that runs detached jobs.")
-    ] = False,
+    now: bool = False,
+    head: bool = False,
     json: AsJson = False,
 ) -> int:
     """Ask every job of a run to stop, and wait until it has. Committed shards are kept.
@@ -48,6 +42,11 @@ def cancel(
     in force. Exit code 0 when every job has ended, 1 when one has not.
 
     For example: datagen cancel runs/first
+
+    Args:
+        run: Folder or s3:// address of a run or of merged runs.
+        now: Kill the running attempts instead of letting them commit.
+        head: Stop the Ray head of this machine that runs detached jobs.
     """
     if head:
         if run is not None:

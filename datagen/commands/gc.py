@@ -6,9 +6,7 @@ import re
 import shlex
 import time
 from collections import Counter
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from datagen.cluster.run_recorder import refresh_index
 from datagen.console.options import AsJson, RunPlace
@@ -28,14 +26,8 @@ def gc(
     run: RunPlace,
     /,
     *,
-    older_than: Annotated[
-        str,
-        Parameter(
-            help="Keep files newer than this: 90s, 30m, 24h or 7d. It must exceed the duration of a merge "
-            "that is running: with 0s the merge loses files and must be run again."
-        ),
-    ] = "24h",
-    dry_run: Annotated[bool, Parameter(negative=(), help="List the files, but remove nothing.")] = False,
+    older_than: str = "24h",
+    dry_run: bool = False,
     json: AsJson = False,
 ) -> int:
     """Remove files that no commit names: of superseded or unfinished attempts, drafts and probes.
@@ -44,6 +36,11 @@ def gc(
     the first running job. It may run while jobs run; after an interruption, run it again.
 
     For example: datagen gc runs/first --dry-run
+
+    Args:
+        older_than: Keep files newer than this: 90s, 30m, 24h or 7d. It must exceed the duration of a
+            merge that is running: with 0s the merge loses files and must be run again.
+        dry_run: List the files, but remove nothing.
     """
     place = open_storage(run, probe=False, create=False)
     age_s = age_of(older_than)

@@ -8,14 +8,11 @@ from collections.abc import Generator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from datagen.commands.verify import finding_row, print_findings
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AsJson, RunPlace, Whole
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.repair import RegenerateShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
@@ -31,9 +28,7 @@ def repair(
     run: RunPlace,
     /,
     *,
-    workers: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0: this process.")
-    ] = 0,
+    workers: Whole = 0,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
@@ -44,6 +39,9 @@ def repair(
     Exit code 0 when no damage is left, else 1.
 
     For example: datagen repair runs/first
+
+    Args:
+        workers: Processes that make bad shards again; 0: this process.
     """
     if not 0 <= workers <= 256:
         raise InputError("--workers", str(workers), "is not between 0 and 256", "Omit it for this process")

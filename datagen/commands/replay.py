@@ -10,9 +10,8 @@ import numpy as np
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import AsJson, RunPlace, refuse_output
+from datagen.console.options import AsJson, RunPlace, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
 from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
 from datagen.regeneration.shards import OpenedSources, open_sources
@@ -34,21 +33,12 @@ _SHOWN = 5
 
 def replay(
     run: RunPlace,
-    sample: Annotated[
-        str | None,
-        Parameter(name="SAMPLE_ID", help="sample_id, 32 hexadecimal digits, or its first ones if unique."),
-    ] = None,
+    sample: Annotated[str | None, Parameter(name="SAMPLE_ID")] = None,
     /,
     *,
-    scene: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a scene, instead of a sample id.")
-    ] = None,
-    shard: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a shard to run in this process, for a debugger.")
-    ] = None,
-    out: Annotated[
-        Path | None, Parameter(help="Picture to write, FILE.png: the stored and the replayed scene.")
-    ] = None,
+    scene: Whole | None = None,
+    shard: Whole | None = None,
+    out: Path | None = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
@@ -62,6 +52,12 @@ def replay(
     debugger stops where it is raised. No file is written.
 
     For example: datagen replay runs/first --scene 0 --out replay.png
+
+    Args:
+        sample: sample_id, 32 hexadecimal digits, or its first ones if unique.
+        scene: Index of a scene, instead of a sample id.
+        shard: Index of a shard to run in this process, for a debugger.
+        out: Picture to write, FILE.png: the stored and the replayed scene.
     """
     if sum(given is not None for given in (sample, scene, shard)) != 1:
         problem = "is one of three ways to say what to replay"

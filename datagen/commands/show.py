@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import RunPlace, refuse_output
+from datagen.console.options import RunPlace, Whole, refuse_output
 from datagen.console.printing import print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
 from datagen.regeneration.sources import AS_FOUND, AssetSources
 from datagen.schemas.errors import InputError
@@ -27,11 +23,9 @@ def show(
     run: RunPlace,
     /,
     *,
-    out: Annotated[Path, Parameter(help="Picture to write: FILE.png, or FILE.gif of a trial.")],
-    scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
-    trial: Annotated[
-        str | None, Parameter(help="Show the trial of a candidate: its index, or best (plan, sim).")
-    ] = None,
+    out: Path,
+    scene: Whole = 0,
+    trial: str | None = None,
     given: AssetSources = AS_FOUND,
 ) -> int:
     """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
@@ -41,6 +35,11 @@ def show(
     in a .gif. Scenes are rendered again from the stored poses.
 
     For example: datagen show runs/first --scene 3 --out scene.png
+
+    Args:
+        out: Picture to write: FILE.png, or FILE.gif of a trial.
+        scene: Index of the scene.
+        trial: Show the trial of a candidate: its index, or best (plan, sim).
     """
     refuse_output(out, "--out", ".png", ".gif")
     moving = out.suffix.lower() == ".gif"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, RunPlace
@@ -19,7 +17,7 @@ def status(
     run: RunPlace,
     /,
     *,
-    stacks: Annotated[bool, Parameter(negative=(), help="Add one stack for each cause of failure.")] = False,
+    stacks: bool = False,
     json: AsJson = False,
 ) -> int:
     """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
@@ -27,6 +25,9 @@ def status(
     Of merged runs it shows the sums, and one line per part.
 
     For example: datagen status runs/first
+
+    Args:
+        stacks: Add one stack for each cause of failure.
     """
     place = open_storage(run, probe=False, create=False)
     report = runs_report(place, stacks)

@@ -6,14 +6,12 @@ import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from cyclopts import Parameter
 
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AsJson, RunPlace, Whole
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
@@ -30,12 +28,8 @@ def verify(
     run: RunPlace,
     /,
     *,
-    deep: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Number of random samples and of random scenes to compute again.")
-    ] = 0,
-    seed: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Seed of the samples and scenes of --deep [random].")
-    ] = None,
+    deep: Whole = 0,
+    seed: Whole | None = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
@@ -45,6 +39,10 @@ def verify(
     damage, else 1. With --deep, labels are also computed again.
 
     For example: datagen verify runs/first
+
+    Args:
+        deep: Number of random samples and of random scenes to compute again.
+        seed: Seed of the samples and scenes of --deep [random].
     """
     if not 0 <= deep <= 1_000_000:
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")

@@ -6,9 +6,8 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -97,14 +96,16 @@ def as_table(checks: list[Check]) -> Table:
 def doctor(
     *,
     json: AsJson = False,
-    houses: Annotated[
-        str | None, Parameter(help="Houses to check: builtin, procthor:DIR or ai2thor:DIR.")
-    ] = None,
-    objects: Annotated[str | None, Parameter(help="Objects to check: builtin or ycb:DIR.")] = None,
+    houses: str | None = None,
+    objects: str | None = None,
 ) -> int:
     """Check this machine, and show how to fix what is missing.
 
     Exit code 0 when labels can be made here, else 1.
+
+    Args:
+        houses: Houses to check: builtin, procthor:DIR or ai2thor:DIR.
+        objects: Objects to check: builtin or ycb:DIR.
     """
     checks = [*host_checks(), *extra_checks(), *engine_checks(), *arm_checks()]
     if not EXTRAS["labels"].missing():

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
-from datagen.jobs.job_result import JobInterrupted, JobResult
+from datagen.jobs.job_result import JobResult
 from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import Jobs, StoredJob
 from datagen.schemas.storage import Storage
@@ -55,13 +54,9 @@ def health_line(job: StoredJob) -> str:
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"
 
 
-def reported(job: Callable[[], JobResult]) -> int:
-    """Run a job, print its summary, also where it was interrupted, and return the exit code."""
-    try:
-        result = job()
-    except JobInterrupted as stopped:
-        result = stopped.result
-    if result.end != "detached":
+def print_job(result: JobResult, **_: Any) -> int:
+    """Print the summary of a job and return the exit code."""
+    if result.end != "detached":  # what to do next is printed when it is detached
         _print(result)
     return result.exit_code
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from datagen.console.command_lines import command_line
-from datagen.console.printing import counted
-
 
 @dataclass(frozen=True, eq=False)
 class JobResult:
@@ -39,12 +36,3 @@ class JobResult:
     def exit_code(self) -> int:
         """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
         return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
-
-
-class JobInterrupted(KeyboardInterrupt):
-    """A job ended because it was asked to; what is committed stays, and `result` says what that is."""
-
-    def __init__(self, result: JobResult) -> None:
-        self.result = result
-        left = counted(result.remaining, "shard")
-        super().__init__(f"{left} left. Resume with: {command_line(result.resume)}")
