@@ -13,6 +13,7 @@ from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AsJson, RunPlace, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.drawing.replay_picture import draw_replay
+from datagen.drawing.shown import Shown
 from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
 from datagen.regeneration.shards import OpenedSources, open_sources
 from datagen.regeneration.single_shard import replay_shard
@@ -164,9 +165,11 @@ def _compare(
         "picture": None if out is None else str(out),
     }
     if out is not None:
-        again = reconstruct_scene(replayer.world, (drawn or stored).record)
-        before = reconstruct_scene(replayer.world, stored.record)
-        draw_replay(report, run.manifest.spec, (before, stored), (again, drawn or stored), row, out)
+        before, again = (
+            Shown(place, run.manifest.spec, rows, reconstruct_scene(replayer.world, rows.record))
+            for rows in (stored, drawn or stored)
+        )
+        draw_replay(report, before, again, row, out)
     if json:
         print_json(report)
     else:

@@ -8,7 +8,9 @@ from pathlib import Path
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import RunPlace, Whole, refuse_output
 from datagen.console.printing import print_rows
-from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
+from datagen.drawing.arm_picture import draw_arm_picture
+from datagen.drawing.scene_picture import draw_scene_picture
+from datagen.drawing.shown import Shown
 from datagen.regeneration.sources import AS_FOUND, AssetSources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import find_scene, open_runs
@@ -62,7 +64,7 @@ def show(
 
         lines = draw_trial(shown, candidate, out)
     else:
-        lines = (draw_heuristic if spec.arm is None else draw_arm)(shown, out)
+        lines = (draw_scene_picture if spec.arm is None else draw_arm_picture)(shown, out)
     print_rows(f"scene {scene} of {run}", [("target", shown.target), *lines, ("picture", str(out))])
     return 0
 

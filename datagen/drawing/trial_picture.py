@@ -33,14 +33,14 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
     retrial = try_again(
-        shown.recalled, reconstruct_candidates(shown.rows.samples, shown.recalled), row, shown.spec
+        shown.recalled, reconstruct_candidates(shown.samples, shown.recalled), row, shown.spec
     )
     outcome, robot = retrial.trial.outcome, retrial.robot
     moving = out.suffix.lower() == ".gif"
     if moving and not retrial.moves:
         problem = f"candidate {row} ended as {outcome} before the arm moved: there is nothing to animate"
         raise InputError(out, "--out", problem, "Give a name that ends in .png")
-    stored = tuple(OUTCOMES)[int(shown.rows.samples["outcome"][row])]
+    stored = tuple(OUTCOMES)[int(shown.samples["outcome"][row])]
     title = Title(
         OUTCOME_STYLES[outcome].colour,
         f"candidate {row}: {outcome} ({_words(retrial)})",
@@ -62,7 +62,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
 
 
 def _candidate(shown: Shown, candidate: int | None) -> int:
-    samples, scene = shown.rows.samples, shown.recalled.index
+    samples, scene = shown.samples, shown.recalled.index
     count = len(samples["label"])
     if candidate is None:
         best = best_success(samples)
