@@ -10,9 +10,8 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.reports.agreement import common_candidates, compare, outcome_report
+from datagen.reports.agreement import common_candidates, compare, join_labelled, outcome_report, read_labelled
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
-from datagen.reports.label_arrays import join_labelled, read_labelled
 from datagen.reports.specification_summary import is_disturbed, made_from
 from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.cost import STAGES

@@ -29,7 +29,7 @@ def print_report(report: dict[str, Any], json: bool, html: Path | None = None, *
     if json:
         print_json(report)
         return 0
-    from datagen.evaluation_report.terminal import print_evaluation
+    from datagen.evaluation_report.report_tables import print_evaluation
 
     print_evaluation(report)
     if html is not None:

@@ -11,9 +11,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from datagen.commands.verify import finding_row, print_findings
-from datagen.console.options import AsJson, RunPlace, Whole
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.repair import RegenerateShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
@@ -21,7 +20,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.regeneration.shards import OpenedSources
+    from datagen.regeneration.scenes import OpenedSources
 
 
 def repair(
@@ -82,14 +81,14 @@ def _leave_signals() -> None:
 def _regenerate(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed in this process."""
     # Simulators are imported only for a bad shard.
-    from datagen.regeneration.shards import regenerate_shard, regenerated_files
+    from datagen.regeneration.scenes import regenerate_shard, regenerated_files
 
     return regenerated_files(run, regenerate_shard(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
 def _origin(place: str, given: Sources) -> OpenedSources:
-    from datagen.regeneration.shards import open_sources
+    from datagen.regeneration.scenes import open_sources
 
     return open_sources(Run.open(place), given)
 

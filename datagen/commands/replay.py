@@ -10,14 +10,18 @@ import numpy as np
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import AsJson, RunPlace, Whole, refuse_output
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.drawing.replay_picture import draw_replay
 from datagen.drawing.shown import Shown
-from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
-from datagen.regeneration.shards import OpenedSources, open_sources
+from datagen.regeneration.scenes import (
+    OpenedSources,
+    chosen_rows,
+    open_replayer,
+    open_sources,
+    what_differs_here,
+)
 from datagen.regeneration.single_shard import replay_shard
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.regeneration.stage_comparison import RECOMPUTED, StageComparison, compare_stages
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows

@@ -6,12 +6,11 @@ import re
 from pathlib import Path
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import RunPlace, Whole, refuse_output
+from datagen.console.options import AS_FOUND, AssetSources, RunPlace, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.arm_picture import draw_arm_picture
 from datagen.drawing.scene_picture import draw_scene_picture
 from datagen.drawing.shown import Shown
-from datagen.regeneration.sources import AS_FOUND, AssetSources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import find_scene, open_runs
 from datagen.schemas.scene_rows import read_scene

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.console.options import AsJson, RunPlace, Whole
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError, printable
@@ -87,7 +86,7 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
     """Findings of samples and scenes computed again, divided among the runs."""
     # Simulators are imported only for --deep_check.
     from datagen.regeneration.deep_check import deep_findings
-    from datagen.regeneration.shards import open_sources
+    from datagen.regeneration.scenes import open_sources
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,3 +57,25 @@ def refuse_output(file: Path, option: str, *endings: str) -> None:
         raise InputError(file, option, f"is not a {valid} file", f"Give a name that ends in {valid}")
     if not file.parent.is_dir():
         raise InputError(file, option, "its folder does not exist", "Make the folder first")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class AssetSources:
+    """References of houses and objects from the command line; None: those in the run's manifest."""
+
+    houses: Annotated[str | None, Parameter(help="New location of the houses [as in the run].")] = None
+    objects: Annotated[str | None, Parameter(help="New location of the objects [as in the run].")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Sources(AssetSources):
+    """The same, and the run whose scenes a run labelled again."""
+
+    scenes_from: Annotated[
+        str | None, Parameter(help="New location of the run with the scenes [as in the run].")
+    ] = None
+
+
+AS_FOUND = Sources()

@@ -14,9 +14,8 @@ from rich.text import Text
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check, Status
-from datagen.doctor.engines import engine_checks
+from datagen.doctor.engines import arm_checks, engine_checks
 from datagen.doctor.host import host_checks
 from datagen.schemas.errors import InputError
 from datagen.workers.extras import EXTRAS, how_to_get

@@ -8,14 +8,14 @@ from importlib.metadata import PackageNotFoundError
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.configuration.specify import label_engines, scene_engines
 from datagen.console.command_lines import Interrupted, command_line, resumable, words_of
+from datagen.console.options import AS_FOUND, Sources
 from datagen.console.printing import counted
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.job import JobPlan, JobRun, run_job
 from datagen.jobs.job_result import JobResult
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
-from datagen.regeneration.shards import open_sources
-from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.regeneration.scenes import open_sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import different_fields

@@ -10,8 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from datagen.regeneration.scenes import Replayer, chosen_rows, open_replayer, what_differs_here
-from datagen.regeneration.shards import OpenedSources
+from datagen.regeneration.scenes import OpenedSources, Replayer, chosen_rows, open_replayer, what_differs_here
 from datagen.regeneration.stage_comparison import (
     DRAWN,
     RECOMPUTED,

@@ -1,4 +1,4 @@
-"""Make scenes of a run again, from their seeds or from the stored poses, and label them."""
+"""Make scenes and shards of a run again, from their seeds or from the stored poses."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ import numpy as np
 
 from datagen.cluster.attempt_guard import this_host
 from datagen.configuration.specify import label_engines, scene_engines
-from datagen.regeneration.shards import OpenedSources, source_of
+from datagen.console.options import AS_FOUND, Sources
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_files import encode_shard
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
-from datagen.workers.run_shard import Columns, candidate_columns, scene_row
+from datagen.workers.run_shard import Columns, ShardResult, candidate_columns, run_shard, scene_row
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import SettledScene
-from datagen.workers.world import World, assemble_world
+from datagen.workers.world import World, assemble_world, open_world
+
+_NO_DRAWING = "the run that made the scenes does not exist any more"
+_FIX = "Give that run with --scenes-from"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +73,6 @@ class Replayer:
         common = candidate_columns(scene.index, candidates, self.run.manifest.spec_hash, source)
         chosen = {name: values[list(rows)] for name, values in common.items()}
         return chosen | source.columns(scene, candidates, spec, rows)
-
-
-_NO_DRAWING = "the run that made the scenes does not exist any more"
-_FIX = "Give that run with --scenes-from"
 
 
 def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
@@ -136,3 +137,57 @@ def _platform_name(text: str) -> tuple[str, str]:
     """The platform string without the version of the kernel."""
     machine = platform.machine()
     return text.partition("-")[0], text.rpartition(machine)[2] if machine in text else text
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedSources:
+    """The opened sources of a run's shards."""
+
+    world: World
+    scenes: Run | None  # the run whose scenes are labelled again
+
+
+def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> OpenedSources:
+    """Open the run's sources: those given, else those in its manifest.
+
+    InputError where they do not exist, or differ from those that the run was made from. Without
+    `needs_scenes` the run of --scenes-from may be missing, unless it is given: stored poses suffice to label
+    again.
+    """
+    spec, known = run.manifest.spec, run.manifest.sources
+    world = open_world(
+        spec, given.houses or known.get("houses", "builtin"), given.objects or known.get("objects", "builtin")
+    )
+    if spec.scenes_from is None:
+        return OpenedSources(world, None)
+    try:
+        return OpenedSources(world, source_of(run, given))
+    except InputError:
+        if needs_scenes or given.scenes_from is not None:
+            raise
+        return OpenedSources(world, None)
+
+
+def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
+    """The run whose scenes this one labelled. InputError where it is missing or has other scenes."""
+    place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
+    fix = "Give --scenes-from with the run that this one was started with"
+    if not place:
+        raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
+    source = Run.open(place)
+    if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
+        raise InputError(place, "spec_hash", "has other scenes than this run", fix)
+    return source
+
+
+def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
+    """Compute the shard's rows again; exceptions of the computation are not caught."""
+    first = shard * run.layout.scenes_per_shard
+    scenes = range(first, first + run.layout.scenes_per_shard)
+    stored = None if origin.scenes is None else read_scenes(origin.scenes, scenes)
+    return run_shard(run.manifest.spec, origin.world, scenes, stored, run.schema.version)
+
+
+def regenerated_files(run: Run, made: ShardResult) -> dict[str, bytes]:
+    """Compute the shard's files again, by path in the attempt's folder."""
+    return encode_shard(run.schema, run.layout, run.manifest.spec_hash, made.scene, made.sample)
