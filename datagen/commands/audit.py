@@ -180,11 +180,5 @@ def audit_report(spending: Spending, source: str) -> dict[str, Any]:
 
 
 def _account(account: Account) -> dict[str, Any]:
-    return {
-        "attempts": account.attempts,
-        "without_account": account.unaccounted,
-        "wall_s": account.wall_s,
-        "cpu_s": account.cpu_s,
-        "written_bytes": account.written_bytes,
-        "peak_rss_bytes": account.peak_rss_bytes,
-    }
+    names = ("attempts", "without_account", "wall_s", "cpu_s", "written_bytes", "peak_rss_bytes")
+    return {name: getattr(account, name) for name in names}

@@ -92,14 +92,13 @@ def evaluate(
     # Imported here, so that other verbs do not wait for them and for torch.
     import numpy as np
 
-    from datagen.evaluation_report.baseline_methods import baseline_methods, read_heuristic
     from datagen.evaluation_report.evaluated_runs import (
         candidate_sets_of,
         open_evaluated_runs,
         refuse_seen_houses,
         split_paths,
     )
-    from datagen.evaluation_report.methods import open_models
+    from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
     from datagen.evaluation_report.report import evaluation_report
     from datagen.train.evaluation.columns import gather
 

@@ -10,8 +10,7 @@ from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.command_lines import prints
 from datagen.console.options import AS_FOUND, RunPlace, Sources, Whole
 from datagen.jobs.job import JobRun
-from datagen.jobs.job_report import print_job
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, refuse_odd_n
 from datagen.jobs.start_job import continue_job, source_words
 from datagen.schemas.errors import InputError

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 import time
-from collections import Counter
 from typing import Any
 
 from datagen.cluster.run_recorder import refresh_index
@@ -79,16 +78,13 @@ def remove(place: Storage, garbage: list[Garbage], seen: Seen = lambda done, of:
 
 def gc_report(place: Storage, garbage: list[Garbage], swept: Swept, dry_run: bool) -> dict[str, Any]:
     """Return what was found and removed, as plain values; sizes in bytes."""
-    files, sizes, pieces = Counter[str](), Counter[str](), Counter[str]()
-    for piece in garbage:
-        files[piece.kind] += piece.files
-        sizes[piece.kind] += piece.bytes
-        pieces[piece.kind] += 1
+    of_kind = {kind: [piece for piece in garbage if piece.kind == kind] for kind in KINDS}
     return {
         "run": place.url,
         "dry_run": dry_run,
         "found": {
-            kind: {"pieces": pieces[kind], "files": files[kind], "bytes": sizes[kind]} for kind in KINDS
+            kind: {"pieces": len(of), "files": sum(p.files for p in of), "bytes": sum(p.bytes for p in of)}
+            for kind, of in of_kind.items()
         },
         "removed": {"files": swept.files, "bytes": swept.bytes},
         "committed_meanwhile": swept.spared,

@@ -11,8 +11,7 @@ from datagen.console.command_lines import prints, words_of
 from datagen.console.options import AS_FOUND, RUN, Sources
 from datagen.console.printing import counted
 from datagen.jobs.job import JobRun
-from datagen.jobs.job_report import print_job
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import JobKeywords, JobOptions, absolute_place
 from datagen.jobs.start_job import continue_job, source_words
 from datagen.schemas.quarantine import lift_quarantine

@@ -19,8 +19,7 @@ from datagen.console.command_lines import prints, words_of
 from datagen.console.options import File, Place, Whole
 from datagen.jobs.detach import detach_job
 from datagen.jobs.job import JobRun
-from datagen.jobs.job_report import print_job
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import (
     JobKeywords,
     JobOptions,

@@ -100,14 +100,8 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
 
 def finding_row(finding: Finding) -> dict[str, Any]:
     """A finding as plain values."""
-    return {
-        "file": finding.key,
-        "kind": finding.kind,
-        "problem": finding.problem,
-        "fix": finding.fix,
-        "shard": finding.shard,
-        "repairable": finding.cure is not None,
-    }
+    fields = {name: getattr(finding, name) for name in ("kind", "problem", "fix", "shard")}
+    return {"file": finding.key, **fields, "repairable": finding.cure is not None}
 
 
 def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,9 @@ from datagen.workers.extras import EXTRAS, how_to_get
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
-def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
+def _count(name: str, ref: str, names: Callable[[], Sequence[str]]) -> Check:
     try:
-        n = count(ref)
+        n = len(names())
     except InputError as error:
         return Check(name, "fail", f"{error.place}: {error.problem}", error.fix)
     if n == 0:
@@ -33,26 +33,21 @@ def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
     return Check(name, "ok", f"{n} from {ref}")
 
 
-def _houses(ref: str) -> int:
-    from datagen.workers.houses import open_houses
-
-    return len(open_houses(ref).house_ids())
-
-
-def _objects(ref: str) -> int:
-    from datagen.workers.objects import open_objects
-
-    return len(open_objects(ref).names())
-
-
 def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
     """Checks of houses and objects: those given, else those in DATAGEN_ASSETS, else the built-in ones."""
+    from datagen.workers.houses import open_houses
+    from datagen.workers.objects import open_objects
+
     root = os.environ.get("DATAGEN_ASSETS")
     if root and houses is None and (Path(root) / "procthor").is_dir():
         houses = f"procthor:{Path(root) / 'procthor'}"
     if root and objects is None and (Path(root) / "ycb").is_dir():
         objects = f"ycb:{Path(root) / 'ycb'}"
-    return [_count("houses", houses or "builtin", _houses), _count("objects", objects or "builtin", _objects)]
+    houses, objects = houses or "builtin", objects or "builtin"
+    return [
+        _count("houses", houses, lambda: open_houses(houses).house_ids()),
+        _count("objects", objects, lambda: open_objects(objects).names()),
+    ]
 
 
 def extra_checks() -> list[Check]:

@@ -204,7 +204,7 @@ def with_interval(estimate: Report, signed: bool = False) -> str:
     if estimate["value"] is None:
         return "-"
     value, low, high = (percent(estimate[k], signed) for k in ("value", "low", "high"))
-    return f"{value} [{low}, {high}]"
+    return value if estimate["low"] is None else f"{value} [{low}, {high}]"
 
 
 def metres_with_interval(estimate: Report) -> str:

@@ -16,7 +16,7 @@ from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id

@@ -26,7 +26,7 @@ from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import ShardTask
 from datagen.console.command_lines import command_line
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError

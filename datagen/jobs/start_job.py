@@ -13,7 +13,7 @@ from datagen.console.printing import counted
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.job import JobPlan, JobRun, run_job
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
 from datagen.regeneration.scenes import open_sources
 from datagen.schemas.errors import InputError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 
@@ -79,7 +79,10 @@ def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     """Open a run to make its scenes again from its sources."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
-        drawn_by = _source_if_there(drawn_by)
+        try:
+            drawn_by = source_of(drawn_by)
+        except InputError:
+            drawn_by = None
     if drawn_by is run:
         return Replayer(run, origin.world, origin.world)
     if drawn_by is None:
@@ -87,13 +90,6 @@ def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     houses, objects = origin.world.houses, origin.world.objects
     drawing = assemble_world(drawn_by.manifest.spec, houses, objects, "--houses", "--objects")
     return Replayer(run, origin.world, drawing)
-
-
-def _source_if_there(run: Run) -> Run | None:
-    try:
-        return source_of(run)
-    except InputError:
-        return None
 
 
 def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:
@@ -111,8 +107,10 @@ def what_differs_here(run: Run, shard: int | None = None) -> list[str]:
     found: list[str] = []
     if _platform_name(manifest.platform) != _platform_name(platform.platform()):
         found.append(f"platform {manifest.platform}, here {platform.platform()}")
-    for name, (made, here) in _differing(manifest.spec.engines, _engines_here(run)):
-        found.append(f"{name} {made}, here {here}")
+    here = _engines_here(run)
+    for name, made in sorted(manifest.spec.engines.items()):
+        if made != (there := here.get(name, "none")):
+            found.append(f"{name} {made}, here {there}")
     if shard is not None:
         cpu = run.commit_of(shard).host.cpu
         if cpu != this_host().cpu:
@@ -126,11 +124,6 @@ def _engines_here(run: Run) -> dict[str, str]:
         return scene_engines(spec) | label_engines(spec.label_source)
     except (PackageNotFoundError, InputError):
         return {}
-
-
-def _differing(made: Mapping[str, str], here: Mapping[str, str]) -> list[tuple[str, tuple[str, str]]]:
-    pairs = {name: (version, here.get(name, "none")) for name, version in made.items()}
-    return [(name, pair) for name, pair in sorted(pairs.items()) if pair[0] != pair[1]]
 
 
 def _platform_name(text: str) -> tuple[str, str]:

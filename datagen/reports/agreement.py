@@ -189,7 +189,7 @@ def read_labelled(run: Run) -> Labelled | None:
     """
     has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
     names = [*_COLUMNS, "object_name", *(["outcome"] if has_outcome else [])]
-    shards = [_read(run, shard, names) for shard in sorted(run.committed())]
+    shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
     if not shards:
         return None
     per_scene = run.layout.candidates_per_scene
@@ -211,7 +211,3 @@ def join_labelled(parts: list[Labelled]) -> Labelled:
     rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
     outcomes = [part.outcome for part in parts if part.outcome is not None]
     return Labelled(**rows, outcome=np.concatenate(outcomes) if outcomes else None)
-
-
-def _read(run: Run, shard: int, names: list[str]) -> dict[str, Array]:
-    return read_committed(run.storage, run.commit_of(shard), names)
