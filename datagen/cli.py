@@ -204,6 +204,7 @@ def _call(app: App, words: Sequence[str]) -> int:
     except Interrupted as interrupted:
         result = interrupted.result
     if printer is not None:
+        bound.apply_defaults()
         return printer(result, **bound.arguments)
     return result if isinstance(result, int) else EXIT_GOOD
 
