@@ -77,10 +77,7 @@ _EXTRA_OF: dict[str, str] = dict.fromkeys(("train", "evaluate", "predict", "cali
 
 
 def build_app(called: str = "") -> App:
-    """Return the command line with every verb of `VERBS` registered and none imported.
-
-    The docstring of the verb that is called is its help text.
-    """
+    """The command line, no verb imported but `called`, whose docstring is its help text."""
     headings = [(Group.create_ordered(name), verbs) for name, verbs in _HEADINGS.items()]
     groups = {verb: group for group, verbs in headings for verb in verbs}
     app = App(

@@ -115,10 +115,7 @@ CATALOGUE: dict[str, CatalogueEntry] = {asset.name: asset for asset in _ALL}
 
 
 def select(names: tuple[str, ...] | list[str]) -> list[CatalogueEntry]:
-    """Assets by name or by group (`procthor-10k`, `ycb-scans`), in catalogue order, each once.
-
-    Raises KeyError with the first unknown name.
-    """
+    """Assets by name or group, in catalogue order, each once. KeyError with the first unknown name."""
     chosen: set[str] = set()
     for name in names:
         matches = {key for key in CATALOGUE if key == name or key.startswith(f"{name}/")}

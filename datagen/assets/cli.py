@@ -32,11 +32,7 @@ app = App(name="assets", help="List, fetch, lock and verify houses and objects."
 
 
 @app.command(name="list")
-def list_assets(
-    folder: Path | None = None,
-    *,
-    json: AsJson = False,
-) -> int:
+def list_assets(folder: Path | None = None, *, json: AsJson = False) -> int:
     """List the assets that can be fetched or, with a folder, the files in its lock file.
 
     Args:
@@ -70,11 +66,7 @@ def list_assets(
 
 @app.command
 def lock(
-    folder: Folder,
-    *,
-    licence: str | None = None,
-    source: str | None = None,
-    json: AsJson = False,
+    folder: Folder, *, licence: str | None = None, source: str | None = None, json: AsJson = False
 ) -> int:
     """Write the sha256, size, licence and source of every file to assets.lock.json.
 

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry
 from datagen.assets.download import DownloadPolicy, Progress, download
-from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
+from datagen.assets.lock import Lock, LockedDownload, locked_file, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
@@ -109,14 +109,7 @@ def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
 def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEntry, files: list[str]) -> None:
     table = {old.path: old for old in lock.files}
     for relative in files:
-        path = folder / relative
-        table[relative] = LockedFile(
-            path=relative,
-            sha256=sha256_of(path),
-            size=path.stat().st_size,
-            licence=asset.licence,
-            source=asset.url,
-        )
+        table[relative] = locked_file(folder, relative, asset.licence, asset.url)
     downloads = {old.name: old for old in lock.downloads} | {entry.name: entry}
     write_lock(
         folder,

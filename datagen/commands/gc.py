@@ -21,14 +21,7 @@ _UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _SHOWN = 100
 
 
-def gc(
-    run: RunPlace,
-    /,
-    *,
-    older_than: str = "24h",
-    dry_run: bool = False,
-    json: AsJson = False,
-) -> int:
+def gc(run: RunPlace, /, *, older_than: str = "24h", dry_run: bool = False, json: AsJson = False) -> int:
     """Remove files that no commit names: of superseded or unfinished attempts, drafts and probes.
 
     Committed files and records of the ledger are never removed, nor are files of attempts that began after
@@ -102,7 +95,6 @@ def _print(place: str, report: dict[str, Any]) -> None:
     print_rows(f"{done} from {place}", rows, ("kind", "pieces", "files", "size"))
     if report["committed_meanwhile"]:
         print_rows("committed meanwhile and kept", [("attempts", str(report["committed_meanwhile"]))])
-    if report["damaged"]:
-        fix = f"datagen repair {shlex.quote(place)}"
-        rows = [(key, fix) for key in report["damaged"][:_SHOWN]]
-        print_rows("committed while their files were removed", rows, ("commit", "fix"))
+    fix = f"datagen repair {shlex.quote(place)}"
+    rows = [(key, fix) for key in report["damaged"][:_SHOWN]]
+    print_rows("committed while their files were removed", rows, ("commit", "fix"))

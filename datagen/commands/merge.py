@@ -69,11 +69,7 @@ def _origin(origin: dict[str, Any]) -> str:
 
 @prints(print_merged)
 def merge(
-    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")],
-    /,
-    *,
-    out: Place,
-    json: AsJson = False,
+    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")], /, *, out: Place, json: AsJson = False
 ) -> dict[str, Any]:
     """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.
 

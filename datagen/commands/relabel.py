@@ -11,7 +11,7 @@ from typing import Literal
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
-from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
+from datagen.relabelling import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import Storage, open_storage

@@ -23,14 +23,7 @@ if TYPE_CHECKING:
     from datagen.regeneration.scenes import OpenedSources
 
 
-def repair(
-    run: RunPlace,
-    /,
-    *,
-    workers: Whole = 0,
-    given: Sources = AS_FOUND,
-    json: AsJson = False,
-) -> int:
+def repair(run: RunPlace, /, *, workers: Whole = 0, given: Sources = AS_FOUND, json: AsJson = False) -> int:
     """Check a run as `datagen verify` does, fix the damage, and check again.
 
     Records are restored from their second copies. Bad shards are made again, and a file is written only if it

@@ -13,7 +13,7 @@ from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.drawing.replay_picture import draw_replay
-from datagen.drawing.shown import Shown
+from datagen.drawing.scene_picture import Shown
 from datagen.regeneration.scenes import (
     OpenedSources,
     chosen_rows,

@@ -9,8 +9,7 @@ from datagen.configuration.arms import refuse_missing_packages
 from datagen.console.options import AS_FOUND, AssetSources, RunPlace, Whole, refuse_output
 from datagen.console.printing import print_rows
 from datagen.drawing.arm_picture import draw_arm_picture
-from datagen.drawing.scene_picture import draw_scene_picture
-from datagen.drawing.shown import Shown
+from datagen.drawing.scene_picture import Shown, draw_scene_picture
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import find_scene, open_runs
 from datagen.schemas.scene_rows import read_scene
@@ -21,13 +20,7 @@ _BEST = "best"
 
 
 def show(
-    run: RunPlace,
-    /,
-    *,
-    out: Path,
-    scene: Whole = 0,
-    trial: str | None = None,
-    given: AssetSources = AS_FOUND,
+    run: RunPlace, /, *, out: Path, scene: Whole = 0, trial: str | None = None, given: AssetSources = AS_FOUND
 ) -> int:
     """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
 

@@ -212,10 +212,7 @@ def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None
 def manifest_of(
     spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
 ) -> Manifest:
-    """The manifest of a new run in shards of this layout.
-
-    `schema_version` is that of the run whose scenes are labelled: fields that its rows lack cannot be stored.
-    """
+    """The manifest of a new run; `schema_version` is that of the run whose scenes are labelled."""
     source = load_label_source(spec.label_source)
     newest = SCHEMAS[source.schema].version
     return Manifest(

@@ -51,10 +51,7 @@ def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
 
 
 def extra_checks() -> list[Check]:
-    """One finding an extra: what it gives, and how to get it where it is not installed.
-
-    Only labels are asked of a machine: without the first extra it fails, the others are a choice.
-    """
+    """One finding an extra: what it gives, and how to get it. Only `labels` is asked of a machine."""
     checks: list[Check] = []
     for name, extra in EXTRAS.items():
         if missing := extra.missing():
@@ -87,12 +84,7 @@ def as_table(checks: list[Check]) -> Table:
     return table
 
 
-def doctor(
-    *,
-    json: AsJson = False,
-    houses: str | None = None,
-    objects: str | None = None,
-) -> int:
+def doctor(*, json: AsJson = False, houses: str | None = None, objects: str | None = None) -> int:
     """Check this machine, and show how to fix what is missing.
 
     Exit code 0 when labels can be made here, else 1.

@@ -20,8 +20,7 @@ from datagen.drawing.floor_plan import (
     draw_scores,
 )
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
-from datagen.drawing.scene_picture import best_clear, positives, scene_facts
-from datagen.drawing.shown import Columns, Lines, Shown
+from datagen.drawing.scene_picture import Columns, Lines, Shown, best_clear, positives, scene_facts
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts

@@ -112,10 +112,7 @@ def film_of(
 
 
 def told_moments(recording: Recording) -> Told:
-    """The eight moments of a filmstrip as (row, name); fewer in a shorter recording.
-
-    Where the trial ended early, further moments fill the gaps.
-    """
+    """The eight moments of a filmstrip as (row, name); gaps of one that ended early are filled."""
     phase = np.array(recording.phase)
     told: dict[int, str] = {}
     for name, share, words in _MOMENTS:

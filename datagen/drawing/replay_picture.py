@@ -17,7 +17,7 @@ from datagen.drawing.floor_plan import (
     half_width_m,
     object_outlines,
 )
-from datagen.drawing.shown import Shown
+from datagen.drawing.scene_picture import Shown
 from datagen.schemas.styles import LABEL_STYLES, SAMPLE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
 from datagen.workers.scenes.reconstruct import ReconstructedScene

@@ -19,7 +19,7 @@ from datagen.drawing.filmstrip import (
     write_sheet,
 )
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.drawing.shown import Lines, Shown
+from datagen.drawing.scene_picture import Lines, Shown
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
@@ -143,10 +143,7 @@ class Retrial:
 
 
 def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
-    """Plan, and for `sim` execute, candidate `row` again, and record the poses.
-
-    Of several executions, the last with the candidate's outcome is shown.
-    """
+    """Plan, and for `sim` execute, candidate `row` again; the last execution with its outcome is shown."""
     at = arm_in_scene(scene, candidates, row, spec, StageClock())
     trial = try_candidate(at, candidates, row, spec, record=True)
     T_world_base = at.base_pose(candidates, row)

@@ -156,10 +156,7 @@ def svg_of(figure: Figure, name: str) -> str:
 def draw_examples(
     examples: Sequence[Example], columns: Columns, records: Sequence[Mapping[str, Any]]
 ) -> Figure:
-    """One row per scene: the cloud from above, the truth, and each method's scores with its pick.
-
-    Up to five methods are shown: the models, then the first baselines.
-    """
+    """One row per scene: the cloud from above, the truth, and the scores and picks of up to five methods."""
     order = sorted(records, key=lambda record: record["regime"] is None)[:_MOST_METHODS]
     names = [record["name"] for record in order]
     figure = new_figure(_PANEL_IN * (2 + len(names)), 0.55 + _PANEL_IN * len(examples) * 1.08)

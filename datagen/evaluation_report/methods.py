@@ -113,10 +113,7 @@ class BaselineMethods:
 
 
 def read_heuristic(path: Path, runs: Sequence[EvaluatedRun], allow_seen_houses: bool) -> HeuristicParams:
-    """Read the rule's parameters from a file of `datagen calibrate`.
-
-    InputError where it has none, or where they were fitted on one of `runs`.
-    """
+    """The rule of a file of `datagen calibrate`. InputError where it was fitted on one of `runs`."""
     fix = "Give a file of `datagen calibrate`"
     section = read_toml(path, fix).get("heuristic")
     if not isinstance(section, dict):

@@ -292,5 +292,5 @@ def print_evaluation(report: Report) -> None:
 
 
 def _print(shown: TitledTable | None) -> None:
-    if shown is not None and shown.rows:
+    if shown is not None:
         print_rows(shown.title, shown.rows, shown.heads)

@@ -61,10 +61,7 @@ def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> Job
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
-    """Write the environment variables of stores and caches for one job; return the file.
-
-    The job removes it at its end. Files of killed jobs are removed here.
-    """
+    """The file with the shell's variables for one job, which removes it; those of killed jobs go here."""
     for left in folder.glob("datagen-*.json"):
         if jobs.state(left.stem) in ENDED:
             left.unlink(missing_ok=True)

@@ -9,8 +9,7 @@ from typing import Any, Literal
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
 from datagen.schemas.errors import one_line
-from datagen.schemas.jobs import Jobs, StoredJob
-from datagen.schemas.storage import Storage
+from datagen.schemas.jobs import StoredJob
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +42,6 @@ class JobResult:
     def exit_code(self) -> int:
         """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
         return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
-
-
-def jobs_report(place: Storage) -> list[dict[str, Any]]:
-    """Every job of the run, the oldest first."""
-    return [job_report(job) for job in Jobs(place).all()]
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:

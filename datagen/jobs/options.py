@@ -90,10 +90,7 @@ def refuse_odd_n(n: int) -> None:
 
 @contextmanager
 def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
-    """Show the phase in which sources are opened, and print how to resume when it is interrupted.
-
-    Gives its start by the monotonic clock.
-    """
+    """Show that sources are opened, and how to resume after an interrupt; gives the start by the clock."""
     began_s = time.monotonic()
     with resumable([*words, *job_options.address_words()]), job_options.display() as shown:
         shown.phase("opening houses and objects")

@@ -94,10 +94,7 @@ def start_job(
     command: Sequence[str],
     given: Sources = AS_FOUND,
 ) -> JobResult:
-    """Make the missing shards; `command` is what the user gave, `path` the path as they wrote it.
-
-    Raises Interrupted where the job was asked to stop.
-    """
+    """Make the missing shards. Raises Interrupted where the job was asked to stop."""
     words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
     words += detached_words() or job_options.address_words()
     with resumable(words):

@@ -32,10 +32,7 @@ _FIX = "Give that run with --scenes-from"
 
 @dataclass(frozen=True, eq=False)
 class Replayer:
-    """A run opened to make its scenes again.
-
-    `drawing` samples its scenes; None where they come from another run that does not exist any more.
-    """
+    """A run opened to make its scenes again; `drawing` is None where the run that sampled them is gone."""
 
     run: Run
     world: World

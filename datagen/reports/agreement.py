@@ -183,10 +183,7 @@ def outcome_report(labelled: Labelled) -> dict[str, Any]:
 
 
 def read_labelled(run: Run) -> Labelled | None:
-    """Read all committed candidates of a run, also those beyond n; None where there are none.
-
-    InputError for a missing, foreign or damaged file.
-    """
+    """All committed candidates of a run, also beyond n; None without any. InputError for a damaged file."""
     has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
     names = [*_COLUMNS, "object_name", *(["outcome"] if has_outcome else [])]
     shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
