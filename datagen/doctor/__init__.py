@@ -63,12 +63,6 @@ def extra_checks() -> list[Check]:
     return checks
 
 
-def as_json(checks: list[Check]) -> dict[str, Any]:
-    """`{"ok": bool, "checks": [{"name", "status", "detail", "fix"}, ...]}`, in the order of the table."""
-    good = all(check.status != "fail" for check in checks)
-    return {"ok": good, "checks": [asdict(check) for check in checks]}
-
-
 def as_table(checks: list[Check]) -> Table:
     """A table with one row per check; the fix is below the finding."""
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -98,7 +92,7 @@ def doctor(*, json: AsJson = False, houses: str | None = None, objects: str | No
         checks += asset_checks(houses, objects)
     failures = sum(check.status == "fail" for check in checks)
     if json:
-        print_json(as_json(checks))
+        print_json({"ok": not failures, "checks": [asdict(check) for check in checks]})
     else:
         console = Console(highlight=False)
         console.print(as_table(checks))
