@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.drawing.arm_picture import best_success
-from datagen.drawing.film import Told, film_of, told_moments
+from datagen.drawing.film import Film, Told, told_moments
 from datagen.drawing.filmstrip import (
     MOTION_NEAR_PX,
     MOTION_WIDE_PX,
@@ -75,7 +75,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     )
     sizes = (MOTION_WIDE_PX, MOTION_NEAR_PX) if moving else (SHEET_WIDE_PX, SHEET_NEAR_PX)
     bodies = robot_bodies(robot, shown.spec.candidates.base_radius_m)
-    film = film_of(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
+    film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
     (write_motion if moving else write_sheet)(film, title, out)
     return [
         ("candidate", f"{row} at {shown.place(row)}"),
