@@ -121,15 +121,7 @@ def evaluate(
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
     baseline_set = baseline_methods(
-        baselines,
-        fit,
-        detector,
-        rule,
-        seed,
-        opened,
-        allow_seen_houses,
-        allow_incomplete,
-        json,
+        baselines, fit, detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
     )
     evaluated = [*baseline_set.baselines, *models]
     if not evaluated:
@@ -146,18 +138,7 @@ def evaluate(
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
         gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
-    houses = baseline_set.houses.union(*(model.houses for model in models))
-    report = evaluation_report(
-        gathered,
-        evaluated,
-        opened,
-        sets,
-        seen_houses=houses,
-        fit=fit,
-        left_out=baseline_set.left_out,
-        resamples=bootstrap,
-        seed=seed,
-    )
+    report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed)
     if html is not None:
         from datagen.evaluation_report.page import page_of
 
