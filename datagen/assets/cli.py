@@ -13,6 +13,7 @@ from rich.progress import (
     BarColumn,
     DownloadColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
     TransferSpeedColumn,
@@ -20,7 +21,7 @@ from rich.progress import (
 
 from datagen.assets import lock as locks
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
-from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
+from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
 from datagen.schemas.errors import InputError, choices
@@ -43,10 +44,17 @@ def list_assets(folder: Path | None = None, *, json: AsJson = False) -> int:
         if json:
             print_json({"assets": rows})
         else:
-            print_rows(
-                "assets for `datagen assets fetch`",
-                [(a.name, size(a.size) if a.size else "?", _trust(a), a.licence, a.about) for a in _shown()],
-            )
+            rows = [
+                (
+                    a.name,
+                    size(a.size) if a.size else "?",
+                    "published digest" if a.sha256 else "first use",
+                    a.licence,
+                    a.about,
+                )
+                for a in _shown()
+            ]
+            print_rows("assets for `datagen assets fetch`", rows)
         return 0
     locked = locks.read_lock(folder)
     if locked is None:
@@ -125,16 +133,10 @@ def fetch_assets(
         cache: Folder of kept downloads.
     """
     if not names:
-        raise InputError("datagen assets fetch", "NAME", "is missing", choices(groups()))
-    try:
-        chosen = select(names)
-    except KeyError as error:
-        raise InputError(
-            "datagen assets fetch",
-            str(error.args[0]),
-            "is not an asset",
-            choices(groups(), str(error.args[0])),
-        ) from None
+        fix = choices({name.split("/")[0] for name in CATALOGUE})
+        raise InputError("datagen assets fetch", "NAME", "is missing", fix)
+    chosen = select(names)
+    refuse_full_disk(chosen, out)
     kept = cache or cache_folder() / "downloads"
     console = Console(stderr=True, quiet=json)
     bar = Progress(
@@ -147,31 +149,23 @@ def fetch_assets(
         disable=json or not console.is_terminal,
     )
 
-    def one(asset: CatalogueEntry) -> Fetched:
-        task = bar.add_task(asset.name, total=asset.size)
-        return fetch(
-            asset,
-            out,
-            cache=kept,
-            mirror=mirror,
-            offline=offline,
-            progress=lambda here, total: bar.update(task, completed=here, total=total),
-        )
-
-    def report(done: Fetched) -> None:
-        how = "from the cache" if done.from_cache else "downloaded"
-        trust = "digest as published" if done.trust == "published" else "trusted on first use"
-        console.print(f"{done.name}: {how}, {size(done.size)}, {trust}, {done.files} files", highlight=False)
-
+    results: list[Fetched] = []
     with bar if not json else nullcontext():
-        results = fetch_all(chosen, out, one, report)
+        for asset in chosen:
+            task = bar.add_task(asset.name, total=asset.size)
+
+            def progress(here: int, total: int | None, task: TaskID = task) -> None:
+                bar.update(task, completed=here, total=total)
+
+            done = fetch(asset, out, cache=kept, mirror=mirror, offline=offline, progress=progress)
+            results.append(done)
+            how = "from the cache" if done.from_cache else "downloaded"
+            trust = "digest as published" if done.trust == "published" else "trusted on first use"
+            line = f"{done.name}: {how}, {size(done.size)}, {trust}, {done.files} files"
+            console.print(line, highlight=False)
     if json:
         print_json({"folder": str(out), "fetched": [asdict(result) for result in results]})
     return 0
-
-
-def _trust(asset: CatalogueEntry) -> str:
-    return "published digest" if asset.sha256 else "first use"
 
 
 def _shown() -> list[CatalogueEntry]:
