@@ -14,8 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from datagen.reports.agreement import Labelled, agreement, confusion
-from datagen.reports.label_arrays import read_labelled
+from datagen.reports.agreement import Labelled, agreement, confusion, read_labelled
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams

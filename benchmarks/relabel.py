@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from datagen.relabelling.runs import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage

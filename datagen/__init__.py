@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from datagen.commands.resume import resume
     from datagen.commands.submit import submit
     from datagen.commands.train import train_model
-    from datagen.jobs.job_result import JobResult
+    from datagen.jobs.job_report import JobResult
     from datagen.schemas.errors import InputError
     from datagen.schemas.run import Run
     from datagen.sources import houses, label_sources, objects, robots
@@ -56,7 +56,7 @@ _HOMES = {
     "datagen.commands.resume": ("resume",),
     "datagen.commands.submit": ("submit",),
     "datagen.commands.train": ("train_model",),
-    "datagen.jobs.job_result": ("JobResult",),
+    "datagen.jobs.job_report": ("JobResult",),
     "datagen.schemas.errors": ("InputError",),
     "datagen.schemas.run": ("Run",),
     "datagen.sources": ("houses", "label_sources", "objects", "robots"),

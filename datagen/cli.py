@@ -24,27 +24,31 @@ from cyclopts.exceptions import (
 
 from datagen import __version__
 from datagen.cluster.environment import job_environment
+from datagen.console.command_lines import PRINTER, Interrupted
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+    from typing import Any
 
+    from cyclopts import Argument
     from pydantic import ValidationError
 
 EXIT_GOOD, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 0, 2, 130, 141
 
-# Verb -> (where it is defined, its line in --help). Verbs return an exit code, or None for 0.
+# Verb -> (where it is defined, its line in --help). A verb returns an exit code, or None for 0; one that is
+# also a Python function returns its result and names what prints it (`prints`).
 VERBS: dict[str, tuple[str, str]] = {
-    "submit": ("datagen.commands.submit:verb", "Make labels: start a run, or resume it."),
-    "resume": ("datagen.commands.resume:verb", "Make the missing labels of a run, or of merged runs."),
-    "extend": ("datagen.commands.extend:verb", "Raise the number of labels of a run and make them."),
+    "submit": ("datagen.commands.submit:submit", "Make labels: start a run, or resume it."),
+    "resume": ("datagen.commands.resume:resume", "Make the missing labels of a run, or of merged runs."),
+    "extend": ("datagen.commands.extend:extend", "Raise the number of labels of a run and make them."),
     "cancel": ("datagen.commands.cancel:cancel", "Ask the jobs of a run to stop and wait until they have."),
     "logs": ("datagen.commands.logs:logs", "List what happened in a run, in order of time."),
     "status": ("datagen.commands.status:status", "Show the progress and the failures of a run."),
     "seal": ("datagen.commands.seal:seal", "Make one Zarr store of a run that any Zarr reader opens."),
     "unseal": ("datagen.commands.seal:unseal", "Remove that store; the run keeps every shard."),
-    "merge": ("datagen.commands.merge:verb", "Merge runs into one."),
+    "merge": ("datagen.commands.merge:merge", "Merge runs into one."),
     "verify": ("datagen.commands.verify:verify", "Check every record and every byte of a run."),
     "repair": ("datagen.commands.repair:repair", "Fix the damage that verify finds."),
     "replay": ("datagen.commands.replay:replay", "Make a stored scene again and compare the two."),
@@ -53,9 +57,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
     "gc": ("datagen.commands.gc:gc", "Remove leftover files of a run."),
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
-    "train": ("datagen.commands.train:verb", "Train a model on labels."),
-    "evaluate": ("datagen.commands.evaluate:verb", "Compare models with baselines and the paper."),
-    "predict": ("datagen.commands.predict:verb", "Find a base pose in a depth camera's frame."),
+    "train": ("datagen.commands.train:train_model", "Train a model on labels."),
+    "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
+    "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
     "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
 }
@@ -73,10 +77,7 @@ _EXTRA_OF: dict[str, str] = dict.fromkeys(("train", "evaluate", "predict", "cali
 
 
 def build_app(called: str = "") -> App:
-    """Return the command line with every verb of `VERBS` registered and none imported.
-
-    The docstring of the verb that is called is its help text.
-    """
+    """The command line, no verb imported but `called`, whose docstring is its help text."""
     headings = [(Group.create_ordered(name), verbs) for name, verbs in _HEADINGS.items()]
     groups = {verb: group for group, verbs in headings for verb in verbs}
     app = App(
@@ -88,9 +89,10 @@ def build_app(called: str = "") -> App:
         print_error=False,
         exit_on_error=False,
         suppress_keyboard_interrupt=False,
-        result_action="return_value",
-        # Every flag is off unless given.
-        default_parameter=Parameter(show_default=lambda value: None if value is False else value),
+        # Every flag is off unless given, and there is none to turn it off.
+        default_parameter=Parameter(
+            negative=(), show_default=lambda value: None if value is False else value
+        ),
     )
     for verb, (target, line) in VERBS.items():
         app.command(target, name=verb, help=None if verb == called else line, group=groups.get(verb))
@@ -115,10 +117,18 @@ def _usage_line(error: CycloptsError) -> str:
         problem = f"{named} {lacks}"
         if near := str(error).partition(" Did you mean ")[2]:  # a mistyped option
             return f"{verb}: {problem}. Did you mean {near} {see}"
-        about = (error.argument.parameter.help or "").rstrip(".")
+        about = _help_of(error.argument, error.target).rstrip(".")
         example = re.search(r"For example: (.+)", getdoc(error.target) or "")
         return f"{verb}: {problem}: {about}. {f'{example[0]}. ' if example else ''}{see}"
     return re.sub(r'unable to convert (".*") into float', r"\1 is not a number", f"{error} {see}")
+
+
+def _help_of(argument: Argument, verb: Callable[..., Any] | None) -> str:
+    """The help of an option; that of a docstring is not in what an error carries."""
+    app = App()
+    app.default(verb)
+    documented = app.assemble_argument_collection(parse_docstring=True)
+    return next((a.parameter.help for a in documented if a.name == argument.name), None) or ""
 
 
 def _validation_lines(error: ValidationError) -> list[str]:
@@ -160,7 +170,7 @@ def run(arguments: Sequence[str]) -> int:
     """
     verb = next(iter(arguments), "")
     try:
-        result = build_app(verb)([refuse_not_utf8(word) for word in arguments])
+        code = _call(build_app(verb), [refuse_not_utf8(word) for word in arguments])
         sys.stdout.flush()
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -179,6 +189,20 @@ def run(arguments: Sequence[str]) -> int:
         for line in lines:
             sys.stderr.write(f"error: {one_line(line)}\n")
         return EXIT_BAD_INPUT
+    return code
+
+
+def _call(app: App, words: Sequence[str]) -> int:
+    """Call the verb of a command line, print what it returns, and return the exit code."""
+    command, bound, _ = app.parse_args(words)
+    printer = getattr(command, PRINTER, None)
+    try:
+        result = command(*bound.args, **bound.kwargs)
+    except Interrupted as interrupted:
+        result = interrupted.result
+    if printer is not None:
+        bound.apply_defaults()
+        return printer(result, **bound.arguments)
     return result if isinstance(result, int) else EXIT_GOOD
 
 

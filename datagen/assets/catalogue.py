@@ -7,7 +7,10 @@ trusted on first use and recorded in the folder's lock file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from datagen.schemas.errors import InputError, choices
 
 _GB = 10**9
 _PROCTHOR_10K = "439193522244720b86d8c81cde2e51e3a4d150cf"
@@ -114,15 +117,13 @@ _ALL = (
 CATALOGUE: dict[str, CatalogueEntry] = {asset.name: asset for asset in _ALL}
 
 
-def select(names: tuple[str, ...] | list[str]) -> list[CatalogueEntry]:
-    """Assets by name or by group (`procthor-10k`, `ycb-scans`), in catalogue order, each once.
-
-    Raises KeyError with the first unknown name.
-    """
+def select(names: Sequence[str]) -> list[CatalogueEntry]:
+    """Assets by name or group, in catalogue order, each once. InputError for an unknown one."""
     chosen: set[str] = set()
     for name in names:
         matches = {key for key in CATALOGUE if key == name or key.startswith(f"{name}/")}
         if not matches:
-            raise KeyError(name)
+            groups = {key.split("/")[0] for key in CATALOGUE}
+            raise InputError("datagen assets fetch", name, "is not an asset", choices(groups, name))
         chosen |= matches
     return [asset for key, asset in CATALOGUE.items() if key in chosen]

@@ -13,6 +13,7 @@ from rich.progress import (
     BarColumn,
     DownloadColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
     TransferSpeedColumn,
@@ -20,7 +21,7 @@ from rich.progress import (
 
 from datagen.assets import lock as locks
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
-from datagen.assets.fetch import Fetched, fetch, fetch_all, groups
+from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
 from datagen.schemas.errors import InputError, choices
@@ -32,21 +33,28 @@ app = App(name="assets", help="List, fetch, lock and verify houses and objects."
 
 
 @app.command(name="list")
-def list_assets(
-    folder: Annotated[Path | None, Parameter(help="List the files in the lock file of this folder.")] = None,
-    *,
-    json: AsJson = False,
-) -> int:
-    """List the assets that can be fetched or, with a folder, the files in its lock file."""
+def list_assets(folder: Path | None = None, *, json: AsJson = False) -> int:
+    """List the assets that can be fetched or, with a folder, the files in its lock file.
+
+    Args:
+        folder: List the files in the lock file of this folder.
+    """
     if folder is None:
         rows = [{k: v for k, v in asdict(asset).items() if k != "archive"} for asset in CATALOGUE.values()]
         if json:
             print_json({"assets": rows})
         else:
-            print_rows(
-                "assets for `datagen assets fetch`",
-                [(a.name, size(a.size) if a.size else "?", _trust(a), a.licence, a.about) for a in _shown()],
-            )
+            rows = [
+                (
+                    a.name,
+                    size(a.size) if a.size else "?",
+                    "published digest" if a.sha256 else "first use",
+                    a.licence,
+                    a.about,
+                )
+                for a in _shown()
+            ]
+            print_rows("assets for `datagen assets fetch`", rows)
         return 0
     locked = locks.read_lock(folder)
     if locked is None:
@@ -66,13 +74,14 @@ def list_assets(
 
 @app.command
 def lock(
-    folder: Folder,
-    *,
-    licence: Annotated[str | None, Parameter(help="Licence of all files [unchanged].")] = None,
-    source: Annotated[str | None, Parameter(help="Origin of all files [unchanged].")] = None,
-    json: AsJson = False,
+    folder: Folder, *, licence: str | None = None, source: str | None = None, json: AsJson = False
 ) -> int:
-    """Write the sha256, size, licence and source of every file to assets.lock.json."""
+    """Write the sha256, size, licence and source of every file to assets.lock.json.
+
+    Args:
+        licence: Licence of all files [unchanged].
+        source: Origin of all files [unchanged].
+    """
     written = locks.lock(folder, licence, source)
     total = sum(entry.size for entry in written.files)
     if json:
@@ -104,29 +113,30 @@ def verify(folder: Folder, *, json: AsJson = False) -> int:
 
 @app.command(name="fetch")
 def fetch_assets(
-    *names: Annotated[str, Parameter(help="Assets or groups of `datagen assets list`.")],
-    out: Annotated[Path, Parameter(help="Folder for the assets.")] = Path("assets"),
-    mirror: Annotated[str | None, Parameter(help="http(s) address of a folder with the same files.")] = None,
-    offline: Annotated[bool, Parameter(negative=(), help="Use only the cache.")] = False,
-    cache: Annotated[Path | None, Parameter(help="Folder of kept downloads.")] = None,
+    *names: str,
+    out: Path = Path("assets"),
+    mirror: str | None = None,
+    offline: bool = False,
+    cache: Path | None = None,
     json: AsJson = False,
 ) -> int:
     """Download, check and unpack assets, and record them in the folder's lock file.
 
     An interrupted download continues where it stopped. Files without a published digest are trusted on first
     use: their digest is recorded in the lock file, and later downloads must match it.
+
+    Args:
+        names: Assets or groups of `datagen assets list`.
+        out: Folder for the assets.
+        mirror: http(s) address of a folder with the same files.
+        offline: Use only the cache.
+        cache: Folder of kept downloads.
     """
     if not names:
-        raise InputError("datagen assets fetch", "NAME", "is missing", choices(groups()))
-    try:
-        chosen = select(names)
-    except KeyError as error:
-        raise InputError(
-            "datagen assets fetch",
-            str(error.args[0]),
-            "is not an asset",
-            choices(groups(), str(error.args[0])),
-        ) from None
+        fix = choices({name.split("/")[0] for name in CATALOGUE})
+        raise InputError("datagen assets fetch", "NAME", "is missing", fix)
+    chosen = select(names)
+    refuse_full_disk(chosen, out)
     kept = cache or cache_folder() / "downloads"
     console = Console(stderr=True, quiet=json)
     bar = Progress(
@@ -139,31 +149,23 @@ def fetch_assets(
         disable=json or not console.is_terminal,
     )
 
-    def one(asset: CatalogueEntry) -> Fetched:
-        task = bar.add_task(asset.name, total=asset.size)
-        return fetch(
-            asset,
-            out,
-            cache=kept,
-            mirror=mirror,
-            offline=offline,
-            progress=lambda here, total: bar.update(task, completed=here, total=total),
-        )
-
-    def report(done: Fetched) -> None:
-        how = "from the cache" if done.from_cache else "downloaded"
-        trust = "digest as published" if done.trust == "published" else "trusted on first use"
-        console.print(f"{done.name}: {how}, {size(done.size)}, {trust}, {done.files} files", highlight=False)
-
+    results: list[Fetched] = []
     with bar if not json else nullcontext():
-        results = fetch_all(chosen, out, one, report)
+        for asset in chosen:
+            task = bar.add_task(asset.name, total=asset.size)
+
+            def progress(here: int, total: int | None, task: TaskID = task) -> None:
+                bar.update(task, completed=here, total=total)
+
+            done = fetch(asset, out, cache=kept, mirror=mirror, offline=offline, progress=progress)
+            results.append(done)
+            how = "from the cache" if done.from_cache else "downloaded"
+            trust = "digest as published" if done.trust == "published" else "trusted on first use"
+            line = f"{done.name}: {how}, {size(done.size)}, {trust}, {done.files} files"
+            console.print(line, highlight=False)
     if json:
         print_json({"folder": str(out), "fetched": [asdict(result) for result in results]})
     return 0
-
-
-def _trust(asset: CatalogueEntry) -> str:
-    return "published digest" if asset.sha256 else "first use"
 
 
 def _shown() -> list[CatalogueEntry]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from datagen.assets.catalogue import CATALOGUE, CatalogueEntry
+from datagen.assets.catalogue import CatalogueEntry
 from datagen.assets.download import DownloadPolicy, Progress, download
-from datagen.assets.lock import Lock, LockedDownload, LockedFile, read_lock, sha256_of, write_lock
+from datagen.assets.lock import Lock, LockedDownload, locked_file, read_lock, sha256_of, write_lock
 from datagen.assets.unpack import Limits, unpack
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
@@ -71,13 +71,8 @@ def fetch(
     return Fetched(asset.name, digest, size, trust, from_cache, len(files))
 
 
-def fetch_all(
-    assets: list[CatalogueEntry],
-    folder: Path,
-    fetch_one: Callable[[CatalogueEntry], Fetched],
-    report: Callable[[Fetched], None],
-) -> list[Fetched]:
-    """Fetch assets in order, after a check that the disk has room for the known sizes."""
+def refuse_full_disk(assets: Sequence[CatalogueEntry], folder: Path) -> None:
+    """InputError where the disk has no room for the known sizes."""
     known = sum(asset.size or 0 for asset in assets)
     place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
     free = shutil.disk_usage(place).free
@@ -88,11 +83,6 @@ def fetch_all(
             f"{known:,} bytes are needed and {free:,} are free",
             "Free some space, or use another disk",
         )
-    done: list[Fetched] = []
-    for asset in assets:
-        done.append(fetch_one(asset))
-        report(done[-1])
-    return done
 
 
 def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
@@ -109,14 +99,7 @@ def _install(asset: CatalogueEntry, kept: Path, folder: Path) -> list[str]:
 def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEntry, files: list[str]) -> None:
     table = {old.path: old for old in lock.files}
     for relative in files:
-        path = folder / relative
-        table[relative] = LockedFile(
-            path=relative,
-            sha256=sha256_of(path),
-            size=path.stat().st_size,
-            licence=asset.licence,
-            source=asset.url,
-        )
+        table[relative] = locked_file(folder, relative, asset.licence, asset.url)
     downloads = {old.name: old for old in lock.downloads} | {entry.name: entry}
     write_lock(
         folder,
@@ -125,8 +108,3 @@ def _record(folder: Path, lock: Lock, entry: LockedDownload, asset: CatalogueEnt
             downloads=tuple(downloads[key] for key in sorted(downloads)),
         ),
     )
-
-
-def groups() -> list[str]:
-    """Names for `fetch`: single assets and groups, without the members of groups."""
-    return sorted({name.split("/")[0] for name in CATALOGUE})

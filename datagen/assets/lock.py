@@ -77,6 +77,13 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def locked_file(folder: Path, relative: str, licence: str, source: str) -> LockedFile:
+    """The entry of a file as it is now."""
+    path = folder / relative
+    size = path.stat().st_size
+    return LockedFile(path=relative, sha256=sha256_of(path), size=size, licence=licence, source=source)
+
+
 def read_lock(folder: Path) -> Lock | None:
     """The folder's lock file, or None where there is none. Raises InputError for a damaged one."""
     path = folder / LOCK_NAME
@@ -112,25 +119,14 @@ def write_lock(folder: Path, lock: Lock) -> Path:
 
 
 def lock(folder: Path, licence: str | None = None, source: str | None = None) -> Lock:
-    """Write a lock file of all files as they are now and return it.
-
-    Licence and source of known files are kept, unless given; downloads are kept too.
-    """
+    """Lock all files as they are now. Licence and source of known files stay unless given."""
     before = read_lock(_folder(folder)) or Lock()
-    known = {entry.path: entry for entry in before.files}
+    known = {entry.path: (entry.licence, entry.source) for entry in before.files}
     files: list[LockedFile] = []
     for relative in _files(folder):
-        path = folder / relative
-        old = known.get(relative)
-        files.append(
-            LockedFile(
-                path=relative,
-                sha256=sha256_of(path),
-                size=path.stat().st_size,
-                licence=licence if licence is not None else old.licence if old else "unknown",
-                source=source if source is not None else old.source if old else "",
-            )
-        )
+        old_licence, old_source = known.get(relative, ("unknown", ""))
+        given = (old_licence if licence is None else licence, old_source if source is None else source)
+        files.append(locked_file(folder, relative, *given))
     if not files:
         raise InputError(folder, "", "has no files to lock", "Name the folder of assets")
     after = Lock(files=tuple(files), downloads=before.downloads)

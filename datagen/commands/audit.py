@@ -10,9 +10,8 @@ from cyclopts import Parameter
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.reports.agreement import common_candidates, compare, outcome_report
+from datagen.reports.agreement import common_candidates, compare, join_labelled, outcome_report, read_labelled
 from datagen.reports.audit_tables import print_pair, print_ratios, print_source
-from datagen.reports.label_arrays import join_labelled, read_labelled
 from datagen.reports.specification_summary import is_disturbed, made_from
 from datagen.reports.spending import Account, Spending, account_for
 from datagen.schemas.cost import STAGES
@@ -31,15 +30,10 @@ _FIDELITY = ("heuristic", "plan", "sim")
 
 
 def audit(
-    runs: Annotated[
-        list[str], Parameter(name="RUN...", negative=(), help="Runs of one or several label sources.")
-    ],
+    runs: Annotated[list[str], Parameter(name="RUN...")],
     /,
     *,
-    candidates: Annotated[
-        Literal["grid", "clear", "in-range"],
-        Parameter(help="Candidates whose outcomes and agreement are counted; grid: all."),
-    ] = "grid",
+    candidates: Literal["grid", "clear", "in-range"] = "grid",
     json: AsJson = False,
 ) -> int:
     """Show the cost of labels by stage, the waste, and a projection to 180,000 labels.
@@ -48,6 +42,10 @@ def audit(
     labels of the same candidates (--scenes-from) are compared pair by pair.
 
     For example: datagen audit runs/first
+
+    Args:
+        runs: Runs of one or several label sources.
+        candidates: Candidates whose outcomes and agreement are counted; grid: all.
     """
     if not runs:
         raise InputError("datagen audit", "RUN", "is missing", "Name one or more run folders")
@@ -182,11 +180,5 @@ def audit_report(spending: Spending, source: str) -> dict[str, Any]:
 
 
 def _account(account: Account) -> dict[str, Any]:
-    return {
-        "attempts": account.attempts,
-        "without_account": account.unaccounted,
-        "wall_s": account.wall_s,
-        "cpu_s": account.cpu_s,
-        "written_bytes": account.written_bytes,
-        "peak_rss_bytes": account.peak_rss_bytes,
-    }
+    names = ("attempts", "without_account", "wall_s", "cpu_s", "written_bytes", "peak_rss_bytes")
+    return {name: getattr(account, name) for name in names}

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
+from datagen.console.options import AllowIncomplete, AsJson, Whole, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.evaluation_report.report_tables import with_interval
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError, one_line, printable
 from datagen.schemas.merged_runs import open_runs
@@ -44,25 +44,17 @@ class _Calibrated:
 
 
 def calibrate(
-    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs of sim or plan labels.")],
+    runs: Annotated[list[str], Parameter(name="RUN...")],
     /,
     *,
-    out: Annotated[Path, Parameter(help="The .toml file to write; it must not exist.")],
-    candidates: Annotated[Sets, Parameter(help="The candidates to fit on.")] = "clear",
-    distance: Annotated[
-        Literal[Form, "any"], Parameter(help="Distance that the score depends on; any: the best.")
-    ] = "planar",
-    objective: Annotated[
-        Literal["balanced", "accuracy"], Parameter(help="What is maximised: balanced accuracy or accuracy.")
-    ] = "balanced",
-    fit_alpha: Annotated[
-        bool, Parameter(negative=(), help="Also fit the weight of the visibility score.")
-    ] = False,
-    split_check: Annotated[
-        bool, Parameter(negative=(), help="Fail, instead of warn, where a run is not of --split val.")
-    ] = False,
-    bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the folds and the resamples.")] = 0,
+    out: Path,
+    candidates: Sets = "clear",
+    distance: Literal[Form, "any"] = "planar",
+    objective: Literal["balanced", "accuracy"] = "balanced",
+    fit_alpha: bool = False,
+    split_check: bool = False,
+    bootstrap: Whole = 1000,
+    seed: Whole = 0,
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
 ) -> int:
@@ -73,8 +65,22 @@ def calibrate(
     --config FILE` and `datagen relabel RUN --config FILE` accept.
 
     For example: datagen calibrate runs/sim-val --out rule.toml
+
+    Args:
+        runs: Runs of sim or plan labels.
+        out: The .toml file to write; it must not exist.
+        candidates: The candidates to fit on.
+        distance: Distance that the score depends on; any: the best.
+        objective: What is maximised: balanced accuracy or accuracy.
+        fit_alpha: Also fit the weight of the visibility score.
+        split_check: Fail, instead of warn, where a run is not of --split val.
+        bootstrap: Resamples of scenes for each interval.
+        seed: Seed of the folds and the resamples.
     """
-    _refuse_odd(out, bootstrap, seed)
+    refuse_odd_draws(bootstrap, seed)
+    refuse_output(out, "--out", ".toml")
+    if out.exists() or out.is_symlink():
+        raise InputError(out, "--out", "already exists", "Choose another name, or remove it first")
     specs, warnings = _specifications(runs, candidates, split_check)
     from datagen.train.heuristic_fit import FOLDS, FORMS, refuse_too_little
 
@@ -116,13 +122,6 @@ def calibrate(
     print_rows(f"{title}: {out}", list(_rows(report)), ("", "before", "after", "gain", "fitted houses"))
     print_rows("[heuristic]", list(_parameter_rows(made)), ("", "before", "after", "over folds"))
     return 0
-
-
-def _refuse_odd(out: Path, bootstrap: int, seed: int) -> None:
-    refuse_odd_draws(bootstrap, seed)
-    refuse_output(out, "--out", ".toml")
-    if out.exists() or out.is_symlink():
-        raise InputError(out, "--out", "already exists", "Choose another name, or remove it first")
 
 
 def _specifications(
@@ -245,19 +244,11 @@ def _estimate(estimate: Estimate) -> dict[str, float | None]:
 def _rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     columns = [report[name] for name in ("before", "after", "gain", "on_the_fitted")]
     for metric, words in _METRICS.items():
-        shown = [_percent(column[metric], signed=column is report["gain"]) for column in columns]
+        shown = [with_interval(column[metric], signed=column is report["gain"]) for column in columns]
         yield (f"{words} (%)", *shown)
     for count in _COUNTS:
         before, after, _, fitted = (column.get("confusion", {}).get(count, 0) for column in columns)
         yield (count.replace("_", " "), f"{before:,}", f"{after:,}", f"{after - before:+,}", f"{fitted:,}")
-
-
-def _percent(estimate: dict[str, float | None], signed: bool = False) -> str:
-    if estimate["value"] is None:
-        return "-"
-    sign = "+" if signed else ""
-    value, low, high = (format(100 * (estimate[k] or 0.0), f"{sign}.1f") for k in ("value", "low", "high"))
-    return value if estimate["low"] is None else f"{value} [{low}, {high}]"
 
 
 def _parameter_rows(made: _Calibrated) -> Iterator[tuple[str, ...]]:
@@ -284,7 +275,11 @@ def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
         f"{report['scenes']:,} scenes in {report['houses']:,} houses",
         f"objective {_METRICS.get(report['objective'], 'balanced accuracy')}, seed {report['seed']}; "
         f"intervals from {report['resamples']:,} resamples of scenes",
-        *(f"{words} (%): {_told(report, metric)}" for metric, words in _METRICS.items()),
+        *(
+            f"{words} (%): before {with_interval(report['before'][metric])}, "
+            f"after {with_interval(report['after'][metric])} in houses left out of the fit"
+            for metric, words in _METRICS.items()
+        ),
         *(f"warning {warning}" for warning in report["warnings"]),
     ]
     comments = "".join(f"# {printable(line)}\n" for line in lines)
@@ -293,11 +288,6 @@ def _toml(report: dict[str, Any], command: str, params: HeuristicParams) -> str:
         for name, value in params.model_dump().items()
     )
     return f"{comments}\n[heuristic]\n{section}"
-
-
-def _told(report: dict[str, Any], metric: str) -> str:
-    before, after = (_percent(report[name][metric]) for name in ("before", "after"))
-    return f"before {before}, after {after} in houses left out of the fit"
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -29,16 +28,10 @@ _GIVE_UP_S = 180.0
 
 
 def cancel(
-    run: Annotated[
-        str | None, Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")
-    ] = None,
+    run: Annotated[str | None, Parameter(name="RUN")] = None,
     *,
-    now: Annotated[
-        bool, Parameter(negative=(), help="Kill the running attempts instead of letting them commit.")
-    ] = False,
-    head: Annotated[
-        bool, Parameter(negative=(), help="Stop the Ray head of this machine that runs detached jobs.")
-    ] = False,
+    now: bool = False,
+    head: bool = False,
     json: AsJson = False,
 ) -> int:
     """Ask every job of a run to stop, and wait until it has. Committed shards are kept.
@@ -48,6 +41,11 @@ def cancel(
     in force. Exit code 0 when every job has ended, 1 when one has not.
 
     For example: datagen cancel runs/first
+
+    Args:
+        run: Folder or s3:// address of a run or of merged runs.
+        now: Kill the running attempts instead of letting them commit.
+        head: Stop the Ray head of this machine that runs detached jobs.
     """
     if head:
         if run is not None:
@@ -62,7 +60,7 @@ def cancel(
     asked = [job for job in jobs.all() if job.health() in ("live", "silent")]
     for job in asked:
         jobs.ask_to_stop(job.id, now)
-    ended = [_await_end(jobs, job, _say) for job in asked]
+    ended = [_await_end(jobs, job) for job in asked]
     living = [job for job in ended if job.health() not in ("ended", "dead")]
     if json:
         print_json({"run": place.url, "jobs": [job_report(job) for job in ended]})
@@ -81,7 +79,7 @@ def cancel(
     return 1 if living else 0
 
 
-def _await_end(jobs: Jobs, job: StoredJob, say: Callable[[str], None]) -> StoredJob:
+def _await_end(jobs: Jobs, job: StoredJob) -> StoredJob:
     """Return the job once it has ended, is dead, or does not answer."""
     since_s, told, stopped = time.monotonic(), "", False
     while True:
@@ -100,7 +98,7 @@ def _await_end(jobs: Jobs, job: StoredJob, say: Callable[[str], None]) -> Stored
             return job
         line = health_line(job)
         if line.partition(", heard")[0] != told.partition(", heard")[0]:
-            say(f"{job.id}: {line}")
+            _say(f"{job.id}: {line}")
             told = line
         time.sleep(_LOOK_S)
 

@@ -8,84 +8,28 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from datagen.console.options import AllowIncomplete, AsJson, refuse_odd_draws, refuse_output
+from datagen.console.command_lines import prints
+from datagen.console.options import (
+    AllowIncomplete,
+    AsJson,
+    File,
+    Places,
+    Whole,
+    refuse_odd_draws,
+    refuse_output,
+)
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 
-def verb(
-    places: Annotated[
-        list[str],
-        Parameter(
-            name="PATH...",
-            negative=(),
-            help="Checkpoints of `datagen train`, and runs of sim or plan labels.",
-        ),
-    ],
-    /,
-    *,
-    candidates: Annotated[
-        list[Literal["grid", "clear", "in-range"]] | None,
-        Parameter(negative=(), help="Candidate set to report; repeat for more [all in the runs]."),
-    ] = None,
-    fit: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Run in validation houses to fit baselines on; repeat for more."),
-    ] = None,
-    baselines: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Baseline to compare with, or none; repeat for more [all]."),
-    ] = None,
-    detector: Annotated[
-        Path | None, Parameter(help="Folder of a zero-shot object detector, for the detector baseline.")
-    ] = None,
-    heuristic: Annotated[
-        Path | None, Parameter(help="Parameters of the analytic baseline, from `datagen calibrate`.")
-    ] = None,
-    bootstrap: Annotated[int, WHOLE_NUMBER, Parameter(help="Resamples of scenes for each interval.")] = 1000,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of the resamples and example scenes.")] = 0,
-    allow_seen_houses: Annotated[
-        bool, Parameter(negative=(), help="Report training houses separately instead of failing.")
-    ] = False,
-    allow_incomplete: AllowIncomplete = False,
-    threads: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="CPU threads of the models [chosen by torch].")
-    ] = None,
-    html: Annotated[
-        Path | None, Parameter(help="HTML page to write, with tables, curves and example grids.")
-    ] = None,
-    json: AsJson = False,
-) -> int:
-    """Compare models with baselines and the paper: accuracy, reach, grid selection and calibration.
-
-    Methods are compared over candidate sets (grid: all cells; clear: where the base fits; in-range: clear and
-    within the arm's reach), with intervals by resampling scenes. Files are checkpoints; folders and s3://
-    addresses are runs. Runs with a house that a model was trained on are refused.
-
-    For example: datagen evaluate model.ckpt runs/sim-test --html report.html
-    """
-    report = evaluate(
-        places,
-        candidates=candidates,
-        fit=fit,
-        baselines=baselines,
-        detector=detector,
-        heuristic=heuristic,
-        bootstrap=bootstrap,
-        seed=seed,
-        allow_seen_houses=allow_seen_houses,
-        allow_incomplete=allow_incomplete,
-        threads=threads,
-        html=html,
-        json=json,
-    )
+def print_report(report: dict[str, Any], json: bool, html: Path | None = None, **_: Any) -> int:
+    """Print the tables of an evaluation."""
     if json:
         print_json(report)
         return 0
-    from datagen.evaluation_report.terminal import print_evaluation
+    from datagen.evaluation_report.report_tables import print_evaluation
 
     print_evaluation(report)
     if html is not None:
@@ -93,40 +37,49 @@ def verb(
     return 0
 
 
+@prints(print_report)
 def evaluate(
-    paths: Sequence[str | Path],
+    paths: Annotated[Sequence[str | Path], Parameter(name="PATH...")],
+    /,
     *,
     candidates: Sequence[Literal["grid", "clear", "in-range"]] | None = None,
-    fit: Sequence[str | Path] | None = None,
+    fit: Places | None = None,
     baselines: Sequence[str] | None = None,
-    detector: str | Path | None = None,
-    heuristic: str | Path | None = None,
-    bootstrap: int = 1000,
-    seed: int = 0,
+    detector: File | None = None,
+    heuristic: File | None = None,
+    bootstrap: Whole = 1000,
+    seed: Whole = 0,
     allow_seen_houses: bool = False,
-    allow_incomplete: bool = False,
-    threads: int | None = None,
-    html: str | Path | None = None,
-    json: bool = False,
+    allow_incomplete: AllowIncomplete = False,
+    threads: Whole | None = None,
+    html: File | None = None,
+    json: AsJson = False,
 ) -> dict[str, Any]:
-    """Compare models and baselines with simulated labels; return tables and curves as plain values.
+    """Compare models with baselines and the paper: accuracy, reach, grid selection and calibration.
 
-    The result is what `datagen evaluate --json` prints; docs/guides/evaluate.md describes it.
+    Methods are compared over candidate sets (grid: all cells; clear: where the base fits; in-range: clear and
+    within the arm's reach), with intervals by resampling scenes. Files are checkpoints; folders and s3://
+    addresses are runs. Runs with a house that a model was trained on are refused.
+
+    For example: datagen evaluate model.ckpt runs/sim-test --html report.html
 
     Args:
-        paths: Checkpoints of `train_model`, and runs of sim (or plan) labels.
-        candidates: Candidate sets to report [all in the runs].
-        fit: Runs in validation houses, to fit baselines on.
-        baselines: Names of baselines, or ["none"] [all].
-        detector: Folder of a zero-shot object detector, for the baseline with one.
-        heuristic: Parameters of the analytic baseline, as `datagen calibrate` writes them.
-        bootstrap: Resamples of scenes behind each interval.
-        seed: Seed of resamples and of the scenes shown.
+        paths: Checkpoints of `datagen train`, and runs of sim or plan labels.
+        candidates: Candidate set to report; repeat for more [all in the runs].
+        fit: Run in validation houses to fit baselines on; repeat for more.
+        baselines: Baseline to compare with, or none; repeat for more [all].
+        detector: Folder of a zero-shot object detector, for the detector baseline.
+        heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
+        bootstrap: Resamples of scenes for each interval.
+        seed: Seed of the resamples and example scenes.
         allow_seen_houses: Report training houses separately instead of failing.
-        allow_incomplete: Read runs that lack a part of their labels.
-        threads: Threads that models compute on.
-        html: Page to write, with tables, curves and grids.
+        allow_incomplete: Accept runs that lack planned samples instead of failing.
+        threads: CPU threads of the models [chosen by torch].
+        html: HTML page to write, with tables, curves and example grids.
         json: Report progress as JSON lines.
+
+    Returns:
+        Tables and curves, as `datagen evaluate --json` prints them (docs/guides/evaluate.md).
 
     Raises:
         InputError: A checkpoint, a run or an option cannot be used.
@@ -139,20 +92,23 @@ def evaluate(
     # Imported here, so that other verbs do not wait for them and for torch.
     import numpy as np
 
-    from datagen.evaluation_report.baseline_methods import baseline_methods, read_heuristic
     from datagen.evaluation_report.evaluated_runs import (
         candidate_sets_of,
         open_evaluated_runs,
         refuse_seen_houses,
         split_paths,
     )
-    from datagen.evaluation_report.methods import open_models
+    from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
     from datagen.evaluation_report.report import evaluation_report
     from datagen.train.evaluation.columns import gather
 
     fit = [str(path) for path in fit or ()]
     detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
-    _refuse_odd(bootstrap, seed, threads, html)
+    refuse_odd_draws(bootstrap, seed)
+    if threads is not None and not 1 <= threads <= 1024:
+        raise InputError("--threads", str(threads), "is below 1", "Give 1 or more")
+    if html is not None:
+        refuse_output(html, "--html", ".html", ".htm")
     checkpoints, runs = split_paths([str(path) for path in paths])
     if threads is not None:
         from datagen.train.scorers import use_threads
@@ -165,15 +121,7 @@ def evaluate(
         refuse_seen_houses(opened, models)
     rule = read_heuristic(heuristic, opened, allow_seen_houses) if heuristic is not None else None
     baseline_set = baseline_methods(
-        baselines,
-        fit,
-        detector,
-        rule,
-        seed,
-        opened,
-        allow_seen_houses,
-        allow_incomplete,
-        json,
+        baselines, fit, detector, rule, seed, opened, allow_seen_houses, allow_incomplete, json
     )
     evaluated = [*baseline_set.baselines, *models]
     if not evaluated:
@@ -190,29 +138,10 @@ def evaluate(
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
         gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
-    houses = baseline_set.houses.union(*(model.houses for model in models))
-    report = evaluation_report(
-        gathered,
-        evaluated,
-        opened,
-        sets,
-        seen_houses=houses,
-        fit=fit,
-        left_out=baseline_set.left_out,
-        resamples=bootstrap,
-        seed=seed,
-    )
+    report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed)
     if html is not None:
         from datagen.evaluation_report.page import page_of
 
         with whole_file(html, alone=True) as file:
             file.write(page_of(report, gathered).encode())
     return report
-
-
-def _refuse_odd(bootstrap: int, seed: int, threads: int | None, html: Path | None) -> None:
-    refuse_odd_draws(bootstrap, seed)
-    if threads is not None and not 1 <= threads <= 1024:
-        raise InputError("--threads", str(threads), "is below 1", "Give 1 or more")
-    if html is not None:
-        refuse_output(html, "--html", ".html", ".htm")

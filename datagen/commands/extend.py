@@ -4,41 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from heapq import heapify, heapreplace
-from typing import Annotated
-
-from cyclopts import Parameter
+from typing import Unpack
 
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
-from datagen.console.options import RunPlace
-from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.console.command_lines import prints
+from datagen.console.options import AS_FOUND, RunPlace, Sources, Whole
 from datagen.jobs.job import JobRun
-from datagen.jobs.job_report import reported
-from datagen.jobs.job_result import JobResult
-from datagen.jobs.options import HERE, JobOptions, absolute_place, refuse_odd_n
+from datagen.jobs.job_report import JobResult, print_job
+from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, refuse_odd_n
 from datagen.jobs.start_job import continue_job, source_words
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 
 
-def verb(
-    run: RunPlace,
-    /,
-    *,
-    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted in total; not fewer than now.")],
-    given: Sources = AS_FOUND,
-    job_options: JobOptions = HERE,
-) -> int:
+@prints(print_job)
+def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpack[JobKeywords]) -> JobResult:
     """Raise the number of labels of a run to n and make the missing ones; existing shards keep their bytes.
 
     In merged runs, the new labels are divided evenly among the parts, in whole shards.
 
     For example: datagen extend runs/first --n 360,000
+
+    Args:
+        n: Labels wanted in total; not fewer than now.
     """
-    return reported(lambda: _extend(run, n, given, job_options))
-
-
-def _extend(run: str, n: int, given: Sources, job_options: JobOptions) -> JobResult:
+    job_options = JobOptions(**job)
     job_options.refuse_bad()
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]

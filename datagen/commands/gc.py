@@ -5,10 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import time
-from collections import Counter
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from datagen.cluster.run_recorder import refresh_index
 from datagen.console.options import AsJson, RunPlace
@@ -24,26 +21,18 @@ _UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _SHOWN = 100
 
 
-def gc(
-    run: RunPlace,
-    /,
-    *,
-    older_than: Annotated[
-        str,
-        Parameter(
-            help="Keep files newer than this: 90s, 30m, 24h or 7d. It must exceed the duration of a merge "
-            "that is running: with 0s the merge loses files and must be run again."
-        ),
-    ] = "24h",
-    dry_run: Annotated[bool, Parameter(negative=(), help="List the files, but remove nothing.")] = False,
-    json: AsJson = False,
-) -> int:
+def gc(run: RunPlace, /, *, older_than: str = "24h", dry_run: bool = False, json: AsJson = False) -> int:
     """Remove files that no commit names: of superseded or unfinished attempts, drafts and probes.
 
     Committed files and records of the ledger are never removed, nor are files of attempts that began after
     the first running job. It may run while jobs run; after an interruption, run it again.
 
     For example: datagen gc runs/first --dry-run
+
+    Args:
+        older_than: Keep files newer than this: 90s, 30m, 24h or 7d. It must exceed the duration of a
+            merge that is running: with 0s the merge loses files and must be run again.
+        dry_run: List the files, but remove nothing.
     """
     place = open_storage(run, probe=False, create=False)
     age_s = age_of(older_than)
@@ -82,16 +71,13 @@ def remove(place: Storage, garbage: list[Garbage], seen: Seen = lambda done, of:
 
 def gc_report(place: Storage, garbage: list[Garbage], swept: Swept, dry_run: bool) -> dict[str, Any]:
     """Return what was found and removed, as plain values; sizes in bytes."""
-    files, sizes, pieces = Counter[str](), Counter[str](), Counter[str]()
-    for piece in garbage:
-        files[piece.kind] += piece.files
-        sizes[piece.kind] += piece.bytes
-        pieces[piece.kind] += 1
+    of_kind = {kind: [piece for piece in garbage if piece.kind == kind] for kind in KINDS}
     return {
         "run": place.url,
         "dry_run": dry_run,
         "found": {
-            kind: {"pieces": pieces[kind], "files": files[kind], "bytes": sizes[kind]} for kind in KINDS
+            kind: {"pieces": len(of), "files": sum(p.files for p in of), "bytes": sum(p.bytes for p in of)}
+            for kind, of in of_kind.items()
         },
         "removed": {"files": swept.files, "bytes": swept.bytes},
         "committed_meanwhile": swept.spared,
@@ -109,7 +95,6 @@ def _print(place: str, report: dict[str, Any]) -> None:
     print_rows(f"{done} from {place}", rows, ("kind", "pieces", "files", "size"))
     if report["committed_meanwhile"]:
         print_rows("committed meanwhile and kept", [("attempts", str(report["committed_meanwhile"]))])
-    if report["damaged"]:
-        fix = f"datagen repair {shlex.quote(place)}"
-        rows = [(key, fix) for key in report["damaged"][:_SHOWN]]
-        print_rows("committed while their files were removed", rows, ("commit", "fix"))
+    fix = f"datagen repair {shlex.quote(place)}"
+    rows = [(key, fix) for key in report["damaged"][:_SHOWN]]
+    print_rows("committed while their files were removed", rows, ("commit", "fix"))

@@ -5,13 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Any
 
-from cyclopts import Parameter
-
-from datagen.console.options import RunPlace
+from datagen.console.options import RunPlace, Whole
 from datagen.console.printing import print_json, print_lines
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.jobs.detach import jobs_api_of
 from datagen.reports.events import Event, Known, events_of
 from datagen.schemas.errors import InputError, printable
@@ -26,23 +23,24 @@ def logs(
     run: RunPlace,
     /,
     *,
-    follow: Annotated[
-        bool, Parameter(negative=(), help="Wait for new events while a job is running.")
-    ] = False,
-    shard: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="All events of one shard, successful attempts included.")
-    ] = None,
-    stacks: Annotated[bool, Parameter(negative=(), help="Add the stack of each failure.")] = False,
-    driver: Annotated[
-        bool, Parameter(negative=(), help="Output of the driver of the latest detached job.")
-    ] = False,
-    json: Annotated[bool, Parameter(negative=(), help="Print one JSON object per line.")] = False,
+    follow: bool = False,
+    shard: Whole | None = None,
+    stacks: bool = False,
+    driver: bool = False,
+    json: bool = False,
 ) -> int:
     """List events of a run: jobs that began and ended, failed attempts, retries, quarantined shards.
 
     Successful attempts are listed with --shard only; `datagen status` counts them.
 
     For example: datagen logs runs/first --follow
+
+    Args:
+        follow: Wait for new events while a job is running.
+        shard: All events of one shard, successful attempts included.
+        stacks: Add the stack of each failure.
+        driver: Output of the driver of the latest detached job.
+        json: Print one JSON object per line.
     """
     place = open_storage(run, probe=False, create=False)
     runs = open_runs(place)

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from datagen.console.command_lines import command_line, resumable, words_of
-from datagen.console.options import AsJson
+from datagen.console.command_lines import command_line, prints, resumable, words_of
+from datagen.console.options import AsJson, Place
 from datagen.console.printing import print_json, print_rows, seconds
 from datagen.jobs.options import absolute_place
 from datagen.reports.spending import account_for
@@ -20,14 +20,57 @@ from datagen.schemas.merging.writing import WrittenUnion
 from datagen.schemas.progress import steps
 from datagen.schemas.run import Run
 
+_WORDS = {
+    "there_before": "merged before",
+    "linked": "linked",
+    "cut": "resharded",
+    "held_more_than_once": "duplicates",
+}
 
-def verb(
-    runs: Annotated[list[str], Parameter(name="RUN...", negative=(), help="Runs, or merged runs, to verb.")],
-    /,
-    *,
-    out: Annotated[str, Parameter(help="Folder or s3:// address of the result, which may exist.")],
-    json: AsJson = False,
-) -> int:
+
+def print_merged(report: dict[str, Any], json: bool, **_: Any) -> int:
+    """Print the report of a merge."""
+    if json:
+        print_json(report)
+        return 0
+    missing = sum(part["missing_shards"] for part in report["runs"])
+    state = f"; missing shards: {missing}" if missing else ""
+    out = report["out"]
+    rows = [
+        ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
+        (
+            "worker time",
+            f"{seconds(report['total_wall_s'])}, of which {seconds(report['useful_wall_s'])} useful",
+        ),
+        ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
+    ]
+    if missing:
+        rows.append(("resume with", command_line(["resume", out])))
+    print_rows(f"merged: {out}", rows)
+    for part in report["runs"]:
+        shards = part["shards"]
+        told = [f"{shards[k]} {word}" for k, word in _WORDS.items() if shards[k]]
+        print_rows(
+            f"run {part['spec_hash'][:16]}, seed {part['seed']}, {part['split']} of {part['houses']} houses",
+            [
+                ("labels", f"{part['labels']:,} of {part['n']:,}"),
+                ("shards", ", ".join(told) or "none"),
+                *(("from", _origin(origin)) for origin in part["lineage"]),
+            ],
+        )
+    return 0
+
+
+def _origin(origin: dict[str, Any]) -> str:
+    return (
+        f"{origin['address']}: {origin['shards']} shards, made on {origin['platform']}, {origin['created']}"
+    )
+
+
+@prints(print_merged)
+def merge(
+    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")], /, *, out: Place, json: AsJson = False
+) -> dict[str, Any]:
     """Merge runs into one: from several machines, seeds or houses; partial, overlapping or merged ones too.
 
     Runs may differ in seed, split, houses, objects and --scenes-from; other differences are refused, as are
@@ -35,25 +78,14 @@ def verb(
     size. The merged runs stay unchanged. After an interruption, run the same command again.
 
     For example: datagen merge runs/a runs/b --out runs/all
-    """
-    report = merge(runs, out=out, json=json)
-    if json:
-        print_json(report)
-    else:
-        _print(report)
-    return 0
-
-
-def merge(runs: Sequence[str | Path], *, out: str | Path, json: bool = False) -> dict[str, Any]:
-    """Make one run of several and return what it holds: labels, shards, cost and origin of each part.
-
-    The result is what `datagen merge --json` prints. Runs may differ in seed, split, houses, objects and
-    the run that their scenes are from. The same call again finishes a merge that was interrupted.
 
     Args:
-        runs: Folders or s3:// addresses of runs, or of merged runs.
-        out: The result's folder or address; runs that are there stay.
+        runs: Runs, or merged runs, to merge.
+        out: Folder or s3:// address of the result, which may exist.
         json: Report progress as JSON lines.
+
+    Returns:
+        Labels, shards, cost and origin of each part, as `datagen merge --json` prints them.
 
     Raises:
         InputError: The runs cannot be merged, or one is damaged.
@@ -110,45 +142,3 @@ def _part(run: Run, written: WrittenUnion | None) -> dict[str, Any]:
         "attempts": written.attempts if written else len(run.ledger.attempts()),
         "lineage": lineage_summary(run),
     }
-
-
-def _print(report: dict[str, Any]) -> None:
-    missing = sum(part["missing_shards"] for part in report["runs"])
-    state = f"; missing shards: {missing}" if missing else ""
-    out = report["out"]
-    rows = [
-        ("labels", f"{report['labels']:,} of {report['n']:,}{state}"),
-        (
-            "worker time",
-            f"{seconds(report['total_wall_s'])}, of which {seconds(report['useful_wall_s'])} useful",
-        ),
-        ("store", f"{report['sealed']}: zarr.open or xarray.open_zarr reads it" if report["sealed"] else "-"),
-    ]
-    if missing:
-        rows.append(("resume with", command_line(["resume", out])))
-    print_rows(f"merged: {out}", rows)
-    for part in report["runs"]:
-        shards = part["shards"]
-        told = [f"{shards[k]} {word}" for k, word in _WORDS.items() if shards[k]]
-        print_rows(
-            f"run {part['spec_hash'][:16]}, seed {part['seed']}, {part['split']} of {part['houses']} houses",
-            [
-                ("labels", f"{part['labels']:,} of {part['n']:,}"),
-                ("shards", ", ".join(told) or "none"),
-                *(("from", _origin(origin)) for origin in part["lineage"]),
-            ],
-        )
-
-
-_WORDS = {
-    "there_before": "merged before",
-    "linked": "linked",
-    "cut": "resharded",
-    "held_more_than_once": "duplicates",
-}
-
-
-def _origin(origin: dict[str, Any]) -> str:
-    return (
-        f"{origin['address']}: {origin['shards']} shards, made on {origin['platform']}, {origin['created']}"
-    )

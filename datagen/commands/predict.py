@@ -10,14 +10,14 @@ from dataclasses import replace
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
-from datagen.console.options import AsJson, refuse_output
+from datagen.console.command_lines import prints
+from datagen.console.options import AsJson, File, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
 from datagen.workers.geometry.mesh import F64
@@ -26,49 +26,73 @@ if TYPE_CHECKING:
     from datagen.train.prediction import Prediction
     from datagen.train.prediction.frames import SensorFrame
 
+    Frames = Sequence[str | Path | SensorFrame]
+else:
+    # What the command line resolves, without importing torch.
+    Prediction, Frames = Any, Sequence[Path]
+
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
 _MOST_ENTRIES = 10_000
 
 
-def verb(
-    checkpoint: Annotated[Path, Parameter(name="CHECKPOINT", help="Checkpoint of `datagen train`.")],
+def print_prediction(
+    prediction: Prediction, json: bool, out: Path | None = None, html: Path | None = None, **_: Any
+) -> int:
+    """Print the best base pose; the exit code is 1 when no cell was seen to be clear."""
+    from datagen.train.prediction.prediction_report import document, told
+
+    if json:
+        print_json(document(prediction))
+    else:
+        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
+        print_rows(f"base poses by {prediction.scorer}", [*told(prediction), *written])
+    return 0 if prediction.best is not None else 1
+
+
+def _pixel(kind: Any, tokens: Sequence[Token]) -> tuple[int, int]:
+    text = tokens[0].value
+    parts = text.split(",")
+    if len(parts) != 2 or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", part, re.ASCII) for part in parts):
+        raise InputError("--click", text[:40], "is not a pixel", "Give column and row as u,v: 320,240")
+    return int(parts[0]), int(parts[1])
+
+
+def _numbers(kind: Any, tokens: Sequence[Token]) -> list[float]:
+    try:
+        return [float(part) for part in tokens[0].value.split(",")]
+    except ValueError:
+        return []
+
+
+@prints(print_prediction)
+def predict(
+    checkpoint: Annotated[str | Path, Parameter(name="CHECKPOINT")],
     /,
     *,
-    base_height: Annotated[float, Parameter(help="Height of the arm's mount above the floor (m).")],
-    reach: Annotated[float, Parameter(help="Reach of the arm from its mount (m).")],
-    rgb: Annotated[Path | None, Parameter(help="Colour image, aligned with the depth image.")] = None,
-    depth: Annotated[Path | None, Parameter(help="Depth image, 16-bit PNG.")] = None,
-    intrinsics: Annotated[
-        Path | None, Parameter(help="JSON file: fx, fy, cx, cy (or ppx, ppy), width, height (pixels).")
-    ] = None,
-    mask: Annotated[Path | None, Parameter(help="Mask of the target, PNG, white on black.")] = None,
-    click: Annotated[str | None, Parameter(help="Pixel u,v on the target in the first frame.")] = None,
-    frame: Annotated[
-        list[Path] | None,
-        Parameter(help="Frame as a folder, .npz or .ply; several with poses are fused.", negative=()),
-    ] = None,
-    frame_dir: Annotated[Path | None, Parameter(help="Folder of such frames, in order of name.")] = None,
-    camera_height: Annotated[float | None, Parameter(help="Height of the frame's camera (m).")] = None,
-    camera_pose: Annotated[
-        Path | None, Parameter(help="JSON file: T_world_camera (4x4); world z up, floor at z = 0.")
-    ] = None,
+    base_height: float,
+    reach: float,
+    rgb: File | None = None,
+    depth: File | None = None,
+    intrinsics: File | None = None,
+    mask: File | None = None,
+    click: Annotated[tuple[int, int] | None, Parameter(converter=_pixel, n_tokens=1, metavar="STR")] = None,
+    frame: Frames | None = None,
+    frame_dir: File | None = None,
+    camera_height: float | None = None,
+    camera_pose: File | None = None,
     gravity: Annotated[
-        str | None, Parameter(help="Direction of gravity x,y,z in the camera frame (x right, y down).")
+        Sequence[float] | None, Parameter(converter=_numbers, n_tokens=1, metavar="STR")
     ] = None,
-    robot_camera_height: Annotated[
-        float | None, Parameter(help="Height of the robot's own camera (m) [that of the frame's camera].")
-    ] = None,
-    depth_scale: Annotated[float, Parameter(help="Metres per step of 16-bit depth.")] = 0.001,
-    grid: Annotated[int, WHOLE_NUMBER, Parameter(help="Cells per side of the grid around the target.")] = 25,
-    half_width: Annotated[float, Parameter(help="Half the side of the grid (m).")] = 1.0,
-    allow_unseen: Annotated[
-        bool, Parameter(negative=(), help="Also consider cells whose floor no camera saw.")
-    ] = False,
-    out: Annotated[Path | None, Parameter(help="Picture to write, FILE.png.")] = None,
-    html: Annotated[Path | None, Parameter(help="Page to write, FILE.html.")] = None,
-    as_json: Annotated[AsJson, Parameter(name="--json")] = False,
-) -> int:
+    robot_camera_height: float | None = None,
+    depth_scale: float = 0.001,
+    grid: Whole = 25,
+    half_width: float = 1.0,
+    allow_unseen: bool = False,
+    out: File | None = None,
+    html: File | None = None,
+    json: AsJson = False,
+) -> Prediction:
     """Score a grid of base poses around a target seen by a depth camera, and name the best clear one.
 
     Give a frame as --rgb --depth --intrinsics with --mask or --click, or as --frame. The floor is known from
@@ -76,91 +100,37 @@ def verb(
     no cell was seen to be clear.
 
     For example: datagen predict model.ckpt --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
-    """
-    from datagen.train.prediction.prediction_report import document, told
-
-    answer = predict(
-        checkpoint,
-        base_height=base_height,
-        reach=reach,
-        rgb=rgb,
-        depth=depth,
-        intrinsics=intrinsics,
-        mask=mask,
-        click=None if click is None else _pixel(click),
-        frame=frame,
-        frame_dir=frame_dir,
-        camera_height=camera_height,
-        camera_pose=camera_pose,
-        gravity=None if gravity is None else _numbers(gravity),
-        robot_camera_height=robot_camera_height,
-        depth_scale=depth_scale,
-        grid=grid,
-        half_width=half_width,
-        allow_unseen=allow_unseen,
-        out=out,
-        html=html,
-    )
-    if as_json:
-        print_json(document(answer))
-    else:
-        written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
-        print_rows(f"base poses by {answer.scorer}", [*told(answer), *written])
-    return 0 if answer.best is not None else 1
-
-
-def predict(
-    checkpoint: str | Path,
-    *,
-    base_height: float,
-    reach: float,
-    rgb: str | Path | None = None,
-    depth: str | Path | None = None,
-    intrinsics: str | Path | None = None,
-    mask: str | Path | None = None,
-    click: tuple[int, int] | None = None,
-    frame: Sequence[str | Path | SensorFrame] | None = None,
-    frame_dir: str | Path | None = None,
-    camera_height: float | None = None,
-    camera_pose: str | Path | None = None,
-    gravity: Sequence[float] | None = None,
-    robot_camera_height: float | None = None,
-    depth_scale: float = 0.001,
-    grid: int = 25,
-    half_width: float = 1.0,
-    allow_unseen: bool = False,
-    out: str | Path | None = None,
-    html: str | Path | None = None,
-) -> Prediction:
-    """Score a grid of base poses around a target that a depth camera sees; return all of them.
-
-    Of the result, `best` is the row of the best clear pose (None where none was seen to be clear),
-    `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x towards the target),
-    `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) says how good they are, and
-    `sure` how far to trust the answer. World is the frame of `T_world_camera` where frames have it, as a
-    robot's map; else its origin is on the floor below the camera.
 
     Args:
-        checkpoint: A file that `train_model` wrote.
-        base_height: Height of the arm's mount above the floor, m.
-        reach: Reach of the arm, m.
-        rgb: Colour picture, aligned with the depth.
-        depth: 16-bit depth PNG.
-        intrinsics: JSON with fx, fy, cx, cy, width, height.
-        mask: PNG of the target's pixels, white on black.
-        click: A pixel (u, v) on the target of the first frame.
-        frame: Folders, .npz or .ply files, or SensorFrame objects; several with poses are fused.
-        frame_dir: A folder of such frames, taken by name.
-        camera_height: Height of the camera that took the frame, m.
-        camera_pose: JSON with T_world_camera (4x4); world z up, floor at z = 0.
-        gravity: Where things fall (x, y, z), in the camera's frame (x right, y down).
-        robot_camera_height: Height of the robot's own camera, m [that of the frame's].
+        checkpoint: Checkpoint of `datagen train`.
+        base_height: Height of the arm's mount above the floor (m).
+        reach: Reach of the arm from its mount (m).
+        rgb: Colour image, aligned with the depth image.
+        depth: Depth image, 16-bit PNG.
+        intrinsics: JSON file: fx, fy, cx, cy (or ppx, ppy), width, height (pixels).
+        mask: Mask of the target, PNG, white on black.
+        click: Pixel u,v on the target in the first frame.
+        frame: Frame as a folder, .npz or .ply; several with poses are fused.
+        frame_dir: Folder of such frames, in order of name.
+        camera_height: Height of the frame's camera (m).
+        camera_pose: JSON file: T_world_camera (4x4); world z up, floor at z = 0.
+        gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
+        robot_camera_height: Height of the robot's own camera (m) [that of the frame's camera].
         depth_scale: Metres per step of 16-bit depth.
-        grid: Cells on a side of the grid around the target.
-        half_width: Half the grid's side, m.
-        allow_unseen: Choose also among poses whose floor was not seen.
-        out: PNG picture to write.
-        html: HTML page to write.
+        grid: Cells per side of the grid around the target.
+        half_width: Half the side of the grid (m).
+        allow_unseen: Also consider cells whose floor no camera saw.
+        out: Picture to write, FILE.png.
+        html: Page to write, FILE.html.
+        json: Of the command line alone.
+
+    Returns:
+        All poses. `best` is the row of the best clear one (None where none was seen to be clear),
+        `T_world_base(row)` and `T_camera_base(row)` are 4x4 poses of the arm's mount (x towards the target),
+        `base_xy_m` (N, 2) and `yaw_rad` (N,) those of all rows, `score` (N,) says how good they are, and
+        `sure` how far to trust the answer. World is the frame of `T_world_camera` where frames have it, as a
+        robot's map; else its origin is on the floor below the camera. A frame in Python may also be a
+        SensorFrame.
 
     Raises:
         InputError: A frame, the checkpoint or an option cannot be used.
@@ -275,20 +245,6 @@ def _frames(
 def _refuse_length(name: str, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and 0 < value <= _LARGEST_M):
         raise InputError(name, f"{value:g}", f"is not between 0 and {_LARGEST_M:g}", "Give it in metres")
-
-
-def _pixel(text: str) -> tuple[int, int]:
-    parts = text.split(",")
-    if len(parts) != 2 or not all(re.fullmatch(r"\s*[0-9]{1,6}\s*", part, re.ASCII) for part in parts):
-        raise InputError("--click", text[:40], "is not a pixel", "Give column and row as u,v: 320,240")
-    return int(parts[0]), int(parts[1])
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        return []
 
 
 def _direction(given: Sequence[float]) -> F64:

@@ -6,14 +6,12 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
+from typing import Literal
 
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, print_json, print_rows, seconds
-from datagen.relabelling.runs import Relabelled, relabel_all, relabelled_specification
+from datagen.relabelling import Relabelled, relabel_all, relabelled_specification
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.storage import Storage, open_storage
@@ -23,22 +21,17 @@ def relabel(
     run: RunPlace,
     /,
     *,
-    out: Annotated[str, Parameter(help="Folder or s3:// address of the new run.")],
-    mu: Annotated[float | None, Parameter(help="Distance of the peak of the distance score.")] = None,
-    sigma_l: Annotated[float | None, Parameter(help="Width of the distance score below mu.")] = None,
-    sigma_r: Annotated[float | None, Parameter(help="Width of the distance score above mu.")] = None,
-    d_min: Annotated[float | None, Parameter(help="Smallest distance with a score.")] = None,
-    d_max: Annotated[float | None, Parameter(help="Largest distance with a score.")] = None,
-    a: Annotated[float | None, Parameter(help="Height of the peak of the distance score.")] = None,
-    alpha: Annotated[
-        float | None, Parameter(help="Weight of the visibility score; the distance score has 1 - alpha.")
-    ] = None,
-    tau: Annotated[float | None, Parameter(help="Smallest score H of a positive label.")] = None,
-    distance: Annotated[
-        Literal["planar", "planar-over-reach", "mount-over-reach"] | None,
-        Parameter(help="Distance that the score depends on."),
-    ] = None,
-    config: Annotated[Path | None, Parameter(help="TOML file with the section [heuristic].")] = None,
+    out: str,
+    mu: float | None = None,
+    sigma_l: float | None = None,
+    sigma_r: float | None = None,
+    d_min: float | None = None,
+    d_max: float | None = None,
+    a: float | None = None,
+    alpha: float | None = None,
+    tau: float | None = None,
+    distance: Literal["planar", "planar-over-reach", "mount-over-reach"] | None = None,
+    config: Path | None = None,
     json: AsJson = False,
 ) -> int:
     """Label a heuristic run by other parameters of the rule, without rendering.
@@ -49,6 +42,19 @@ def relabel(
     command again resumes it, or extends it after the run has grown.
 
     For example: datagen relabel runs/first --tau 0.6 --out runs/stricter
+
+    Args:
+        out: Folder or s3:// address of the new run.
+        mu: Distance of the peak of the distance score.
+        sigma_l: Width of the distance score below mu.
+        sigma_r: Width of the distance score above mu.
+        d_min: Smallest distance with a score.
+        d_max: Largest distance with a score.
+        a: Height of the peak of the distance score.
+        alpha: Weight of the visibility score; the distance score has 1 - alpha.
+        tau: Smallest score H of a positive label.
+        distance: Distance that the score depends on.
+        config: TOML file with the section [heuristic].
     """
     given = {
         "a": a, "mu": mu, "sigma_l": sigma_l, "sigma_r": sigma_r, "d_min": d_min, "d_max": d_max,

@@ -8,15 +8,11 @@ from collections.abc import Generator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from datagen.commands.verify import finding_row, print_findings
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.repair import RegenerateShard, Repaired, repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
@@ -24,19 +20,10 @@ from datagen.schemas.run import Run
 from datagen.schemas.storage import open_storage
 
 if TYPE_CHECKING:
-    from datagen.regeneration.shards import OpenedSources
+    from datagen.regeneration.scenes import OpenedSources
 
 
-def repair(
-    run: RunPlace,
-    /,
-    *,
-    workers: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Processes that make bad shards again; 0: this process.")
-    ] = 0,
-    given: Sources = AS_FOUND,
-    json: AsJson = False,
-) -> int:
+def repair(run: RunPlace, /, *, workers: Whole = 0, given: Sources = AS_FOUND, json: AsJson = False) -> int:
     """Check a run as `datagen verify` does, fix the damage, and check again.
 
     Records are restored from their second copies. Bad shards are made again, and a file is written only if it
@@ -44,6 +31,9 @@ def repair(
     Exit code 0 when no damage is left, else 1.
 
     For example: datagen repair runs/first
+
+    Args:
+        workers: Processes that make bad shards again; 0: this process.
     """
     if not 0 <= workers <= 256:
         raise InputError("--workers", str(workers), "is not between 0 and 256", "Omit it for this process")
@@ -84,14 +74,14 @@ def _leave_signals() -> None:
 def _regenerate(run: Run, shard: int, given: Sources) -> Mapping[str, bytes]:
     """The files of a shard, computed in this process."""
     # Simulators are imported only for a bad shard.
-    from datagen.regeneration.shards import regenerate_shard, regenerated_files
+    from datagen.regeneration.scenes import regenerate_shard, regenerated_files
 
     return regenerated_files(run, regenerate_shard(run, shard, _origin(run.storage.url, given)))
 
 
 @lru_cache(maxsize=1)  # a world is large
 def _origin(place: str, given: Sources) -> OpenedSources:
-    from datagen.regeneration.shards import open_sources
+    from datagen.regeneration.scenes import open_sources
 
     return open_sources(Run.open(place), given)
 

@@ -10,14 +10,18 @@ import numpy as np
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import AsJson, RunPlace, refuse_output
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
 from datagen.drawing.replay_picture import draw_replay
-from datagen.regeneration.scenes import chosen_rows, open_replayer, what_differs_here
-from datagen.regeneration.shards import OpenedSources, open_sources
+from datagen.drawing.scene_picture import Shown
+from datagen.regeneration.scenes import (
+    OpenedSources,
+    chosen_rows,
+    open_replayer,
+    open_sources,
+    what_differs_here,
+)
 from datagen.regeneration.single_shard import replay_shard
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.regeneration.stage_comparison import RECOMPUTED, StageComparison, compare_stages
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
@@ -34,21 +38,12 @@ _SHOWN = 5
 
 def replay(
     run: RunPlace,
-    sample: Annotated[
-        str | None,
-        Parameter(name="SAMPLE_ID", help="sample_id, 32 hexadecimal digits, or its first ones if unique."),
-    ] = None,
+    sample: Annotated[str | None, Parameter(name="SAMPLE_ID")] = None,
     /,
     *,
-    scene: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a scene, instead of a sample id.")
-    ] = None,
-    shard: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Index of a shard to run in this process, for a debugger.")
-    ] = None,
-    out: Annotated[
-        Path | None, Parameter(help="Picture to write, FILE.png: the stored and the replayed scene.")
-    ] = None,
+    scene: Whole | None = None,
+    shard: Whole | None = None,
+    out: Path | None = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
@@ -62,6 +57,12 @@ def replay(
     debugger stops where it is raised. No file is written.
 
     For example: datagen replay runs/first --scene 0 --out replay.png
+
+    Args:
+        sample: sample_id, 32 hexadecimal digits, or its first ones if unique.
+        scene: Index of a scene, instead of a sample id.
+        shard: Index of a shard to run in this process, for a debugger.
+        out: Picture to write, FILE.png: the stored and the replayed scene.
     """
     if sum(given is not None for given in (sample, scene, shard)) != 1:
         problem = "is one of three ways to say what to replay"
@@ -168,9 +169,11 @@ def _compare(
         "picture": None if out is None else str(out),
     }
     if out is not None:
-        again = reconstruct_scene(replayer.world, (drawn or stored).record)
-        before = reconstruct_scene(replayer.world, stored.record)
-        draw_replay(report, run.manifest.spec, (before, stored), (again, drawn or stored), row, out)
+        before, again = (
+            Shown(place, run.manifest.spec, rows, reconstruct_scene(replayer.world, rows.record))
+            for rows in (stored, drawn or stored)
+        )
+        draw_replay(report, before, again, row, out)
     if json:
         print_json(report)
     else:

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.console.options import RunPlace, refuse_output
+from datagen.console.options import AS_FOUND, AssetSources, RunPlace, Whole, refuse_output
 from datagen.console.printing import print_rows
-from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.drawing.shown import Shown, draw_arm, draw_heuristic
-from datagen.regeneration.sources import AS_FOUND, AssetSources
+from datagen.drawing.arm_picture import draw_arm_picture
+from datagen.drawing.scene_picture import Shown, draw_scene_picture
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import find_scene, open_runs
 from datagen.schemas.scene_rows import read_scene
@@ -24,15 +20,7 @@ _BEST = "best"
 
 
 def show(
-    run: RunPlace,
-    /,
-    *,
-    out: Annotated[Path, Parameter(help="Picture to write: FILE.png, or FILE.gif of a trial.")],
-    scene: Annotated[int, WHOLE_NUMBER, Parameter(help="Index of the scene.")] = 0,
-    trial: Annotated[
-        str | None, Parameter(help="Show the trial of a candidate: its index, or best (plan, sim).")
-    ] = None,
-    given: AssetSources = AS_FOUND,
+    run: RunPlace, /, *, out: Path, scene: Whole = 0, trial: str | None = None, given: AssetSources = AS_FOUND
 ) -> int:
     """Draw a picture of one scene: the RGB-D frame, floor plans with the candidates, and numbers.
 
@@ -41,6 +29,11 @@ def show(
     in a .gif. Scenes are rendered again from the stored poses.
 
     For example: datagen show runs/first --scene 3 --out scene.png
+
+    Args:
+        out: Picture to write: FILE.png, or FILE.gif of a trial.
+        scene: Index of the scene.
+        trial: Show the trial of a candidate: its index, or best (plan, sim).
     """
     refuse_output(out, "--out", ".png", ".gif")
     moving = out.suffix.lower() == ".gif"
@@ -63,7 +56,7 @@ def show(
 
         lines = draw_trial(shown, candidate, out)
     else:
-        lines = (draw_heuristic if spec.arm is None else draw_arm)(shown, out)
+        lines = (draw_scene_picture if spec.arm is None else draw_arm_picture)(shown, out)
     print_rows(f"scene {scene} of {run}", [("target", shown.target), *lines, ("picture", str(out))])
     return 0
 

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from datagen.console.command_lines import command_line
 from datagen.console.options import AsJson, RunPlace
 from datagen.console.printing import counted, listed, print_json, print_rows
-from datagen.jobs.job_report import health_line, jobs_report
+from datagen.jobs.job_report import health_line, job_report
 from datagen.reports.run_status import runs_report
 from datagen.schemas.jobs import Jobs
 from datagen.schemas.storage import Storage, open_storage
 
 
-def status(
-    run: RunPlace,
-    /,
-    *,
-    stacks: Annotated[bool, Parameter(negative=(), help="Add one stack for each cause of failure.")] = False,
-    json: AsJson = False,
-) -> int:
+def status(run: RunPlace, /, *, stacks: bool = False, json: AsJson = False) -> int:
     """Show the progress of a run: shards, labels, jobs, failed attempts by cause, and quarantine.
 
     Of merged runs it shows the sums, and one line per part.
 
     For example: datagen status runs/first
+
+    Args:
+        stacks: Add one stack for each cause of failure.
     """
     place = open_storage(run, probe=False, create=False)
     report = runs_report(place, stacks)
     if json:
-        print_json(report | {"jobs": jobs_report(place)})
+        print_json(report | {"jobs": [job_report(job) for job in Jobs(place).all()]})
     else:
         _print(run, place, report)
     return 0
@@ -59,60 +54,41 @@ def _print(name: str, place: Storage, report: dict[str, Any]) -> None:
         without = counted(report["attempts_without_end"], "attempt")
         rows.insert(3, ("unfinished", f"{without}: running or lost"))
     print_rows(f"run {name}", rows)
-    _print_jobs(place)
-    _print_parts(report)
-    _print_lineage(report)
+    jobs = Jobs(place).all()
+    # The jobs that may be running, or else the latest.
+    if shown := [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]:
+        print_rows("jobs", [(job.id, health_line(job)) for job in shown])
+    parts = [
+        (
+            part["run"].rsplit("/", 1)[-1],
+            f"{part['labels']:,} of {part['n']:,}",
+            f"{part['shards']['committed']} of {part['shards']['planned']}",
+            str(len(part["shards"]["quarantined"])),
+        )
+        for part in report.get("parts", ())
+    ]
+    print_rows("parts", parts, ("part", "labels", "shards", "quarantined"))
+    lineage = [(source["address"], str(source["shards"]), source["created"]) for source in report["lineage"]]
+    print_rows("merged from", lineage, ("run", "shards", "created"))
     _print_failures(name, report)
 
 
-def _print_jobs(place: Storage) -> None:
-    """The jobs that may be running, or else the latest job."""
-    jobs = Jobs(place).all()
-    shown = [job for job in jobs if job.health() in ("live", "silent")] or jobs[-1:]
-    if shown:
-        print_rows("jobs", [(job.id, health_line(job)) for job in shown])
-
-
-def _print_parts(report: dict[str, Any]) -> None:
-    parts = report.get("parts", ())
-    if parts:
-        rows = [
-            (
-                part["run"].rsplit("/", 1)[-1],
-                f"{part['labels']:,} of {part['n']:,}",
-                f"{part['shards']['committed']} of {part['shards']['planned']}",
-                str(len(part["shards"]["quarantined"])),
-            )
-            for part in parts
-        ]
-        print_rows("parts", rows, ("part", "labels", "shards", "quarantined"))
-
-
-def _print_lineage(report: dict[str, Any]) -> None:
-    rows = [(source["address"], str(source["shards"]), source["created"]) for source in report["lineage"]]
-    if rows:
-        print_rows("merged from", rows, ("run", "shards", "created"))
-
-
 def _print_failures(name: str, report: dict[str, Any]) -> None:
-    if report["budgets"]:
-        rows = [
-            (
-                row["outcome"],
-                str(row["attempts"]),
-                str(row["shards"]),
-                f"{row['most_on_one_shard']} of {row['budget']}" if row["budget"] else "-",
-            )
-            for row in report["budgets"]
-        ]
-        print_rows("failures", rows, ("kind", "attempts", "shards", "most per shard"))
-    if report["causes"]:
-        rows = [(cause, str(n)) for cause, n in report["causes"].items()]
-        print_rows("causes", rows, ("cause", "attempts"))
+    budgets = [
+        (
+            row["outcome"],
+            str(row["attempts"]),
+            str(row["shards"]),
+            f"{row['most_on_one_shard']} of {row['budget']}" if row["budget"] else "-",
+        )
+        for row in report["budgets"]
+    ]
+    print_rows("failures", budgets, ("kind", "attempts", "shards", "most per shard"))
+    causes = [(cause, str(n)) for cause, n in report["causes"].items()]
+    print_rows("causes", causes, ("cause", "attempts"))
     for cause, stack in report.get("stacks", {}).items():
         print_rows(cause, [(line, "") for line in stack.splitlines()])
-    given_up = report["quarantine"]
-    if given_up:
+    if given_up := report["quarantine"]:
         rows = [(str(q["shard"]), str(q["attempts"]), q["cause"]) for q in given_up[:20]]
         print_rows("quarantined", rows, ("shard", "attempts", "last cause"))
         again = command_line(["resume", name, "--quarantined"])

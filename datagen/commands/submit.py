@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Unpack
 
 from cyclopts import Parameter
-from typing_extensions import Unpack
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.configuration.manifest import manifest_of
-from datagen.configuration.specify import layout_of, specify
+from datagen.configuration.specify import layout_of, manifest_of, specify
 from datagen.configuration.stored_scenes import (
     layout_again,
     open_stored_scenes,
     refuse_too_few,
     specify_again,
 )
-from datagen.console.command_lines import words_of
-from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.console.command_lines import prints, words_of
+from datagen.console.options import File, Place, Whole
 from datagen.jobs.detach import detach_job
 from datagen.jobs.job import JobRun
-from datagen.jobs.job_report import reported
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import (
-    HERE,
     JobKeywords,
     JobOptions,
     absolute_place,
@@ -51,62 +47,37 @@ _OF_SCENES = (
     *("--seed", "--split", "--candidates", "--candidates-per-scene", "--robots-per-scene"),
     *("--settler", "--renderer", "--noise"),
 )
+# A number is read as text: "grid" is not one.
+_TEXT = Parameter(converter=lambda kind, tokens: tokens[0].value, n_tokens=1, metavar="STR")
 _BUILTIN = (
     "Using built-in houses. For real ones: datagen assets fetch procthor-10k --out DIR, then "
     "--houses procthor:DIR/procthor"
 )
 
 
-def verb(
-    label_source: Annotated[str, Parameter(name="LABEL_SOURCE", help="heuristic, plan or sim.")],
+@prints(print_job)
+def submit(
+    label_source: Annotated[str, Parameter(name="LABEL_SOURCE")],
     /,
     *,
-    n: Annotated[int, WHOLE_NUMBER, Parameter(help="Labels wanted; a larger number extends the run.")],
-    out: Annotated[str, Parameter(help="Folder or s3:// address of the run.")],
-    houses: Annotated[str | None, Parameter(help="builtin, procthor:DIR or ai2thor:DIR [builtin].")] = None,
-    objects: Annotated[str | None, Parameter(help="builtin or ycb:DIR [builtin].")] = None,
-    scenes_from: Annotated[
-        str | None, Parameter(help="Run whose scenes and candidates are labelled again.")
-    ] = None,
-    robot: Annotated[
-        str | None,
-        Parameter(
-            help="fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled]."
-        ),
-    ] = None,
-    perturb: Annotated[
-        int | None,
-        WHOLE_NUMBER,
-        Parameter(help="Trials per candidate, each with random errors of pose and world (sim) [1, without]."),
-    ] = None,
-    candidates: Annotated[
-        Literal["grid", "clear", "in-range"] | None,
-        Parameter(
-            help="Cells to sample from: all, those with a clear base, or those also within reach [grid]."
-        ),
-    ] = None,
-    candidates_per_scene: Annotated[
-        str | None,
-        Parameter(help="Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60]."),
-    ] = None,
-    robots_per_scene: Annotated[
-        int | None,
-        WHOLE_NUMBER,
-        Parameter(help="Robots that share a scene's candidates [4; 1 on a whole grid]."),
-    ] = None,
-    split: Annotated[
-        Literal["train", "val", "test", "all"] | None,
-        Parameter(help="Split of the houses; splits share no house [all]."),
-    ] = None,
-    seed: Annotated[int | None, WHOLE_NUMBER, Parameter(help="Seed of the whole run [0].")] = None,
-    settler: Annotated[
-        str | None, Parameter(help="Physics engine: sapien or pybullet [sapien where installed].")
-    ] = None,
-    renderer: Annotated[str | None, Parameter(help="Renderer: embree, sapien or pybullet [embree].")] = None,
-    noise: Annotated[bool, Parameter(negative=(), help="Add sensor noise to the frame.")] = False,
-    config: Annotated[Path | None, Parameter(help="TOML file with any field of the specification.")] = None,
-    job_options: JobOptions = HERE,
-) -> int:
+    n: Whole,
+    out: Place,
+    houses: str | None = None,
+    objects: str | None = None,
+    scenes_from: Place | None = None,
+    robot: str | None = None,
+    perturb: Whole | None = None,
+    candidates: Literal["grid", "clear", "in-range"] | None = None,
+    candidates_per_scene: Annotated[int | str | None, _TEXT] = None,
+    robots_per_scene: Whole | None = None,
+    split: Literal["train", "val", "test", "all"] | None = None,
+    seed: Whole | None = None,
+    settler: str | None = None,
+    renderer: str | None = None,
+    noise: bool = False,
+    config: File | None = None,
+    **job: Unpack[JobKeywords],
+) -> JobResult:
     """Make labels: start a run, or resume the run in the folder.
 
     The same command on the same folder resumes the run, and a larger --n extends it; other options are
@@ -114,82 +85,29 @@ def verb(
     committed shards are kept.
 
     For example: datagen submit heuristic --n 1e5 --out runs/first
-    """
-    return reported(
-        lambda: submit(
-            label_source,
-            n=n,
-            out=out,
-            houses=houses,
-            objects=objects,
-            scenes_from=scenes_from,
-            robot=robot,
-            perturb=perturb,
-            candidates=candidates,
-            candidates_per_scene=candidates_per_scene,
-            robots_per_scene=robots_per_scene,
-            split=split,
-            seed=seed,
-            settler=settler,
-            renderer=renderer,
-            noise=noise,
-            config=config,
-            job_options=job_options,
-        )
-    )
-
-
-def submit(
-    label_source: str,
-    *,
-    n: int,
-    out: str | Path,
-    houses: str | None = None,
-    objects: str | None = None,
-    scenes_from: str | Path | None = None,
-    robot: str | None = None,
-    perturb: int | None = None,
-    candidates: Literal["grid", "clear", "in-range"] | None = None,
-    candidates_per_scene: int | str | None = None,
-    robots_per_scene: int | None = None,
-    split: Literal["train", "val", "test", "all"] | None = None,
-    seed: int | None = None,
-    settler: str | None = None,
-    renderer: str | None = None,
-    noise: bool = False,
-    config: str | Path | None = None,
-    job_options: JobOptions | None = None,
-    **where: Unpack[JobKeywords],
-) -> JobResult:
-    """Make labels and return what was done: start a run, or continue the one in the folder.
-
-    The call blocks and reports progress on standard error; in a notebook an interrupt of the kernel lets
-    the shards in flight finish, and the same call, or `resume`, continues. Options are those of
-    `datagen submit`, which `datagen submit --help` describes; the same options make the same bytes for
-    any number of workers.
 
     Args:
-        label_source: One of `datagen.label_sources`: heuristic, plan or sim.
-        n: Labels wanted; a larger number later extends the run.
-        out: The run's folder or s3:// address.
-        houses: One of `datagen.houses`, as `procthor:DIR` [builtin].
-        objects: One of `datagen.objects`, as `ycb:DIR` [builtin].
-        scenes_from: A run whose scenes and candidates are labelled again.
-        robot: One of `datagen.robots` [plan, sim: panda-scaled].
-        perturb: Trials at each candidate under disturbances (sim) [undisturbed].
-        candidates: Which cells of the grid around the target are candidates.
-        candidates_per_scene: Candidates of a scene [60]; "grid" for all 625.
-        robots_per_scene: Robots that share a scene's candidates [4, and 1 on a whole grid].
-        split: Houses to use, disjoint by split [all].
+        label_source: heuristic, plan or sim.
+        n: Labels wanted; a larger number extends the run.
+        out: Folder or s3:// address of the run.
+        houses: builtin, procthor:DIR or ai2thor:DIR [builtin].
+        objects: builtin or ycb:DIR [builtin].
+        scenes_from: Run whose scenes and candidates are labelled again.
+        robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
+        perturb: Trials per candidate, each with random errors of pose and world (sim) [1, without].
+        candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
+        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60].
+        robots_per_scene: Robots that share a scene's candidates [4; 1 on a whole grid].
+        split: Split of the houses; splits share no house [all].
         seed: Seed of the whole run [0].
-        settler: Physics engine: sapien or pybullet.
-        renderer: Renderer of the RGB-D frame: embree, sapien or pybullet [embree].
-        noise: Add the sensor noise model to the frame.
+        settler: Physics engine: sapien or pybullet [sapien where installed].
+        renderer: Renderer: embree, sapien or pybullet [embree].
+        noise: Add sensor noise to the frame.
         config: TOML file with any field of the specification.
-        job_options: What the command line gives instead of `where`.
-        where: `workers` (processes [one a core]; 0 works in this process), `address` (of a Ray cluster
-            [local]), `max_quarantined` (share of shards that may fail [0.01]), `detach` (let Ray continue
-            when this process ends) and `quiet` (report no progress).
+        job: `workers`, `address`, `max_quarantined`, `detach`, `json`, and `quiet` to report no progress.
+
+    Returns:
+        What was done. The call blocks and reports progress on standard error.
 
     Raises:
         InputError: An option, a source or the run cannot be used.
@@ -202,7 +120,7 @@ def submit(
         >>> result.complete, result.labels, result.path == str(folder / "new")
         (True, 8, True)
     """
-    out, job_options = str(out), job_options or JobOptions(**where)
+    out, job_options = str(out), JobOptions(**job)
     scenes_from = None if scenes_from is None else str(scenes_from)
     config = None if config is None else Path(config)
     refuse_missing_packages(label_source)

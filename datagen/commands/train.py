@@ -2,75 +2,106 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 from cyclopts import Parameter
+from pydantic import TypeAdapter, ValidationError
 
-from datagen.console.command_lines import say_interrupted
-from datagen.console.options import AllowIncomplete, AsJson
+from datagen.configuration.specify import parse_toml, read_toml
+from datagen.console.command_lines import Interrupted, prints, say_interrupted
+from datagen.console.options import AllowIncomplete, AsJson, File, Place, Places, Whole
 from datagen.console.printing import print_json, print_rows, seconds
-from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.schemas.errors import InputError
-from datagen.training.options import model_sizes, read_augmentation, share_cores
+from datagen.schemas.errors import InputError, choices
 
 if TYPE_CHECKING:
+    from datagen.train.augment import Augmentation
     from datagen.train.training.checkpoints import CheckpointHead, EpochRecord
     from datagen.train.training.training_setup import TrainingJob
+else:
+    CheckpointHead = Any  # the command line resolves it, without importing torch
 
-Whole = Annotated[int | None, WHOLE_NUMBER]
+
+_FIX = "Give a TOML file as in docs/guides/train.md"
 
 
-def verb(
-    stage: Annotated[
-        Literal["stage1", "stage2", "sim-only"],
-        Parameter(name="STAGE", help="Heuristic labels, then sim labels, or sim labels alone."),
-    ],
-    runs: Annotated[
-        list[str], Parameter(name="RUN...", negative=(), help="Runs to train on; merged and sealed ones too.")
-    ],
+def print_training(head: CheckpointHead | None, out: str | Path, json: bool, **_: Any) -> int:
+    """Print what a checkpoint holds; None where training was interrupted before it had one."""
+    finished = head is not None and head.finished
+    best = head.history[head.best_epoch - 1] if head and head.best_epoch else None
+    if json:
+        print_json(
+            {
+                "out": str(out),
+                "end": "finished" if finished else "interrupted",
+                "digest": head.digest if head else None,
+                "model": head.model if head else None,
+                "epochs": head.epoch if head else 0,
+                "steps": head.step if head else 0,
+                "best": best,
+                "history": head.history if head else (),
+                "cost": head.cost if head else {},
+            }
+        )
+    elif head is not None:
+        print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
+    if finished:
+        return 0
+    say_interrupted("; nothing is lost", sys.argv[1:])
+    return 130
+
+
+def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str, str]]:
+    yield "model", f"{head.model}, {head.stage}, sha256 {head.digest[:16]}"
+    for name, runs in (("trained on", head.data), ("validated on", head.val_data)):
+        for run in runs:
+            labels = f"{run['n_samples']:,} {run['schema']} labels of {run['n_scenes']:,} scenes"
+            specified = "+".join(spec_hash[:12] for spec_hash in run["spec_hashes"])
+            yield name, f"{labels}, by {specified}, samples {run['samples_sha256'][:12]}"
+    yield "trained", f"{head.epoch} epochs, {head.step:,} steps"
+    if best is not None:
+        balanced, auc = best["val_balanced_accuracy"], best["val_auc"]
+        numbers = [f"loss {best['val_loss']:.4f}", f"accuracy {best['val_accuracy']:.4f}"]
+        numbers += [f"balanced {balanced:.4f}"] if balanced is not None else []
+        numbers += [f"AUC {auc:.4f}"] if auc is not None else []
+        yield "validation", f"epoch {head.best_epoch}: {', '.join(numbers)}"
+    wall_s, cpu_s = head.cost.get("train_wall_s", 0.0), head.cost.get("train_cpu_s", 0.0)
+    waited = head.cost.get("data_wait_s", 0.0) / wall_s if wall_s > 0 else 0.0
+    yield "time", f"{seconds(wall_s)}, {waited:.1%} of it waiting for data"
+    yield "cost", f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU for labels, {seconds(cpu_s)} to train"
+
+
+@prints(print_training)
+def train_model(
+    stage: Annotated[Literal["stage1", "stage2", "sim-only"], Parameter(name="STAGE")],
+    runs: Annotated[Sequence[str | Path], Parameter(name="RUN...")],
     /,
     *,
-    out: Annotated[Path, Parameter(help="Checkpoint to write; the same command resumes it.")],
-    val: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Runs for validation [a tenth of the houses is held out]."),
-    ] = None,
-    init: Annotated[Path | None, Parameter(help="Checkpoint of stage 1 (stage2).")] = None,
-    model: Annotated[
-        Literal["paper", "shared"] | None, Parameter(help="Architecture [shared, or that of --init].")
-    ] = None,
-    model_config: Annotated[
-        list[str] | None,
-        Parameter(negative=(), help="Sizes of the model: a TOML file, or field=value; repeat for more."),
-    ] = None,
-    epochs: Annotated[Whole, Parameter(help="Epochs [12 in stage1, else 20].")] = None,
-    batch_scenes: Annotated[int, WHOLE_NUMBER, Parameter(help="Scenes per step, over all processes.")] = 16,
-    house_share: Annotated[
-        float, Parameter(help="Share of the houses to train on, for learning curves.")
-    ] = 1.0,
-    candidates_per_robot: Annotated[
-        Whole, Parameter(help="Candidates sampled per robot per epoch [all].")
-    ] = None,
-    lr: Annotated[float | None, Parameter(help="Highest learning rate [0.002; 0.001 in stage2].")] = None,
-    weight_decay: Annotated[float | None, Parameter(help="Weight decay [0 in stage1, else 0.01].")] = None,
-    seed: Annotated[int, WHOLE_NUMBER, Parameter(help="Seed of weights, order and dropout.")] = 0,
-    patience: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Epochs without a lower validation loss before training stops.")
-    ] = 8,
-    augment: Annotated[
-        str | None,
-        Parameter(help="noise, holes, dropout, colour, rotation, comma-separated; or a TOML file."),
-    ] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Device of the model.")] = "auto",
-    processes: Annotated[Whole, Parameter(help="Training processes [one per GPU; one on CPUs].")] = None,
-    threads: Annotated[Whole, Parameter(help="Threads per process [cores / processes].")] = None,
-    tensorboard: Annotated[str | None, Parameter(help="Folder for TensorBoard logs.")] = None,
+    out: File,
+    val: Places | None = None,
+    init: File | None = None,
+    model: Literal["paper", "shared"] | None = None,
+    model_config: Sequence[str] | None = None,
+    epochs: Whole | None = None,
+    batch_scenes: Whole = 16,
+    house_share: float = 1.0,
+    candidates_per_robot: Whole | None = None,
+    lr: float | None = None,
+    weight_decay: float | None = None,
+    seed: Whole = 0,
+    patience: Whole = 8,
+    augment: str | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    processes: Whole | None = None,
+    threads: Whole | None = None,
+    tensorboard: Place | None = None,
     allow_incomplete: AllowIncomplete = False,
     json: AsJson = False,
-) -> int:
+) -> CheckpointHead:
     """Train a model; the checkpoint records the data, settings and history.
 
     stage1 trains on heuristic labels with class-weighted cross-entropy; stage2 continues from it on sim or
@@ -79,95 +110,33 @@ def verb(
     command resumes.
 
     For example: datagen train stage1 runs/first --out model.ckpt
-    """
-    finished = True
-    try:
-        train_model(
-            stage,
-            runs,
-            out=out,
-            val=val,
-            init=init,
-            model=model,
-            model_config=model_config,
-            epochs=epochs,
-            batch_scenes=batch_scenes,
-            house_share=house_share,
-            candidates_per_robot=candidates_per_robot,
-            lr=lr,
-            weight_decay=weight_decay,
-            seed=seed,
-            patience=patience,
-            augment=augment,
-            device=device,
-            processes=processes,
-            threads=threads,
-            tensorboard=tensorboard,
-            allow_incomplete=allow_incomplete,
-            json=json,
-        )
-    except TrainingInterrupted:
-        finished = False
-    return _report(out, finished, json)
-
-
-class TrainingInterrupted(KeyboardInterrupt):
-    """A training ended because it was asked to; its checkpoint has the last step."""
-
-
-def train_model(
-    stage: Literal["stage1", "stage2", "sim-only"],
-    runs: Sequence[str | Path],
-    *,
-    out: str | Path,
-    val: Sequence[str | Path] | None = None,
-    init: str | Path | None = None,
-    model: Literal["paper", "shared"] | None = None,
-    model_config: Sequence[str] | None = None,
-    epochs: int | None = None,
-    batch_scenes: int = 16,
-    house_share: float = 1.0,
-    candidates_per_robot: int | None = None,
-    lr: float | None = None,
-    weight_decay: float | None = None,
-    seed: int = 0,
-    patience: int = 8,
-    augment: str | None = None,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-    processes: int | None = None,
-    threads: int | None = None,
-    tensorboard: str | Path | None = None,
-    allow_incomplete: bool = False,
-    json: bool = False,
-) -> CheckpointHead:
-    """Train a model on labels, keep it in one file, and return what the file says of itself.
-
-    Options are those of `datagen train`, which `datagen train --help` describes; the same call on the same
-    file continues a training that was interrupted.
 
     Args:
-        stage: stage1 on heuristic labels, stage2 from there on plan or sim labels, or sim-only.
-        runs: Runs to learn from, also merged or sealed ones.
-        out: The checkpoint's file.
-        val: Runs that decide when to stop [a tenth of the houses is held out].
-        init: The checkpoint of stage 1 that stage2 begins from.
-        model: paper or shared [shared, or that of `init`].
-        model_config: Sizes of the model: TOML files, or field=value.
-        epochs: Most epochs [12 in stage1, else 20].
-        batch_scenes: Scenes in a step, of all processes together.
-        house_share: Share of the houses to learn from.
+        stage: Heuristic labels, then sim labels, or sim labels alone.
+        runs: Runs to train on; merged and sealed ones too.
+        out: Checkpoint to write; the same command resumes it.
+        val: Runs for validation [a tenth of the houses is held out].
+        init: Checkpoint of stage 1 (stage2).
+        model: Architecture [shared, or that of --init].
+        model_config: Sizes of the model: a TOML file, or field=value; repeat for more.
+        epochs: Epochs [12 in stage1, else 20].
+        batch_scenes: Scenes per step, over all processes.
+        house_share: Share of the houses to train on, for learning curves.
         candidates_per_robot: Candidates sampled per robot per epoch [all].
         lr: Highest learning rate [0.002; 0.001 in stage2].
         weight_decay: Weight decay [0 in stage1, else 0.01].
         seed: Seed of weights, order and dropout.
         patience: Epochs without a lower validation loss before training stops.
-        augment: Effects, as "noise,holes", or a TOML file.
-        device: auto, cpu or cuda.
-        processes: Processes that train together [one a GPU; on CPUs one].
-        threads: Threads of each process [cores over processes].
-        tensorboard: Folder for TensorBoard's curves.
-        allow_incomplete: Read runs that lack a part of their labels.
+        augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
+        device: Device of the model.
+        processes: Training processes [one per GPU; one on CPUs].
+        threads: Threads per process [cores / processes].
+        tensorboard: Folder for TensorBoard logs.
+        allow_incomplete: Accept runs that lack planned samples instead of failing.
         json: Report progress as JSON lines.
+
+    Returns:
+        What the checkpoint says of itself.
 
     Raises:
         InputError: An option or a run cannot be used.
@@ -222,7 +191,8 @@ def train_model(
         allow_incomplete=allow_incomplete,
     )
     if not _train(job, n_processes):
-        raise TrainingInterrupted(f"Training stopped; the same call on {out} continues it")
+        head = read_checkpoint(out).head if Path(out).exists() else None
+        raise Interrupted(f"Training stopped; the same call on {out} continues it", head)
     return read_checkpoint(out).head
 
 
@@ -246,48 +216,62 @@ def _train(job: TrainingJob, processes: int) -> bool:
         return train_in_processes(train_job, job, processes, job.device, stopping)
 
 
-def _report(out: Path, finished: bool, json: bool) -> int:
-    from datagen.train.training.checkpoints import read_checkpoint
-
-    head = read_checkpoint(out).head if out.exists() else None
-    best = head.history[head.best_epoch - 1] if head and head.best_epoch else None
-    if json:
-        print_json(
-            {
-                "out": str(out),
-                "end": "finished" if finished else "interrupted",
-                "digest": head.digest if head else None,
-                "model": head.model if head else None,
-                "epochs": head.epoch if head else 0,
-                "steps": head.step if head else 0,
-                "best": best,
-                "history": head.history if head else (),
-                "cost": head.cost if head else {},
-            }
-        )
-    elif head is not None:
-        print_rows(f"{'finished' if finished else 'interrupted'}: {out}", list(_rows(head, best)))
-    if finished:
-        return 0
-    say_interrupted("; nothing is lost", sys.argv[1:])
-    return 130
+def model_sizes(words: Sequence[str]) -> dict[str, Any]:
+    """Read fields from files and `field=value` words; later ones override. Values are TOML."""
+    sizes: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            sizes |= read_toml(Path(word), _FIX)
+            continue
+        try:
+            sizes[name.strip()] = parse_toml(f"value = {text}")["value"]
+        except ValueError:
+            sizes[name.strip()] = text
+    return sizes
 
 
-def _rows(head: CheckpointHead, best: EpochRecord | None) -> Iterator[tuple[str, str]]:
-    yield "model", f"{head.model}, {head.stage}, sha256 {head.digest[:16]}"
-    for name, runs in (("trained on", head.data), ("validated on", head.val_data)):
-        for run in runs:
-            labels = f"{run['n_samples']:,} {run['schema']} labels of {run['n_scenes']:,} scenes"
-            specified = "+".join(spec_hash[:12] for spec_hash in run["spec_hashes"])
-            yield name, f"{labels}, by {specified}, samples {run['samples_sha256'][:12]}"
-    yield "trained", f"{head.epoch} epochs, {head.step:,} steps"
-    if best is not None:
-        balanced, auc = best["val_balanced_accuracy"], best["val_auc"]
-        numbers = [f"loss {best['val_loss']:.4f}", f"accuracy {best['val_accuracy']:.4f}"]
-        numbers += [f"balanced {balanced:.4f}"] if balanced is not None else []
-        numbers += [f"AUC {auc:.4f}"] if auc is not None else []
-        yield "validation", f"epoch {head.best_epoch}: {', '.join(numbers)}"
-    wall_s, cpu_s = head.cost.get("train_wall_s", 0.0), head.cost.get("train_cpu_s", 0.0)
-    waited = head.cost.get("data_wait_s", 0.0) / wall_s if wall_s > 0 else 0.0
-    yield "time", f"{seconds(wall_s)}, {waited:.1%} of it waiting for data"
-    yield "cost", f"{seconds(head.cost.get('label_cpu_s', 0.0))} of CPU for labels, {seconds(cpu_s)} to train"
+def read_augmentation(word: str | None) -> tuple[Augmentation | None, dict[str, Any]]:
+    """Read `--augment`, names of effects or a TOML file; return it also as plain data."""
+    if word is None:
+        return None, {}
+    from datagen.train.augment import Augmentation
+
+    kinds = {name: get_args(kind)[0] for name, kind in get_type_hints(Augmentation).items()}
+    asked: dict[str, Any] = {name.strip(): {} for name in word.split(",")}
+    if word.endswith(".toml"):
+        asked = read_toml(Path(word), _FIX)
+    effects: dict[str, Any] = {}
+    for name, values in asked.items():
+        if name not in kinds:
+            raise InputError("--augment", name, "is not an effect", choices(kinds, name))
+        known = {f.name for f in fields(kinds[name])}
+        if not isinstance(values, dict) or not values.keys() <= known:
+            raise InputError("--augment", name, "is not a section of the file", choices(known, name))
+        try:
+            effects[name] = TypeAdapter(kinds[name]).validate_python(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, (name, *first["loc"])))
+            raise InputError("--augment", where, first["msg"].lower(), _FIX) from None
+    return Augmentation(**effects), {name: asdict(effect) for name, effect in effects.items()}
+
+
+def share_cores(processes: int | None, threads: int | None) -> int:
+    """Return the threads of each process: those given, or an equal share of the cores.
+
+    Call it before torch is imported. The threads of a single process are bound to cores, since unbound ones
+    may share a core for minutes; those of several processes are not, since each would start at the first
+    core.
+    """
+    cores = len(os.sched_getaffinity(0))
+    for option, value in (("--processes", processes), ("--threads", threads)):
+        if value is not None and not 1 <= value <= 1024:
+            raise InputError("datagen train", option, f"{value}", "Give 1 or more, or leave it out")
+    each = threads or max(1, cores // (processes or 1))
+    if (processes or 1) == 1 and each == cores > 1:
+        os.environ.setdefault("OMP_PROC_BIND", "true")
+        os.environ.setdefault("OMP_PLACES", "cores")
+    elif processes is not None and processes > 1:
+        os.environ.setdefault("OMP_NUM_THREADS", str(each))
+    return each

@@ -6,15 +6,12 @@ import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from cyclopts import Parameter
 
-from datagen.console.options import AsJson, RunPlace
+from datagen.console.options import AS_FOUND, AsJson, RunPlace, Sources, Whole
 from datagen.console.printing import counted, print_json, print_lines, print_rows, seconds, size
-from datagen.console.whole_number import WHOLE_NUMBER
-from datagen.regeneration.sources import AS_FOUND, Sources
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.errors import InputError, printable
@@ -30,12 +27,8 @@ def verify(
     run: RunPlace,
     /,
     *,
-    deep: Annotated[
-        int, WHOLE_NUMBER, Parameter(help="Number of random samples and of random scenes to compute again.")
-    ] = 0,
-    seed: Annotated[
-        int | None, WHOLE_NUMBER, Parameter(help="Seed of the samples and scenes of --deep [random].")
-    ] = None,
+    deep: Whole = 0,
+    seed: Whole | None = None,
     given: Sources = AS_FOUND,
     json: AsJson = False,
 ) -> int:
@@ -45,6 +38,10 @@ def verify(
     damage, else 1. With --deep, labels are also computed again.
 
     For example: datagen verify runs/first
+
+    Args:
+        deep: Number of random samples and of random scenes to compute again.
+        seed: Seed of the samples and scenes of --deep [random].
     """
     if not 0 <= deep <= 1_000_000:
         raise InputError("--deep", str(deep), "is not between 0 and 1,000,000", "Give a number of samples")
@@ -89,7 +86,7 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
     """Findings of samples and scenes computed again, divided among the runs."""
     # Simulators are imported only for --deep_check.
     from datagen.regeneration.deep_check import deep_findings
-    from datagen.regeneration.shards import open_sources
+    from datagen.regeneration.scenes import open_sources
 
     rng = np.random.default_rng(seed)
     shares = np.full(len(runs), count // len(runs))
@@ -103,14 +100,8 @@ def _deep(place: Storage, runs: list[Run], count: int, seed: int, given: Sources
 
 def finding_row(finding: Finding) -> dict[str, Any]:
     """A finding as plain values."""
-    return {
-        "file": finding.key,
-        "kind": finding.kind,
-        "problem": finding.problem,
-        "fix": finding.fix,
-        "shard": finding.shard,
-        "repairable": finding.cure is not None,
-    }
+    fields = {name: getattr(finding, name) for name in ("kind", "problem", "fix", "shard")}
+    return {"file": finding.key, **fields, "repairable": finding.cure is not None}
 
 
 def _report(run: str, checked: Checked, found: Found) -> dict[str, Any]:

@@ -91,10 +91,7 @@ def robot_of(fields: Fields, robot: str | None) -> str | None:
 
 
 def narrow_candidates(fields: Fields, robot: str) -> None:
-    """Narrow the ranges of candidates that the fields do not set to those of the robot.
-
-    Raises InputError for an unknown robot.
-    """
+    """Narrow the ranges that the fields do not set to those of the robot. InputError for an unknown one."""
     limits, defaults = robot_limits(robot), CandidateParams()
     candidates = fields.setdefault("candidates", {})
     if not isinstance(candidates, dict):

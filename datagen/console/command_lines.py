@@ -1,11 +1,36 @@
-"""Command lines to copy, and the message of an interrupted command."""
+"""Verbs that are also Python functions, command lines to copy, and interruptions."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any, TypeVar
+
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+PRINTER = "print_result"
+
+
+def prints(printer: Callable[..., int]) -> Callable[[Verb], Verb]:
+    """Name the function that prints what a verb returns, on the command line, and gives the exit code.
+
+    It is called with the result and, by name, with the arguments of the verb.
+    """
+
+    def with_printer(verb: Verb) -> Verb:
+        setattr(verb, PRINTER, printer)
+        return verb
+
+    return with_printer
+
+
+class Interrupted(KeyboardInterrupt):
+    """The command was asked to stop, and did so in order; `result` is what it would have returned."""
+
+    def __init__(self, message: str, result: Any) -> None:
+        self.result = result
+        super().__init__(message)
 
 
 def words_of(options: Mapping[str, object]) -> list[str]:

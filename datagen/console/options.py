@@ -1,21 +1,44 @@
-"""Options that several verbs share."""
+"""Options that several verbs share.
+
+The help of an option is its line in the `Args:` section of the verb's docstring, or is given here.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from datagen.schemas.errors import InputError
 
 _MOST_RESAMPLES = 10_000
+_NUMBER = re.compile(r"[+-]?([0-9]{1,30}|[0-9]{1,3}(,[0-9]{3}){1,9})((\.[0-9]{1,30})?[eE]\+?[0-9]{1,2})?")
 
-RunPlace = Annotated[str, Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")]
-AllowIncomplete = Annotated[
-    bool, Parameter(negative=(), help="Accept runs that lack planned samples instead of failing.")
-]
-AsJson = Annotated[bool, Parameter(negative=(), help="Print one JSON document to standard output.")]
+
+def _whole_number(kind: Any, tokens: Sequence[Token]) -> int:
+    text = tokens[0].value
+    value = Decimal(text.replace(",", "")) if _NUMBER.fullmatch(text) else None
+    if value is None or value != int(value):
+        shown = text if len(text) <= 40 else text[:37] + "..."
+        raise ValueError(f'"{shown}" is not a whole number like 600, 180,000 or 1e5.')
+    return int(value)
+
+
+# 180000, 180,000 or 1e5. A plain int would read 2.5 as 2.
+Whole = Annotated[int, Parameter(converter=_whole_number)]
+RUN = Parameter(name="RUN", help="Folder or s3:// address of a run or of merged runs.")
+RunPlace = Annotated[str, RUN]
+# The command line gives text. An address such as s3://bucket/run is no path.
+Place = Annotated[str | Path, Parameter(metavar="STR")]
+Places = Annotated[Sequence[str | Path], Parameter(metavar="STR...")]
+File = Annotated[str | Path, Parameter(metavar="PATH")]
+AllowIncomplete = Annotated[bool, Parameter(help="Accept runs that lack planned samples instead of failing.")]
+AsJson = Annotated[bool, Parameter(help="Print one JSON document to standard output.")]
 
 
 def refuse_odd_draws(bootstrap: int, seed: int) -> None:
@@ -34,3 +57,25 @@ def refuse_output(file: Path, option: str, *endings: str) -> None:
         raise InputError(file, option, f"is not a {valid} file", f"Give a name that ends in {valid}")
     if not file.parent.is_dir():
         raise InputError(file, option, "its folder does not exist", "Make the folder first")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class AssetSources:
+    """References of houses and objects from the command line; None: those in the run's manifest."""
+
+    houses: Annotated[str | None, Parameter(help="New location of the houses [as in the run].")] = None
+    objects: Annotated[str | None, Parameter(help="New location of the objects [as in the run].")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Sources(AssetSources):
+    """The same, and the run whose scenes a run labelled again."""
+
+    scenes_from: Annotated[
+        str | None, Parameter(help="New location of the run with the scenes [as in the run].")
+    ] = None
+
+
+AS_FOUND = Sources()

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
-from typing import Any, TextIO
+from collections.abc import Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -22,8 +22,10 @@ def print_json(value: Any, indent: int | None = 2) -> None:
     sys.stdout.write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
-def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:
-    """Print a table; the first column is left-aligned, the others right-aligned when there are heads."""
+def print_rows(title: str, rows: Sequence[Sequence[str]], heads: Sequence[str] = ()) -> None:
+    """Print a table. With heads: nothing without rows, and all columns but the first right-aligned."""
+    if heads and not rows:
+        return
     table = Table(show_header=bool(heads), box=None, padding=(0, 2, 0, 0))
     for k in range(len(heads)) if heads else range(2):
         table.add_column(
@@ -37,11 +39,10 @@ def print_rows(title: str, rows: Iterable[Sequence[str]], heads: Sequence[str] =
     console.print(table)
 
 
-def print_lines(text: str, indent: str = "", stream: TextIO | None = None) -> None:
-    """Print the lines of a text to standard output or another stream."""
-    out: TextIO = stream or sys.stdout
-    out.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
-    out.flush()
+def print_lines(text: str, indent: str = "") -> None:
+    """Print the lines of a text."""
+    sys.stdout.writelines(f"{indent}{printable(line)}\n" for line in text.splitlines())
+    sys.stdout.flush()
 
 
 def counted(n: int, what: str) -> str:
@@ -49,9 +50,9 @@ def counted(n: int, what: str) -> str:
     return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
 
 
-def listed(values: Sequence[object], most: int = 10) -> str:
-    """The first values: 3, 5, 8, ..."""
-    return ", ".join(map(str, values[:most])) + (", ..." if len(values) > most else "")
+def listed(values: Sequence[object]) -> str:
+    """The first ten values: 3, 5, 8, ..."""
+    return ", ".join(map(str, values[:10])) + (", ..." if len(values) > 10 else "")
 
 
 def seconds(value: float) -> str:

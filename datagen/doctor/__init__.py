@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
 
-from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json
-from datagen.doctor.arm import arm_checks
 from datagen.doctor.check import Check, Status
-from datagen.doctor.engines import engine_checks
+from datagen.doctor.engines import arm_checks, engine_checks
 from datagen.doctor.host import host_checks
 from datagen.schemas.errors import InputError
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -25,9 +22,9 @@ from datagen.workers.extras import EXTRAS, how_to_get
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
-def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
+def _count(name: str, ref: str, names: Callable[[], Sequence[str]]) -> Check:
     try:
-        n = count(ref)
+        n = len(names())
     except InputError as error:
         return Check(name, "fail", f"{error.place}: {error.problem}", error.fix)
     if n == 0:
@@ -35,33 +32,25 @@ def _count(name: str, ref: str, count: Callable[[str], int]) -> Check:
     return Check(name, "ok", f"{n} from {ref}")
 
 
-def _houses(ref: str) -> int:
-    from datagen.workers.houses import open_houses
-
-    return len(open_houses(ref).house_ids())
-
-
-def _objects(ref: str) -> int:
-    from datagen.workers.objects import open_objects
-
-    return len(open_objects(ref).names())
-
-
 def asset_checks(houses: str | None, objects: str | None) -> list[Check]:
     """Checks of houses and objects: those given, else those in DATAGEN_ASSETS, else the built-in ones."""
+    from datagen.workers.houses import open_houses
+    from datagen.workers.objects import open_objects
+
     root = os.environ.get("DATAGEN_ASSETS")
     if root and houses is None and (Path(root) / "procthor").is_dir():
         houses = f"procthor:{Path(root) / 'procthor'}"
     if root and objects is None and (Path(root) / "ycb").is_dir():
         objects = f"ycb:{Path(root) / 'ycb'}"
-    return [_count("houses", houses or "builtin", _houses), _count("objects", objects or "builtin", _objects)]
+    houses, objects = houses or "builtin", objects or "builtin"
+    return [
+        _count("houses", houses, lambda: open_houses(houses).house_ids()),
+        _count("objects", objects, lambda: open_objects(objects).names()),
+    ]
 
 
 def extra_checks() -> list[Check]:
-    """One finding an extra: what it gives, and how to get it where it is not installed.
-
-    Only labels are asked of a machine: without the first extra it fails, the others are a choice.
-    """
+    """One finding an extra: what it gives, and how to get it. Only `labels` is asked of a machine."""
     checks: list[Check] = []
     for name, extra in EXTRAS.items():
         if missing := extra.missing():
@@ -71,12 +60,6 @@ def extra_checks() -> list[Check]:
         else:
             checks.append(Check(f"extra {name}", "ok", extra.gives))
     return checks
-
-
-def as_json(checks: list[Check]) -> dict[str, Any]:
-    """`{"ok": bool, "checks": [{"name", "status", "detail", "fix"}, ...]}`, in the order of the table."""
-    good = all(check.status != "fail" for check in checks)
-    return {"ok": good, "checks": [asdict(check) for check in checks]}
 
 
 def as_table(checks: list[Check]) -> Table:
@@ -94,24 +77,21 @@ def as_table(checks: list[Check]) -> Table:
     return table
 
 
-def doctor(
-    *,
-    json: AsJson = False,
-    houses: Annotated[
-        str | None, Parameter(help="Houses to check: builtin, procthor:DIR or ai2thor:DIR.")
-    ] = None,
-    objects: Annotated[str | None, Parameter(help="Objects to check: builtin or ycb:DIR.")] = None,
-) -> int:
+def doctor(*, json: AsJson = False, houses: str | None = None, objects: str | None = None) -> int:
     """Check this machine, and show how to fix what is missing.
 
     Exit code 0 when labels can be made here, else 1.
+
+    Args:
+        houses: Houses to check: builtin, procthor:DIR or ai2thor:DIR.
+        objects: Objects to check: builtin or ycb:DIR.
     """
     checks = [*host_checks(), *extra_checks(), *engine_checks(), *arm_checks()]
     if not EXTRAS["labels"].missing():
         checks += asset_checks(houses, objects)
     failures = sum(check.status == "fail" for check in checks)
     if json:
-        print_json(as_json(checks))
+        print_json({"ok": not failures, "checks": [asdict(check) for check in checks]})
     else:
         console = Console(highlight=False)
         console.print(as_table(checks))

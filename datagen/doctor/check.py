@@ -13,10 +13,7 @@ Status = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report. `fail`: labels cannot be made; `warn`: a feature is missing.
-
-    `fix` says what to do, "" where nothing is to be done.
-    """
+    """One line of the report. `fail`: labels cannot be made; `warn`: a feature is missing."""
 
     name: str
     status: Status

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,45 +20,47 @@ from datagen.drawing.floor_plan import (
     draw_scores,
 )
 from datagen.drawing.grasp_views import draw_grasps, support_sheet, used_grasps
-from datagen.drawing.scene_picture import best_clear, scene_facts
+from datagen.drawing.scene_picture import Columns, Lines, Shown, best_clear, positives, scene_facts
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.styles import BEST, BEST_BY_SCORE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
-from datagen.workers.rendering.frame import Frame
-from datagen.workers.scenes.reconstruct import ReconstructedScene
+from datagen.workers.robots import open_robot
 
 if TYPE_CHECKING:  # the heuristic's pictures need no library of arms
     from datagen.workers.robots.robot import Robot
 
-Columns = Mapping[str, Any]
 _SUCCESS = tuple(OUTCOMES).index("success")
 _PICKS = ("highest H", "best")
 _ROBOTS = 4  # more circles and lines would hide each other
 
 
-def draw_arm_picture(
-    title: str,
-    recalled: ReconstructedScene,
-    frame: Frame,
-    record: Columns,
-    samples: Columns,
-    robots: Sequence[Robot],
-    tau: float,
-    out: Path,
-) -> None:
-    """Write the picture of a scene of `plan` or `sim`; `robots` are the first of its candidates'."""
-    figure = new_sheet(title, 9.2)
+def draw_arm_picture(shown: Shown, out: Path) -> Lines:
+    """Write the picture of a scene of `plan` or `sim`; return its positives and its best success."""
+    samples, robots = shown.samples, _robots_of(shown)
+    figure = new_sheet(shown.title, 9.2)
     upper, lower, numbers = np.asarray(figure.subfigures(3, 1, height_ratios=(3.6, 3.7, 1.75))).tolist()
     frame_ax, outcome_ax, score_ax = upper.subplots(1, 3, width_ratios=(1.05, 1, 1))
-    draw_frame(frame_ax, frame.rgb, frame.body == 1)
-    handles, picks = _draw_maps(upper, outcome_ax, score_ax, recalled, samples, robots, tau)
+    draw_frame(frame_ax, shown.frame.rgb, shown.frame.body == 1)
+    handles, picks = _draw_maps(upper, outcome_ax, score_ax, shown, robots)
     views, legend = np.asarray(lower.subfigures(1, 2, width_ratios=(1.75, 1))).tolist()
-    _draw_grasps(views, recalled, record, samples, robots[0])
+    _draw_grasps(views, shown, robots[0])
     draw_legend(legend.subplots(), handles, "base poses: filled where the base fits", picks)
     columns = numbers.subplots(1, 2)
-    write_facts(columns[0], scene_facts(recalled, record) + _robots(samples, robots))
+    write_facts(columns[0], scene_facts(shown) + _robots(samples, robots))
     write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
+    best = best_success(samples)
+    words = "none" if best is None else f"candidate {best} at {shown.place(best)}"
+    return [positives(samples), ("best success", words)]
+
+
+def _robots_of(shown: Shown) -> list[Robot]:
+    """The first robots of the candidates, in the order of `robot_index`."""
+    samples, arm = shown.samples, shown.spec.arm
+    assert arm is not None
+    _, rows = np.unique(np.asarray(samples["robot_index"]), return_index=True)
+    reach_m, height_m = samples["arm_reach_m"], samples["base_height_m"]
+    return [open_robot(arm.robot, float(reach_m[row]), float(height_m[row])) for row in rows[:_ROBOTS]]
 
 
 def best_success(samples: Columns) -> int | None:
@@ -84,12 +86,11 @@ def _draw_maps(
     figure: Any,
     outcome_ax: Axes,
     score_ax: Axes,
-    recalled: ReconstructedScene,
-    samples: Columns,
+    shown: Shown,
     robots: Sequence[Robot],
-    tau: float,
 ) -> tuple[list[Handle], list[Style]]:
     """Draw candidates by outcome and by score; returns the legend of both, and the picks."""
+    recalled, samples, tau = shown.recalled, shown.samples, shown.spec.heuristic.tau
     centre = recalled.target_center_m
     xy = np.asarray(samples["base_xy_m"], np.float64)
     half_m = float(np.abs(xy - centre[:2]).max()) + 0.12
@@ -112,13 +113,12 @@ def _draw_maps(
     return handles + circles, [style for _, style in marked] + seen
 
 
-def _draw_grasps(
-    figure: Any, recalled: ReconstructedScene, record: Columns, samples: Columns, robot: Robot
-) -> None:
+def _draw_grasps(figure: Any, shown: Shown, robot: Robot) -> None:
+    record, samples = shown.rows.record, shown.samples
     views = figure.subplots(1, 2)
     used = used_grasps(samples["T_target_tcp"][samples["outcome"] == _SUCCESS])
     sheet = support_sheet(np.asarray(record["T_world_support"]), np.asarray(record["support_size_m"]))
-    scale = draw_grasps((views[0], views[1]), recalled, sheet, robot.gripper, used)
+    scale = draw_grasps((views[0], views[1]), shown.recalled, sheet, robot.gripper, used)
     if scale is None:
         views[0].set_xlabel("none succeeded")
         return
@@ -134,7 +134,7 @@ def _picked(samples: Columns) -> list[tuple[int | None, Style]]:
     return [(by_score, BEST_BY_SCORE), (best_success(samples), BEST)]
 
 
-def _robots(samples: Columns, robots: Sequence[Robot]) -> list[tuple[str, str]]:
+def _robots(samples: Columns, robots: Sequence[Robot]) -> Lines:
     facts = [
         (f"robot {k}", f"{robot.name}, reach {robot.reach_m:.2f} m, mount {robot.base_height_m:.2f} m high")
         for k, robot in enumerate(robots)
@@ -143,7 +143,7 @@ def _robots(samples: Columns, robots: Sequence[Robot]) -> list[tuple[str, str]]:
     return facts + ([("", f"and {others} more robots")] if others else [])
 
 
-def _candidates(samples: Columns) -> list[tuple[str, str]]:
+def _candidates(samples: Columns) -> Lines:
     label, clear = np.asarray(samples["label"]), np.asarray(samples["base_is_clear"])
     called = np.asarray(samples["heuristic_label"]).astype(bool) & clear
     near = clear & (samples["outcome"] != tuple(OUTCOMES).index("out_of_reach"))
@@ -177,10 +177,3 @@ def _described(samples: Columns, row: int | None) -> str:
             text += f"; lifted {int(samples['successes'][row])} of {int(samples['trials'][row])} times, "
             text += f"lift {lift_cm:.1f} cm, slip {slip_cm:.1f} cm"
     return text
-
-
-def robots_of(samples: Columns) -> list[tuple[float, float]]:
-    """Reach and mount height of the first robots among the candidates, in the order of `robot_index`."""
-    _, rows = np.unique(np.asarray(samples["robot_index"]), return_index=True)
-    reach_m, height_m = samples["arm_reach_m"], samples["base_height_m"]
-    return [(float(reach_m[row]), float(height_m[row])) for row in rows[:_ROBOTS]]

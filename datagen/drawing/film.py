@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -50,19 +51,50 @@ _PHASE_WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A trial with its cameras, ready to be rendered."""
+    """A trial to be rendered; its cameras are chosen once."""
 
     recalled: ReconstructedScene
     bodies: RobotBodies
     T_world_base: F64
     recording: Recording
     told: Told  # the moments of a filmstrip
-    wide: Shot
-    near: Shot
+    wide_px: tuple[int, int]  # width and height of the far view
+    near_px: tuple[int, int]
 
     def stage(self, moment: int) -> RayScene:
         """Objects, then the robot's bodies, at a moment; without the house."""
-        return _stage(self.recalled, self.bodies, self.T_world_base, self.recording, moment)
+        recording, rays = self.recording, self.recalled.rays
+        opening_m = float(recording.opening_m[moment])
+        robot = self.bodies.poses(self.T_world_base, recording.q_rad[moment], opening_m)
+        return RayScene(
+            nothing(),
+            [*rays.objects, *self.bodies.rays],
+            np.concatenate([rays.radii_m, self.bodies.radii_m]),
+            np.concatenate([recording.T_world_object[moment], robot]),
+        )
+
+    @cached_property
+    def shots(self) -> tuple[Shot, Shot]:
+        """The far view of the whole trial, and the near one of the grasp."""
+        recording, bodies, models = self.recording, self.bodies, self.recalled.models
+        named, last = {words: moment for moment, words in self.told}, len(recording.phase) - 1
+        shown = sorted({0, named.get("on the way", 0), named.get("at the grasp", (last + 1) // 2), last})
+        moments = [self.stage(moment) for moment in shown]
+        hand = tuple(len(models) + k for k in bodies.hand)
+        arm = tuple(len(models) + k for k in range(len(bodies.rays)) if bodies.link[k] >= 0)
+        origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in moments])
+        target_m = recording.T_world_object[shown, 0, :3, 3]
+        target_m = target_m[np.linalg.norm(target_m - target_m[0], axis=1) < _FOLLOWED_M]
+        around_m = np.concatenate([_around(origins_m, _LINK_M), _around(target_m, _LINK_M)])
+        grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
+        half_m = max(_NEAR_HALF_M, float(models[0].radius_m) + 0.03)
+        house, forward = self.recalled.house.house, self.T_world_base[:3, 0]
+        wide = Subject(moments, ((arm, 1.0), (hand, 1.5), ((0,), 1.5)), around_m, forward)
+        near = Subject(moments[-2:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
+        return (
+            choose_shot(house, wide, _WIDE_M, *self.wide_px),
+            choose_shot(house, near, _NEAR_M, *self.near_px),
+        )
 
     def rise_m(self, moment: int) -> float:
         """Rise of the target above its start (m)."""
@@ -74,48 +106,8 @@ class Film:
         return _PHASE_WORDS.get(self.recording.phase[moment], self.recording.phase[moment])
 
 
-def film_of(
-    recalled: ReconstructedScene,
-    bodies: RobotBodies,
-    T_world_base: F64,
-    recording: Recording,
-    told: Told,
-    wide_px: tuple[int, int],
-    near_px: tuple[int, int],
-) -> Film:
-    """Choose both views of a trial for the moments `told`; sizes are (width, height)."""
-    named = {words: moment for moment, words in told}
-    middle = len(recording.phase) // 2
-    shown = sorted(
-        {0, named.get("on the way", 0), named.get("at the grasp", middle), len(recording.phase) - 1}
-    )
-    moments = [_stage(recalled, bodies, T_world_base, recording, m) for m in shown]
-    n_objects = len(recalled.models)
-    hand = tuple(n_objects + k for k in bodies.hand)
-    arm = tuple(n_objects + k for k in range(len(bodies.rays)) if bodies.link[k] >= 0)
-    origins_m = np.concatenate([stage.T_world_object[list(arm), :3, 3] for stage in moments])
-    target_m = recording.T_world_object[shown, 0, :3, 3]
-    target_m = target_m[np.linalg.norm(target_m - target_m[0], axis=1) < _FOLLOWED_M]
-    forward = T_world_base[:3, 0]
-    house = recalled.house.house
-    wide = Subject(
-        moments, ((arm, 1.0), (hand, 1.5), ((0,), 1.5)),
-        np.concatenate([_around(origins_m, _LINK_M), _around(target_m, _LINK_M)]), forward,
-    )  # fmt: skip
-    grasp_m = recording.T_world_object[0, :1, :3, 3] + [0.0, 0.0, 0.04]
-    half_m = max(_NEAR_HALF_M, float(recalled.models[0].radius_m) + 0.03)
-    near = Subject(moments[-2:], ((hand, 1.0), ((0,), 1.0)), _around(grasp_m, half_m), forward)
-    return Film(
-        recalled, bodies, T_world_base, recording, told,
-        choose_shot(house, wide, _WIDE_M, *wide_px), choose_shot(house, near, _NEAR_M, *near_px),
-    )  # fmt: skip
-
-
 def told_moments(recording: Recording) -> Told:
-    """The eight moments of a filmstrip as (row, name); fewer in a shorter recording.
-
-    Where the trial ended early, further moments fill the gaps.
-    """
+    """The eight moments of a filmstrip as (row, name); gaps of one that ended early are filled."""
     phase = np.array(recording.phase)
     told: dict[int, str] = {}
     for name, share, words in _MOMENTS:
@@ -174,22 +166,12 @@ class Lens:
 
 def pictures(film: Film, moments: Sequence[int], sharpness: int) -> Iterator[tuple[U8, U8]]:
     """The far and the near view of each moment."""
-    wide, near = Lens(film.wide, sharpness, outlined=True), Lens(film.near, sharpness, outlined=False)
+    wide, near = (
+        Lens(shot, sharpness, outlined) for shot, outlined in zip(film.shots, (True, False), strict=True)
+    )
     for moment in moments:
         stage = film.stage(moment)
         yield wide.picture(stage), near.picture(stage)
-
-
-def _stage(
-    recalled: ReconstructedScene, bodies: RobotBodies, T_world_base: F64, recording: Recording, moment: int
-) -> RayScene:
-    robot = bodies.poses(T_world_base, recording.q_rad[moment], float(recording.opening_m[moment]))
-    return RayScene(
-        nothing(),
-        [*recalled.rays.objects, *bodies.rays],
-        np.concatenate([recalled.rays.radii_m, bodies.radii_m]),
-        np.concatenate([recording.T_world_object[moment], robot]),
-    )
 
 
 def _around(centres_m: F64, half_m: float) -> F64:

@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from datagen.drawing.film import OUTLINE_RGB, Film, pictures
-from datagen.drawing.film_camera import Shot
 from datagen.schemas.styles import PHASE_COLOURS
 from datagen.workers.geometry.mesh import U8
 
@@ -38,7 +37,7 @@ class Title:
 def write_sheet(film: Film, title: Title, out: Path) -> None:
     """Moments in rows of four: the far view, below it the near one."""
     told, text_px = film.told, _SHEET_TEXT_PX
-    (w, h), (_, near_h) = _size(film.wide), _size(film.near)
+    (w, h), (_, near_h) = film.wide_px, film.near_px
     top, caption_px = _title_px(title, text_px), 2 * round(1.3 * text_px) + _GAP_PX
     band = caption_px + h + near_h + 2 * _GAP_PX
     columns = max(2, min(_COLUMNS, len(told)))  # two have room for the title
@@ -98,7 +97,7 @@ def _pale(colour: str) -> tuple[int, int, int]:
 
 
 def _motion_frame(film: Film, title: Title, moment: int, wide: U8, near: U8) -> Image.Image:
-    (w, h), (near_w, _) = _size(film.wide), _size(film.near)
+    (w, h), (near_w, _) = film.wide_px, film.near_px
     text_px = _MOTION_TEXT_PX
     top, full = _title_px(title, text_px), w + near_w + _GAP_PX
     frame = Image.new("RGB", (full + 2 * _GAP_PX, top + h + 2 * text_px + 2 * _GAP_PX), _PAPER)
@@ -131,10 +130,6 @@ def _write_title(draw: ImageDraw.ImageDraw, title: Title, text_px: int) -> None:
     draw.text((2 * _GAP_PX + chip_px, 11), title.head, _INK, _font(round(1.3 * text_px), bold=True))
     for k, line in enumerate(title.lines):
         draw.text((_GAP_PX, (1.9 + 1.4 * k) * text_px + _GAP_PX), line, _PALE, _font(text_px))
-
-
-def _size(shot: Shot) -> tuple[int, int]:
-    return shot.camera.width_px, shot.camera.height_px
 
 
 def _state(film: Film, moment: int) -> tuple[str, str]:

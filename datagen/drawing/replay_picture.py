@@ -17,20 +17,13 @@ from datagen.drawing.floor_plan import (
     half_width_m,
     object_outlines,
 )
-from datagen.schemas.fields import SceneRows
-from datagen.schemas.identity import Stream, generator
-from datagen.schemas.specification import Specification
+from datagen.drawing.scene_picture import Shown
 from datagen.schemas.styles import LABEL_STYLES, SAMPLE, Style
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet
-from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
-Side = tuple[ReconstructedScene, SceneRows]
 
-
-def draw_replay(
-    report: dict[str, Any], spec: Specification, stored: Side, made: Side, row: int | None, out: Path
-) -> None:
+def draw_replay(report: dict[str, Any], stored: Shown, made: Shown, row: int | None, out: Path) -> None:
     """Write the picture. `report` is that of `datagen replay`; `row` is the candidate to mark."""
     verdict = "equal bit for bit" if report["equal"] else "different"
     figure = new_sheet(f"Scene {report['scene']} of {report['run']} replayed: {verdict}", 8.2)
@@ -38,13 +31,10 @@ def draw_replay(
     handles: list[Handle] = []
     marks: list[Style] = []
     for column, (name, side) in enumerate((("stored", stored), ("replayed", made))):
-        recalled, rows = side
-        rng = generator(spec.seed, Stream.NOISE, recalled.index, recalled.retry)
-        frame = render_frame(spec.observation, recalled.geometry, recalled.camera, rng)
-        draw_frame(panels[0, column], frame.rgb, frame.body == 1, f"{name}: RGB frame")
-        handles, marks = _draw_candidates(panels[1, column], recalled, rows, row)
+        draw_frame(panels[0, column], side.frame.rgb, side.frame.body == 1, f"{name}: RGB frame")
+        handles, marks = _draw_candidates(panels[1, column], side, row)
         panels[1, column].set_title(f"{name}: candidates by label")
-    _draw_over(panels[0, 2], stored[0], made[0])
+    _draw_over(panels[0, 2], stored.recalled, made.recalled)
     draw_legend(panels[1, 2], handles, "base poses", marks)
     panels[1, 2].text(
         0, 0, "\n".join(_lines(report)), va="bottom", family="monospace", fontsize=9,
@@ -53,12 +43,10 @@ def draw_replay(
     save_sheet(figure, out)
 
 
-def _draw_candidates(
-    axes: Axes, recalled: ReconstructedScene, rows: SceneRows, row: int | None
-) -> tuple[list[Handle], list[Style]]:
-    xy = np.asarray(rows.samples["base_xy_m"], np.float64)
-    marks = draw_plan(axes, recalled, half_width_m(recalled))
-    label, clear = (np.asarray(rows.samples[key]) for key in ("label", "base_is_clear"))
+def _draw_candidates(axes: Axes, side: Shown, row: int | None) -> tuple[list[Handle], list[Style]]:
+    xy = np.asarray(side.samples["base_xy_m"], np.float64)
+    marks = draw_plan(axes, side.recalled, half_width_m(side.recalled))
+    label, clear = (np.asarray(side.samples[key]) for key in ("label", "base_is_clear"))
     handles = draw_labels(axes, xy, label, clear)
     if row is not None:
         draw_pick(axes, xy[row], SAMPLE)

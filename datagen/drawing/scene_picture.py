@@ -1,8 +1,10 @@
-"""One picture of a scene labelled by the heuristic: frame, depth, floor plans, cloud, numbers."""
+"""A stored scene to draw, and its picture by the heuristic: frame, depth, floor plans, cloud, numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +20,64 @@ from datagen.drawing.floor_plan import (
     draw_scores,
     half_width_m,
 )
+from datagen.schemas.fields import SceneRows
+from datagen.schemas.identity import Stream, generator
 from datagen.schemas.outcomes import REDRAW_CAUSES
+from datagen.schemas.specification import Specification
 from datagen.schemas.styles import BEST_BY_SCORE, TARGET
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 from datagen.workers.rendering.frame import Frame
+from datagen.workers.scenes.generate import render_frame
 from datagen.workers.scenes.reconstruct import ReconstructedScene
 
 Columns = Mapping[str, Any]
+Lines = list[tuple[str, str]]  # printed next to a picture
 
 
-def draw_scene_picture(
-    title: str,
-    recalled: ReconstructedScene,
-    frame: Frame,
-    record: Columns,
-    samples: Columns,
-    tau: float,
-    out: Path,
-) -> None:
-    """Write the picture of a scene; `samples` are its candidates, one row each; `tau` splits their scores."""
-    figure = new_sheet(title, 8.0)
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A scene of a run: its rows, and the scene made from them again."""
+
+    run: str
+    spec: Specification
+    rows: SceneRows
+    recalled: ReconstructedScene
+
+    @property
+    def samples(self) -> Columns:
+        """The candidates, one row each."""
+        return self.rows.samples
+
+    @property
+    def title(self) -> str:
+        return f"Scene {self.recalled.index} of {self.run}: {self.target}"
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The RGB-D frame, rendered again."""
+        rng = generator(self.spec.seed, Stream.NOISE, self.recalled.index, self.recalled.retry)
+        return render_frame(self.spec.observation, self.recalled.geometry, self.recalled.camera, rng)
+
+    def place(self, row: int) -> str:
+        """Position of a candidate's base as text."""
+        x, y = self.samples["base_xy_m"][row]
+        return f"({x:.3f}, {y:.3f}) m"
+
+    @property
+    def target(self) -> str:
+        record = self.rows.record
+        return f"{self.recalled.models[0].name} on {record['support_type']}, {record['room_type']}"
+
+
+def draw_scene_picture(shown: Shown, out: Path) -> Lines:
+    """Write the picture of a scene; return its positives and its best base."""
+    recalled, record, samples = shown.recalled, shown.rows.record, shown.samples
+    tau = shown.spec.heuristic.tau
+    figure = new_sheet(shown.title, 8.0)
     upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(6.4, 1.6))).tolist()
     panels = upper.subplots(2, 3, width_ratios=(1.1, 1, 1))
-    draw_frame(panels[0, 0], frame.rgb, frame.body == 1)
-    _draw_depth(upper, panels[1, 0], frame)
+    draw_frame(panels[0, 0], shown.frame.rgb, shown.frame.body == 1)
+    _draw_depth(upper, panels[1, 0], shown.frame)
 
     xy = np.asarray(samples["base_xy_m"], np.float64)
     marks = draw_plan(panels[0, 1], recalled, half_width_m(recalled))
@@ -60,9 +96,16 @@ def draw_scene_picture(
     _draw_cloud(upper.add_subplot(2, 3, 5, projection="3d"), record)
     draw_legend(panels[1, 2], legend, "base poses", marks if best is None else [BEST_BY_SCORE, *marks])
     columns = lower.subplots(1, 2)
-    write_facts(columns[0], _scene(recalled, record))
+    write_facts(columns[0], _scene(shown))
     write_facts(columns[1], _candidates(samples))
     save_sheet(figure, out)
+    words = "none is clear" if best is None else f"{shown.place(best)}, H = {score[best]:.3f}"
+    return [positives(samples), ("best clear base", words)]
+
+
+def positives(samples: Columns) -> tuple[str, str]:
+    """How many candidates are positive."""
+    return "positive", f"{int(samples['label'].sum())} of {len(samples['label'])} candidates"
 
 
 def best_clear(score: Any, clear: Any) -> int | None:
@@ -71,16 +114,16 @@ def best_clear(score: Any, clear: Any) -> int | None:
     return int(rows[np.argmax(score[rows])]) if len(rows) else None
 
 
-def scene_facts(recalled: ReconstructedScene, record: Columns) -> list[tuple[str, str]]:
+def scene_facts(shown: Shown) -> Lines:
     """House, room, support and objects of a scene."""
+    record, models = shown.rows.record, shown.recalled.models
     height_m = float(np.asarray(record["T_world_support"])[2, 3])
-    target = recalled.models[0]
     return [
         ("house", str(record["house_id"])),
         ("room", f"{record['room_type']} ({record['room_id']})"),
         ("support", f"{record['support_type']}, {height_m:.3f} m high"),
-        ("target", f"{target.name}, {1000 * target.mass_kg:.0f} g"),
-        ("clutter", ", ".join(m.name for m in recalled.models[1:]) or "none"),
+        ("target", f"{models[0].name}, {1000 * models[0].mass_kg:.0f} g"),
+        ("clutter", ", ".join(m.name for m in models[1:]) or "none"),
     ]
 
 
@@ -109,19 +152,20 @@ def _draw_cloud(axes: Axes3D, record: Columns) -> None:
     axes.set_title(f"cloud around the target, {n:,} points")
 
 
-def _scene(recalled: ReconstructedScene, record: Columns) -> list[tuple[str, str]]:
+def _scene(shown: Shown) -> Lines:
+    record = shown.rows.record
     counts = zip(REDRAW_CAUSES, np.asarray(record["redraws"]), strict=True)
     speed_mm, depth_mm = (1000 * float(record[k]) for k in ("residual_speed_mps", "penetration_m"))
     steps, seen = int(record["settle_steps"]), float(record["target_visible_fraction"])
     return [
-        *scene_facts(recalled, record),
+        *scene_facts(shown),
         ("settled", f"{steps} steps, then {speed_mm:.2f} mm/s, penetration {depth_mm:.2f} mm"),
         ("resampled", ", ".join(f"{cause} {n}" for cause, n in counts if n) or "never"),
         ("frame", f"{100 * seen:.0f}% of the target visible"),
     ]
 
 
-def _candidates(samples: Columns) -> list[tuple[str, str]]:
+def _candidates(samples: Columns) -> Lines:
     rho, label = np.asarray(samples["visibility"]), np.asarray(samples["label"])
     clear = np.asarray(samples["base_is_clear"])
     low, high = 100 * (rho < 0.04).mean(), 100 * (rho > 0.8).mean()

@@ -1,11 +1,14 @@
-"""Picture of one candidate's trial for `datagen show --trial`."""
+"""One candidate's trial, run again with its poses recorded and drawn: `datagen show --trial`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from datagen.drawing.arm_picture import best_success
-from datagen.drawing.film import film_of
+from datagen.drawing.film import Film, Told, told_moments
 from datagen.drawing.filmstrip import (
     MOTION_NEAR_PX,
     MOTION_WIDE_PX,
@@ -16,13 +19,33 @@ from datagen.drawing.filmstrip import (
     write_sheet,
 )
 from datagen.drawing.posed_robot import robot_bodies
-from datagen.drawing.retrial import Retrial, try_again
-from datagen.drawing.shown import Lines, Shown
+from datagen.drawing.scene_picture import Lines, Shown
+from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.specification import Specification
 from datagen.schemas.styles import OUTCOME_STYLES
-from datagen.workers.labels.arm_labelling import arm_of
+from datagen.workers.bases.candidates import SceneCandidates
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.transforms import inverse
+from datagen.workers.labels.arm_labelling import (
+    ArmInScene,
+    CandidateTrial,
+    arm_in_scene,
+    arm_of,
+    try_candidate,
+)
+from datagen.workers.motion.arm_collision import surroundings
+from datagen.workers.motion.motion_plan import MotionPlan
+from datagen.workers.motion.rrt_connect import dense
+from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.reconstruct import reconstruct_candidates
+from datagen.workers.scenes.scene import SettledScene
+from datagen.workers.trials.trial import Recording, TrialResult
+
+_STEP_S = 0.05  # between the moments of a plan that was not executed
+_STEP_RAD = 0.08  # advance of a plan in that time, over all joints
+_TRIES = 7  # poses to show of an arm without a plan
 
 
 def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
@@ -33,14 +56,14 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     arm = arm_of(shown.spec)
     row = _candidate(shown, candidate)
     retrial = try_again(
-        shown.recalled, reconstruct_candidates(shown.rows.samples, shown.recalled), row, shown.spec
+        shown.recalled, reconstruct_candidates(shown.samples, shown.recalled), row, shown.spec
     )
     outcome, robot = retrial.trial.outcome, retrial.robot
     moving = out.suffix.lower() == ".gif"
     if moving and not retrial.moves:
         problem = f"candidate {row} ended as {outcome} before the arm moved: there is nothing to animate"
         raise InputError(out, "--out", problem, "Give a name that ends in .png")
-    stored = tuple(OUTCOMES)[int(shown.rows.samples["outcome"][row])]
+    stored = tuple(OUTCOMES)[int(shown.samples["outcome"][row])]
     title = Title(
         OUTCOME_STYLES[outcome].colour,
         f"candidate {row}: {outcome} ({_words(retrial)})",
@@ -52,7 +75,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
     )
     sizes = (MOTION_WIDE_PX, MOTION_NEAR_PX) if moving else (SHEET_WIDE_PX, SHEET_NEAR_PX)
     bodies = robot_bodies(robot, shown.spec.candidates.base_radius_m)
-    film = film_of(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
+    film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
     (write_motion if moving else write_sheet)(film, title, out)
     return [
         ("candidate", f"{row} at {shown.place(row)}"),
@@ -62,7 +85,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
 
 
 def _candidate(shown: Shown, candidate: int | None) -> int:
-    samples, scene = shown.rows.samples, shown.recalled.index
+    samples, scene = shown.samples, shown.recalled.index
     count = len(samples["label"])
     if candidate is None:
         best = best_success(samples)
@@ -95,3 +118,105 @@ def _measured(retrial: Retrial) -> str:
     if retrial.shown is None or len(trial.results) == 1:
         return numbers
     return f"{numbers}, execution {retrial.shown + 1} of {len(trial.results)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Retrial:
+    """The trial of a candidate. `recording` holds a trial, a plan, or the poses that were tried."""
+
+    robot: Robot
+    T_world_base: F64  # (4, 4), true pose of the mount
+    trial: CandidateTrial
+    shown: int | None  # recorded row of `trial.results`; None where nothing was executed
+    recording: Recording
+    told: Told  # the moments to show
+
+    @property
+    def moves(self) -> bool:
+        """Whether the recording is a motion; else it holds poses that were tried."""
+        return bool(self.recording.time_s[-1] > self.recording.time_s[0])
+
+    @property
+    def result(self) -> TrialResult | None:
+        """The execution to show."""
+        return None if self.shown is None else self.trial.results[self.shown]
+
+
+def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
+    """Plan, and for `sim` execute, candidate `row` again; the last execution with its outcome is shown."""
+    at = arm_in_scene(scene, candidates, row, spec, StageClock())
+    trial = try_candidate(at, candidates, row, spec, record=True)
+    T_world_base = at.base_pose(candidates, row)
+    alike = [k for k, result in enumerate(trial.results) if result.outcome == trial.outcome]
+    shown = alike[-1] if alike else None
+    recording = None if shown is None else trial.results[shown].recording
+    if shown is not None and recording is not None:
+        T_world_base = trial.T_world_base[shown]
+        kept = _with_sense(recording)
+        return Retrial(at.robot, T_world_base, trial, shown, kept, told_moments(kept))
+    if trial.plan is not None:
+        planned = planned_motion(at.robot, trial.plan, T_world_base, scene.T_world_object)
+        return Retrial(at.robot, T_world_base, trial, None, planned, told_moments(planned))
+    poses, told = _tried_poses(at, trial, T_world_base)
+    return Retrial(at.robot, T_world_base, trial, None, poses, told)
+
+
+def planned_motion(robot: Robot, plan: MotionPlan, T_world_base: F64, T_world_object: F64) -> Recording:
+    """A plan as if executed perfectly: the target moves with the hand once it is grasped."""
+    q, phases = [plan.q_reach_rad[:1]], ["reach"]
+    for phase, path in (
+        ("reach", plan.q_reach_rad),
+        ("approach", plan.q_approach_rad),
+        ("lift", plan.q_lift_rad),
+    ):
+        q.append(dense(path, _STEP_RAD)[1:])
+        phases += [phase] * len(q[-1])
+    q_rad = np.concatenate(q)
+    poses = np.tile(T_world_object, (len(q_rad), 1, 1, 1))
+    T_tcp_target = inverse(T_world_base @ robot.T_base_tcp(plan.q_approach_rad[-1])) @ T_world_object[0]
+    for k, phase in enumerate(phases):
+        if phase == "lift":
+            poses[k, 0] = T_world_base @ robot.T_base_tcp(q_rad[k]) @ T_tcp_target
+    opening_m = np.full(len(q_rad), plan.opening_m)
+    return Recording(
+        np.arange(len(q_rad), dtype=np.float64) * _STEP_S, q_rad, opening_m, poses, tuple(phases)
+    )
+
+
+def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tuple[Recording, Told]:
+    """The tucked arm and, where planning failed later, the arm at grasps with an IK solution."""
+    robot = at.robot
+    q_rad, opening_m, words = [robot.homes_rad[0]], [robot.gripper.max_opening_m], ["tucked"]
+    if trial.report is not None:
+        planning = at.planning
+        around = surroundings(planning, T_world_base)
+        T_base_tcp = np.matmul(inverse(T_world_base), planning.T_world_tcp)
+        distance, seeds = planning.moving.table.nearest(T_base_tcp, planning.params.ik_seeds)
+        for k in np.argsort(distance, kind="stable").tolist():
+            found = (robot.ik(T_base_tcp[k], seed) for seed in seeds[k])
+            q = next((q for q in found if q is not None), None)
+            if q is None:
+                continue
+            blocked = around.is_base_stuck or around.first_arm_blocked(q[None], is_target_held=False) == 0
+            q_rad.append(q)
+            opening_m.append(float(planning.opening_m[k]))
+            words.append("the arm collides here" if blocked else "the arm is free here")
+            if len(words) > _TRIES:
+                break
+    n = len(words)
+    poses = np.tile(at.scene.T_world_object, (n, 1, 1, 1))
+    recording = Recording(np.zeros(n), np.stack(q_rad), np.array(opening_m), poses, ("reach",) * n)
+    return recording, tuple(enumerate(words))
+
+
+def _with_sense(recording: Recording) -> Recording:
+    """The part of the recording with finite numbers; unstable physics cannot be drawn."""
+    finite = np.isfinite(recording.q_rad).all(1) & np.isfinite(recording.T_world_object).all((1, 2, 3))
+    n = int(np.argmin(np.append(finite, False)))
+    return Recording(
+        recording.time_s[:n],
+        recording.q_rad[:n],
+        recording.opening_m[:n],
+        recording.T_world_object[:n],
+        recording.phase[:n],
+    )

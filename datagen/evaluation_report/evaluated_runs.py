@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from datagen.evaluation_report.methods import EvaluatedMethod
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -16,6 +15,9 @@ from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
 from datagen.train.evaluation.columns import EXTRA
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
+
+if TYPE_CHECKING:
+    from datagen.evaluation_report.methods import EvaluatedMethod
 
 # Whole scenes: a model scores a few scenes of 625 candidates at once.
 SCENES_PER_BATCH = 8

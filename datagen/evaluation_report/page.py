@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from datagen.evaluation_report import report_tables as tables
-from datagen.evaluation_report.curves import draw_curves, draw_intervals
-from datagen.evaluation_report.grid_pictures import GRIDS_CAPTION, draw_examples
-from datagen.evaluation_report.number_format import Report
-from datagen.evaluation_report.report_tables import TitledTable
-from datagen.evaluation_report.svg import svg_of
+from datagen.evaluation_report.figures import (
+    GRIDS_CAPTION,
+    draw_curves,
+    draw_examples,
+    draw_intervals,
+    svg_of,
+)
+from datagen.evaluation_report.report_tables import Report, TitledTable
 from datagen.train.evaluation.columns import Gathered
 from datagen.train.html_page import escape, html_facts, html_figure, html_page, html_table
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen import __version__
 from datagen.evaluation_report.evaluated_runs import EvaluatedRun
-from datagen.evaluation_report.methods import EvaluatedMethod
+from datagen.evaluation_report.methods import BaselineMethods, EvaluatedMethod
 from datagen.schemas.errors import InputError
 from datagen.train.evaluation import paper_results
 from datagen.train.evaluation.bootstrap import LEVEL
@@ -21,13 +21,11 @@ UNSEEN, SEEN = "unseen", "seen"
 
 def evaluation_report(
     gathered: Gathered,
-    evaluated: Sequence[EvaluatedMethod],
+    baselines: BaselineMethods,
+    models: Sequence[EvaluatedMethod],
     runs: Sequence[EvaluatedRun],
     sets: Mapping[str, Sequence[int]],
-    *,
-    seen_houses: frozenset[str],
     fit: Sequence[str],
-    left_out: Mapping[str, str],
     resamples: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -35,7 +33,8 @@ def evaluation_report(
 
     `sets` names candidates, each with the indices of the runs that offer them.
     """
-    columns = gathered.columns
+    columns, evaluated = gathered.columns, [*baselines.baselines, *models]
+    seen_houses = baselines.houses.union(*(model.houses for model in models))
     methods = [c.method for c in evaluated]
     objects = frozenset[str]().union(*(c.objects for c in evaluated))
     is_seen = np.isin(columns.house.astype(str), np.array(sorted(seen_houses), str))
@@ -61,7 +60,7 @@ def evaluation_report(
             }
             for c in evaluated
         ],
-        "left_out": dict(left_out),
+        "left_out": baselines.left_out,
         "bootstrap": {"resamples": resamples, "seed": seed, "level": LEVEL, "by": "scene"},
         "candidates": list(sets),
         "seen_houses": sorted(set(columns.house[is_seen].tolist())),

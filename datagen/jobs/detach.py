@@ -16,7 +16,7 @@ from datagen.cluster.ray_head import ensure_head, head_token
 from datagen.cluster.ray_jobs import ENDED, RayJobs, open_ray_jobs
 from datagen.console.command_lines import command_line
 from datagen.console.printing import print_rows
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.schemas.errors import InputError
 from datagen.schemas.jobs import new_job_id
@@ -61,10 +61,7 @@ def detach_job(words: Sequence[str], place: str, job_options: JobOptions) -> Job
 
 
 def hand_over(jobs: RayJobs, folder: Path, submission: str) -> Path:
-    """Write the environment variables of stores and caches for one job; return the file.
-
-    The job removes it at its end. Files of killed jobs are removed here.
-    """
+    """The file with the shell's variables for one job, which removes it; those of killed jobs go here."""
     for left in folder.glob("datagen-*.json"):
         if jobs.state(left.stem) in ENDED:
             left.unlink(missing_ok=True)

@@ -7,14 +7,14 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_progress import JobMonitor, JobProgress
-from datagen.cluster.job_totals import JobSummary, JobTotals, empty_summary
+from datagen.cluster.job_progress import JobMonitor, JobProgress, JobStatus, StopMode
+from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.ray_cluster import RaySettings
@@ -24,12 +24,11 @@ from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import Executor, ShardTask
 from datagen.console.command_lines import command_line
-from datagen.jobs.job_recorder import JobRecorder
-from datagen.jobs.job_result import JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
 from datagen.schemas.errors import InputError
-from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, new_job_id
+from datagen.schemas.jobs import JobEnd, JobRecord, Jobs, JobState, new_job_id
 from datagen.schemas.progress import Progress
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run import Run
@@ -229,3 +228,81 @@ def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
         cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
         resume=tuple(plan.resume),
     )
+
+
+class JobRecorder:
+    """The status records of one job over one run or several. `shards` are all that it has to make.
+
+    A state that cannot be written, or a request that cannot be read, is passed over: what is wrong with
+    the store is said by the commits.
+    """
+
+    def __init__(self, jobs: Jobs, record: JobRecord, shards: int) -> None:
+        self._jobs, self._record, self._shards = jobs, record, shards
+        self._before = JobTotals(0)  # of the runs that this job is through with
+        self._last = JobState(id=record.id, updated=utc_now(), phase="starting", shards=shards)
+
+    def begin(self) -> None:
+        """Make the job known. InputError where that cannot be written: then nothing could."""
+        self._jobs.begin(self._record)
+        self._put(self._last)
+
+    def add(self, totals: JobTotals) -> None:
+        """One run is done; `totals` is the job's up to here."""
+        self._before = totals
+
+    def publish(self, status: JobStatus) -> None:
+        totals = self._before.plus(status.totals)
+        self._put(
+            self._last.model_copy(
+                update={
+                    **_counts(totals),
+                    "updated": utc_now(),
+                    "phase": "making",
+                    "labels_per_s": status.labels_per_s,
+                    "left_s": status.left_s,
+                    "stopping": status.stopping,
+                }
+            )
+        )
+
+    def stop_requested(self) -> StopMode | None:
+        with suppress(InputError):
+            if (order := self._jobs.stop_order(self._record.id)) is not None:
+                return "force" if order.now else "drain"
+        return None
+
+    def seal(self) -> None:
+        """Say that the shards are made and the store is laid."""
+        self._put(self._last.model_copy(update={"updated": utc_now(), "phase": "sealing", "in_flight": 0}))
+
+    def end(self, end: JobEnd | End, code: int, cause: str, summary: JobSummary | None = None) -> None:
+        """Say how the job ended."""
+        update = {
+            "updated": utc_now(),
+            "phase": "ended",
+            "end": end,
+            "exit_code": code,
+            "cause": cause,
+            "in_flight": 0,
+            "left_s": None,
+        }
+        if summary is not None:
+            rate = summary.totals.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0
+            update |= {**_counts(summary.totals), "in_flight": 0, "labels_per_s": rate}
+        self._put(self._last.model_copy(update=update))
+
+    def _put(self, state: JobState) -> None:
+        self._last = state
+        with suppress(InputError):
+            self._jobs.put_state(state)
+
+
+def _counts(totals: JobTotals) -> dict[str, int]:
+    return {
+        "done": totals.finished,
+        "in_flight": totals.in_flight,
+        "labels": totals.labels,
+        "retries": totals.retries,
+        "quarantined": totals.quarantined,
+    }

@@ -1,22 +1,47 @@
-"""Jobs of a run as plain values and as lines of text."""
+"""What a job did, and the jobs of a run, as plain values and as lines of text."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from datagen.console.command_lines import command_line, say_interrupted
 from datagen.console.printing import counted, listed, print_rows, seconds
-from datagen.jobs.job_result import JobInterrupted, JobResult
 from datagen.schemas.errors import one_line
-from datagen.schemas.jobs import Jobs, StoredJob
-from datagen.schemas.storage import Storage
+from datagen.schemas.jobs import StoredJob
 
 
-def jobs_report(place: Storage) -> list[dict[str, Any]]:
-    """Every job of the run, the oldest first."""
-    return [job_report(job) for job in Jobs(place).all()]
+@dataclass(frozen=True, eq=False)
+class JobResult:
+    """What a job did, and what its run holds now. Quarantined shards are those that failed repeatedly."""
+
+    path: str  # the run, as the user wrote it
+    # detached: Ray makes the labels. failed: more shards are quarantined than allowed.
+    end: Literal["complete", "failed", "interrupted", "aborted", "detached"]
+    n: int = 0  # labels wanted
+    made_from: str = ""  # houses, objects and robot
+    labels: int = 0  # made by this job
+    positives: int = 0  # of those
+    shards: int = 0  # that were missing when the job began
+    remaining: int = 0  # of those, still missing
+    quarantined: tuple[int, ...] = ()
+    retries: int = 0
+    start_s: float = 0.0  # until the first shard began
+    elapsed_s: float = 0.0  # from then on
+    store: str = ""  # the sealed store, which zarr and xarray open
+    cause: str = ""  # of an aborted job, and the most frequent one of a failed job
+    resume: tuple[str, ...] = ()  # the words of the command that continues
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run has all labels that were wanted, but for the allowed share in quarantine."""
+        return self.end == "complete"
+
+    @property
+    def exit_code(self) -> int:
+        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
+        return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:
@@ -55,13 +80,9 @@ def health_line(job: StoredJob) -> str:
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"
 
 
-def reported(job: Callable[[], JobResult]) -> int:
-    """Run a job, print its summary, also where it was interrupted, and return the exit code."""
-    try:
-        result = job()
-    except JobInterrupted as stopped:
-        result = stopped.result
-    if result.end != "detached":
+def print_job(result: JobResult, **_: Any) -> int:
+    """Print the summary of a job and return the exit code."""
+    if result.end != "detached":  # what to do next is printed when it is detached
         _print(result)
     return result.exit_code
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.console.command_lines import resumable, words_of
-from datagen.console.whole_number import WHOLE_NUMBER
+from datagen.console.options import Whole
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.progress import Progress
 from datagen.workers.extras import refuse_missing
@@ -29,25 +29,31 @@ _DETACH = (
 )
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class JobOptions:
+class JobKeywords(TypedDict, total=False):
     """Where and how a job runs; no option changes a sample."""
 
     workers: Annotated[
-        int | None,
-        WHOLE_NUMBER,
-        Parameter(help="Worker processes [one per core]; 0: this process, for debuggers."),
-    ] = None
-    address: Annotated[str, Parameter(help="local, or the address of a Ray cluster.")] = "local"
+        Whole | None, Parameter(help="Worker processes [one per core]; 0: this process, for debuggers.")
+    ]
+    address: Annotated[str, Parameter(help="local, or the address of a Ray cluster [local].")]
     max_quarantined: Annotated[
-        float, Parameter(help="Largest quarantined share of the run's shards in a successful job.")
-    ] = DEFAULT_SHARE
-    detach: Annotated[bool, Parameter(negative=(), help=_DETACH)] = False
-    json: Annotated[bool, Parameter(negative=(), help="Print progress as JSON lines to standard error.")] = (
-        False
-    )
-    quiet: Annotated[bool, Parameter(parse=False)] = False  # the command line always reports progress
+        float, Parameter(help="Largest quarantined share of the run's shards in a successful job [0.01].")
+    ]
+    detach: Annotated[bool, Parameter(help=_DETACH)]
+    json: Annotated[bool, Parameter(help="Print progress as JSON lines to standard error.")]
+    quiet: Annotated[bool, Parameter(parse=False)]  # the command line always reports progress
+
+
+@dataclass(frozen=True)
+class JobOptions:
+    """The values of JobKeywords."""
+
+    workers: int | None = None
+    address: str = "local"
+    max_quarantined: float = DEFAULT_SHARE
+    detach: bool = False
+    json: bool = False
+    quiet: bool = False
 
     def refuse_bad(self) -> None:
         """Raise InputError for values out of range and, unless detached, for an unreachable cluster."""
@@ -76,19 +82,6 @@ class JobOptions:
         return words_of({"--address": None if self.address == "local" else self.address})
 
 
-HERE = JobOptions()
-
-
-class JobKeywords(TypedDict, total=False):
-    """The fields of JobOptions as keyword arguments."""
-
-    workers: int | None
-    address: str
-    max_quarantined: float
-    detach: bool
-    quiet: bool
-
-
 def refuse_odd_n(n: int) -> None:
     """Raise InputError for a number of labels out of range."""
     if not 1 <= n <= 10**12:
@@ -97,10 +90,7 @@ def refuse_odd_n(n: int) -> None:
 
 @contextmanager
 def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
-    """Show the phase in which sources are opened, and print how to resume when it is interrupted.
-
-    Gives its start by the monotonic clock.
-    """
+    """Show that sources are opened, and how to resume after an interrupt; gives the start by the clock."""
     began_s = time.monotonic()
     with resumable([*words, *job_options.address_words()]), job_options.display() as shown:
         shown.phase("opening houses and objects")
@@ -115,8 +105,9 @@ def absolute_source(ref: str) -> str:
     return refuse_not_utf8(f"{kind}:{Path(text).expanduser().resolve()}" if is_path else ref)
 
 
-def absolute_place(place: str) -> str:
+def absolute_place(place: str | Path) -> str:
     """A run's absolute path or its address, valid in every folder."""
+    place = str(place)
     if "://" in place and not place.startswith("file://"):
         return place
     return str(Path(place.removeprefix("file://")).expanduser().absolute())

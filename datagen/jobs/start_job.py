@@ -7,14 +7,15 @@ from importlib.metadata import PackageNotFoundError
 
 from datagen.configuration.arms import refuse_missing_packages
 from datagen.configuration.specify import label_engines, scene_engines
-from datagen.console.command_lines import resumable, words_of
+from datagen.console.command_lines import Interrupted, command_line, resumable, words_of
+from datagen.console.options import AS_FOUND, Sources
+from datagen.console.printing import counted
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detach_job, detached_words
 from datagen.jobs.job import JobPlan, JobRun, run_job
-from datagen.jobs.job_result import JobInterrupted, JobResult
+from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
-from datagen.regeneration.shards import open_sources
-from datagen.regeneration.sources import AS_FOUND, Sources
+from datagen.regeneration.scenes import open_sources
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import different_fields
@@ -93,16 +94,14 @@ def start_job(
     command: Sequence[str],
     given: Sources = AS_FOUND,
 ) -> JobResult:
-    """Make the missing shards; `command` is what the user gave, `path` the path as they wrote it.
-
-    Raises JobInterrupted where the job was asked to stop.
-    """
+    """Make the missing shards. Raises Interrupted where the job was asked to stop."""
     words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
     words += detached_words() or job_options.address_words()
     with resumable(words):
         result = run_job(JobPlan(storage, path, job_runs, job_options, began_s, command, words))
     if result.end == "interrupted":
-        raise JobInterrupted(result)
+        left = counted(result.remaining, "shard")
+        raise Interrupted(f"{left} left. Resume with: {command_line(result.resume)}", result)
     return result
 
 

@@ -10,8 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from datagen.regeneration.scenes import Replayer, chosen_rows, open_replayer, what_differs_here
-from datagen.regeneration.shards import OpenedSources
+from datagen.regeneration.scenes import OpenedSources, Replayer, chosen_rows, open_replayer, what_differs_here
 from datagen.regeneration.stage_comparison import (
     DRAWN,
     RECOMPUTED,
@@ -26,6 +25,7 @@ from datagen.schemas.keys import shard_folder
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scenes
 
+_RECOMPUTED = "recomputed from stored poses"
 _FIX = "Do not use this run; find the cause in its code version, libraries or machine"
 # Candidates of a scene to label again where a label is a plan or a trial.
 _TRIED = 4
@@ -76,44 +76,36 @@ def _checked(run: Run, scene: int, findings: Iterator[Finding]) -> Iterator[Find
 
 
 def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
-    run = replayer.run
-    shard = scene // run.layout.scenes_per_shard
+    run, stages = replayer.run, RECOMPUTED
     stored = next(read_scenes(run, [scene]))
-    made = replayer.recompute(stored, rows)
-    kept = chosen_rows(stored, rows)
-    if what_differs_here(run, shard):
-        problems = beyond_tolerance(run.manifest.spec, kept.samples, made.samples)
-        if problems:
-            yield _finding(run, shard, scene, f"recomputed from stored poses: {'; '.join(problems)}")
-        yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, ("candidates",)))
-        return
-    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, RECOMPUTED))
+    made, kept = replayer.recompute(stored, rows), chosen_rows(stored, rows)
+    if what_differs_here(run, scene // run.layout.scenes_per_shard):
+        stages = ("candidates",)
+        if problems := beyond_tolerance(run.manifest.spec, kept.samples, made.samples):
+            yield _finding(run, scene, f"{_RECOMPUTED}: {'; '.join(problems)}")
+    yield from _of_stages(run, scene, compare_stages(run.schema, kept, made, stages), _RECOMPUTED)
 
 
 def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
-    run = replayer.run
-    shard = scene // run.layout.scenes_per_shard
+    run, stages = replayer.run, tuple(STAGES)
     stored = next(read_scenes(run, [scene]))
-    made = replayer.redraw(scene, rows)
-    kept = chosen_rows(stored, rows)
-    stages = tuple(STAGES)
-    if what_differs_here(run, shard):
+    made, kept = replayer.redraw(scene, rows), chosen_rows(stored, rows)
+    if what_differs_here(run, scene // run.layout.scenes_per_shard):
         # Other physics results may cause a resampling, after which all draws differ.
         stages = DRAWN[:1] if int(made.record["retry"]) == int(stored.record["retry"]) else ()
-    yield from _of_stages(run, shard, scene, compare_stages(run.schema, kept, made, stages), "sampled again")
+    yield from _of_stages(run, scene, compare_stages(run.schema, kept, made, stages), "sampled again")
 
 
-def _of_stages(
-    run: Run, shard: int, scene: int, stages: list[StageComparison], how: str = "recomputed from stored poses"
-) -> Iterator[Finding]:
+def _of_stages(run: Run, scene: int, stages: list[StageComparison], how: str) -> Iterator[Finding]:
     apart = [stage for stage in stages if not stage.equal]
     if apart:
         # Later stages follow from the first that differs.
         first = apart[0]
         text = "; ".join(str(d) for d in first.differences)
-        yield _finding(run, shard, scene, f"{how}: {first.stage}: {text}", first.differences[0].field)
+        yield _finding(run, scene, f"{how}: {first.stage}: {text}", first.differences[0].field)
 
 
-def _finding(run: Run, shard: int, scene: int, problem: str, field: str = "label") -> Finding:
+def _finding(run: Run, scene: int, problem: str, field: str = "label") -> Finding:
+    shard = scene // run.layout.scenes_per_shard
     folder = shard_folder(shard, run.commit_of(shard).attempt)
     return Finding(f"{folder}/{field}", "deep", f"scene {scene}, {problem}", _FIX, shard)

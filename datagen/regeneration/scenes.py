@@ -1,9 +1,9 @@
-"""Make scenes of a run again, from their seeds or from the stored poses, and label them."""
+"""Make scenes and shards of a run again, from their seeds or from the stored poses."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
 
@@ -11,26 +11,28 @@ import numpy as np
 
 from datagen.cluster.attempt_guard import this_host
 from datagen.configuration.specify import label_engines, scene_engines
-from datagen.regeneration.shards import OpenedSources, source_of
+from datagen.console.options import AS_FOUND, Sources
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
+from datagen.schemas.shard_files import encode_shard
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import load_label_source
-from datagen.workers.run_shard import Columns, candidate_columns, scene_row
+from datagen.workers.run_shard import Columns, ShardResult, candidate_columns, run_shard, scene_row
 from datagen.workers.scenes.generate import generate_scene
 from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import SettledScene
-from datagen.workers.world import World, assemble_world
+from datagen.workers.world import World, assemble_world, open_world
+
+_NO_DRAWING = "the run that made the scenes does not exist any more"
+_FIX = "Give that run with --scenes-from"
 
 
 @dataclass(frozen=True, eq=False)
 class Replayer:
-    """A run opened to make its scenes again.
-
-    `drawing` samples its scenes; None where they come from another run that does not exist any more.
-    """
+    """A run opened to make its scenes again; `drawing` is None where the run that sampled them is gone."""
 
     run: Run
     world: World
@@ -70,15 +72,14 @@ class Replayer:
         return chosen | source.columns(scene, candidates, spec, rows)
 
 
-_NO_DRAWING = "the run that made the scenes does not exist any more"
-_FIX = "Give that run with --scenes-from"
-
-
 def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     """Open a run to make its scenes again from its sources."""
     drawn_by = run if origin.scenes is None else origin.scenes
     while drawn_by is not None and drawn_by.manifest.spec.scenes_from is not None:
-        drawn_by = _source_if_there(drawn_by)
+        try:
+            drawn_by = source_of(drawn_by)
+        except InputError:
+            drawn_by = None
     if drawn_by is run:
         return Replayer(run, origin.world, origin.world)
     if drawn_by is None:
@@ -86,13 +87,6 @@ def open_replayer(run: Run, origin: OpenedSources) -> Replayer:
     houses, objects = origin.world.houses, origin.world.objects
     drawing = assemble_world(drawn_by.manifest.spec, houses, objects, "--houses", "--objects")
     return Replayer(run, origin.world, drawing)
-
-
-def _source_if_there(run: Run) -> Run | None:
-    try:
-        return source_of(run)
-    except InputError:
-        return None
 
 
 def chosen_rows(stored: SceneRows, rows: Sequence[int]) -> SceneRows:
@@ -110,8 +104,10 @@ def what_differs_here(run: Run, shard: int | None = None) -> list[str]:
     found: list[str] = []
     if _platform_name(manifest.platform) != _platform_name(platform.platform()):
         found.append(f"platform {manifest.platform}, here {platform.platform()}")
-    for name, (made, here) in _differing(manifest.spec.engines, _engines_here(run)):
-        found.append(f"{name} {made}, here {here}")
+    here = _engines_here(run)
+    for name, made in sorted(manifest.spec.engines.items()):
+        if made != (there := here.get(name, "none")):
+            found.append(f"{name} {made}, here {there}")
     if shard is not None:
         cpu = run.commit_of(shard).host.cpu
         if cpu != this_host().cpu:
@@ -127,12 +123,61 @@ def _engines_here(run: Run) -> dict[str, str]:
         return {}
 
 
-def _differing(made: Mapping[str, str], here: Mapping[str, str]) -> list[tuple[str, tuple[str, str]]]:
-    pairs = {name: (version, here.get(name, "none")) for name, version in made.items()}
-    return [(name, pair) for name, pair in sorted(pairs.items()) if pair[0] != pair[1]]
-
-
 def _platform_name(text: str) -> tuple[str, str]:
     """The platform string without the version of the kernel."""
     machine = platform.machine()
     return text.partition("-")[0], text.rpartition(machine)[2] if machine in text else text
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedSources:
+    """The opened sources of a run's shards."""
+
+    world: World
+    scenes: Run | None  # the run whose scenes are labelled again
+
+
+def open_sources(run: Run, given: Sources = AS_FOUND, needs_scenes: bool = True) -> OpenedSources:
+    """Open the run's sources: those given, else those in its manifest.
+
+    InputError where they do not exist, or differ from those that the run was made from. Without
+    `needs_scenes` the run of --scenes-from may be missing, unless it is given: stored poses suffice to label
+    again.
+    """
+    spec, known = run.manifest.spec, run.manifest.sources
+    world = open_world(
+        spec, given.houses or known.get("houses", "builtin"), given.objects or known.get("objects", "builtin")
+    )
+    if spec.scenes_from is None:
+        return OpenedSources(world, None)
+    try:
+        return OpenedSources(world, source_of(run, given))
+    except InputError:
+        if needs_scenes or given.scenes_from is not None:
+            raise
+        return OpenedSources(world, None)
+
+
+def source_of(run: Run, given: Sources = AS_FOUND) -> Run:
+    """The run whose scenes this one labelled. InputError where it is missing or has other scenes."""
+    place = given.scenes_from or run.manifest.sources.get("scenes_from", "")
+    fix = "Give --scenes-from with the run that this one was started with"
+    if not place:
+        raise InputError(run.storage.url, "scenes_from", "is not in the run's manifest", fix)
+    source = Run.open(place)
+    if source.manifest.spec.scenes_hash != run.manifest.spec.scenes_hash:
+        raise InputError(place, "spec_hash", "has other scenes than this run", fix)
+    return source
+
+
+def regenerate_shard(run: Run, shard: int, origin: OpenedSources) -> ShardResult:
+    """Compute the shard's rows again; exceptions of the computation are not caught."""
+    first = shard * run.layout.scenes_per_shard
+    scenes = range(first, first + run.layout.scenes_per_shard)
+    stored = None if origin.scenes is None else read_scenes(origin.scenes, scenes)
+    return run_shard(run.manifest.spec, origin.world, scenes, stored, run.schema.version)
+
+
+def regenerated_files(run: Run, made: ShardResult) -> dict[str, bytes]:
+    """Compute the shard's files again, by path in the attempt's folder."""
+    return encode_shard(run.schema, run.layout, run.manifest.spec_hash, made.scene, made.sample)

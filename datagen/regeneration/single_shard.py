@@ -10,7 +10,7 @@ from hashlib import sha256
 from typing import Any
 
 from datagen.console.printing import print_json, print_lines, print_rows
-from datagen.regeneration.shards import OpenedSources, regenerate_shard, regenerated_files
+from datagen.regeneration.scenes import OpenedSources, regenerate_shard, regenerated_files
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import QuarantineRecord

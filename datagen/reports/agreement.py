@@ -1,7 +1,8 @@
-"""Agreement of labels of the same candidates, and statistics of outcomes: arrays to plain values."""
+"""Labels of runs as arrays, their agreement for the same candidates, and statistics of outcomes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run import Run
+from datagen.schemas.shard_reading import Array, read_committed
 from datagen.workers.bases.candidate_sets import (
     DISTANCE_EDGES_M,
     TENTHS,
@@ -24,6 +27,19 @@ Rows = npt.NDArray[np.intp]
 
 REACH_EDGES_M: Edges = (0.0, *TENTHS[3:], None)
 HEIGHT_EDGES_M: Edges = (0.0, *TENTHS[5:], None)
+
+
+_COLUMNS = {
+    "sample_scene_index": "scene",
+    "candidate_index": "candidate",
+    "label": "label",
+    "base_is_clear": "is_clear",
+    "distance_m": "distance_m",
+    "mount_distance_m": "mount_distance_m",
+    "visibility": "visibility",
+    "arm_reach_m": "reach_m",
+    "base_height_m": "height_m",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,3 +180,31 @@ def outcome_report(labelled: Labelled) -> dict[str, Any]:
             "height": share_by(labelled.height_m, HEIGHT_EDGES_M),
         },
     }
+
+
+def read_labelled(run: Run) -> Labelled | None:
+    """All committed candidates of a run, also beyond n; None without any. InputError for a damaged file."""
+    has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
+    names = [*_COLUMNS, "object_name", *(["outcome"] if has_outcome else [])]
+    shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
+    if not shards:
+        return None
+    per_scene = run.layout.candidates_per_scene
+
+    def joined(parts: Iterable[Array]) -> Any:
+        return np.concatenate(list(parts))
+
+    columns = {to: joined(shard[name] for shard in shards) for name, to in _COLUMNS.items()}
+    columns["label"] = columns["label"].astype(np.bool_)
+    return Labelled(
+        **columns,
+        target=joined(np.repeat(shard["object_name"][:, 0], per_scene) for shard in shards),
+        outcome=joined(shard["outcome"] for shard in shards) if has_outcome else None,
+    )
+
+
+def join_labelled(parts: list[Labelled]) -> Labelled:
+    """Join candidates of several runs of one schema."""
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
+    outcomes = [part.outcome for part in parts if part.outcome is not None]
+    return Labelled(**rows, outcome=np.concatenate(outcomes) if outcomes else None)

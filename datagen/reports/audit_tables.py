@@ -49,8 +49,7 @@ def print_source(report: dict[str, Any], candidates: str) -> None:
         (outcome, str(account["attempts"]), seconds(account["wall_s"]), str(account["without_account"]))
         for outcome, account in report["waste"].items()
     ]
-    if waste:
-        print_rows("waste", waste, ("outcome", "attempts", "wall time", "cost unknown"))
+    print_rows("waste", waste, ("outcome", "attempts", "wall time", "cost unknown"))
     _print_projection(report["projection"], report["waste_share"])
     if "outcomes" in report:
         _print_outcomes(report["outcomes"], candidates)
@@ -134,9 +133,8 @@ def print_pair(pair: dict[str, Any]) -> None:
     for key, unit in (("distance", "m"), ("visibility", "rho"), ("reach", "m")):
         _print_groups(f"by {key}", unit, [(_band(g), g) for g in pair[f"by_{key}"]], said, true)
     _print_groups("by object", "target", [(g["object"], g) for g in pair["by_object"]], said, true)
-    if pair["by_outcome"]:
-        rows = [(o["outcome"], f"{o['count']:,}", f"{o['said_positive']:,}") for o in pair["by_outcome"]]
-        print_rows(f"by outcome of {true}", rows, ("outcome", "count", f"{said} 1"))
+    rows = [(o["outcome"], f"{o['count']:,}", f"{o['said_positive']:,}") for o in pair["by_outcome"]]
+    print_rows(f"by outcome of {true}", rows, ("outcome", "count", f"{said} 1"))
 
 
 def _print_groups(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from datagen.console.printing import counted
@@ -29,24 +28,13 @@ class Event:
 
 
 _NOTHING = Event("", "", "", "")
-
-
-class Known:
-    """Events of earlier calls: ledger entries are read once while events are followed."""
-
-    def __init__(self) -> None:
-        self._events: dict[str, Event] = {}
-
-    def once(self, key: str, read: Callable[[], Event]) -> Event:
-        """The event of this key, read where it is new."""
-        if key not in self._events:
-            self._events[key] = read()
-        return self._events[key]
+# Events of the ledger by key: while events are followed, each is read once.
+Known = dict[str, Event]
 
 
 def events_of(place: Storage, shard: int | None = None, known: Known | None = None) -> list[Event]:
-    """Return the events of a run, or of merged runs, in order of time; `known` holds earlier ones."""
-    known = known or Known()
+    """Return the events of a run, or of merged runs, in order of time; `known` keeps those of the ledger."""
+    known = {} if known is None else known
     found = _job_events(place) if shard is None else []
     runs = open_runs(place)
     for number, run in enumerate(runs):
@@ -90,15 +78,17 @@ def _attempt_events(run: Run, part: str, shard: int | None, known: Known) -> lis
         if end.outcome not in _GOOD:
             failed.add(end.shard)
     wanted = failed if shard is None else {shard}
-    events: list[Event] = []
-    for end in ends:
-        if end.shard in wanted and (shard is not None or end.outcome not in _GOOD):
-            key = f"{run.storage.url} {end.attempt} {end.outcome}"
-            events.append(known.once(key, lambda end=end, key=key: _end_event(run, part, end.attempt, key)))
+    found = {
+        f"{run.storage.url} {end.attempt} {end.outcome}": (_end_event, end.attempt)
+        for end in ends
+        if end.shard in wanted and (shard is not None or end.outcome not in _GOOD)
+    }
     for attempt in sorted(attempt for attempt, number in shards.items() if number in wanted):
-        key = f"{run.storage.url} {attempt} begins"
-        events.append(known.once(key, lambda attempt=attempt, key=key: _start_event(run, part, attempt, key)))
-    return [event for event in events if event.what]
+        found[f"{run.storage.url} {attempt} begins"] = (_start_event, attempt)
+    for key, (read, attempt) in found.items():
+        if key not in known:
+            known[key] = read(run, part, attempt, key)
+    return [known[key] for key in found if known[key].what]
 
 
 def _end_event(run: Run, part: str, attempt: str, key: str) -> Event:

@@ -17,7 +17,7 @@ class Account:
     """Sums over attempts; seconds and bytes."""
 
     attempts: int = 0
-    unaccounted: int = 0  # attempts without a recorded cost
+    without_account: int = 0  # attempts without a recorded cost
     wall_s: float = 0.0
     cpu_s: float = 0.0
     stage_wall_s: Counter[str] = field(default_factory=Counter)
@@ -30,7 +30,7 @@ class Account:
         """Add one attempt."""
         self.attempts += 1
         if cost is None:
-            self.unaccounted += 1
+            self.without_account += 1
             return
         self.wall_s += cost.wall_s
         self.cpu_s += cost.cpu_s

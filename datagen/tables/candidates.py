@@ -13,7 +13,7 @@ import pandas
 from datagen.schemas.fields import Field, Table
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.shard_reading import ShardPlace
-from datagen.tables.stored_fields import fields_of, refuse_no_path, refuse_unknown
+from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.reader import JOIN_FIELDS, Columns, load_shard, native
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 from datagen.workers.houses.split import split_of
@@ -123,8 +123,7 @@ def candidates(
         >>> datagen.candidates(run, columns=["house", "label"]).columns.tolist()
         ['house', 'label']
     """
-    refuse_no_path(paths, "candidates")
-    fields = [fields_of(path) for path in paths]
+    fields = fields_of(paths, "candidates")
     valid = list(dict.fromkeys(name for of_path in fields for name in _valid(of_path)))
     refuse_unknown(columns or (), valid, "candidates")
     names = list(columns) if columns is not None else [name for name in _DEFAULT if name in valid]

@@ -14,7 +14,7 @@ from xarray.core import indexing
 from datagen.schemas.description import cf_attributes, described
 from datagen.schemas.fields import Table
 from datagen.schemas.shard_reading import ShardPlace, StoredArray
-from datagen.tables.stored_fields import fields_of, refuse_no_path, refuse_unknown
+from datagen.tables.stored_fields import fields_of, refuse_unknown
 from datagen.train.run_parts import RunPart, open_parts, refuse_twins
 
 _Shard = tuple[ShardPlace, StoredArray]
@@ -51,8 +51,7 @@ def open_dataset(
         ('m', 'world')
         >>> cloud = dataset["points_m"].isel(scene=dataset["scene_row"][0])  # read here, of one scene
     """
-    refuse_no_path(paths, "open_dataset")
-    each = [fields_of(path) for path in paths]
+    each = fields_of(paths, "open_dataset")
     shared = {name: field for name, field in each[0].items() if all(name in other for other in each[1:])}
     refuse_unknown(columns or (), list(shared), "open_dataset")
     names = list(dict.fromkeys([*_COORDINATES, *(columns or shared)]))

@@ -10,26 +10,21 @@ from datagen.schemas.fields import SCHEMAS, Field, Table
 from datagen.schemas.merged_runs import open_runs
 from datagen.train.run_parts import is_sealed_store, open_sealed
 
-Paths = Sequence[str | Path]
+
+def fields_of(paths: Sequence[str | Path], function: str) -> list[dict[str, tuple[Table, Field]]]:
+    """The arrays of each path, by name: their table and description. InputError where there is no run."""
+    if not paths:
+        raise InputError(function, "paths", "no run is given", "Give the folder of at least one run")
+    return [_fields_of(path) for path in paths]
 
 
-def fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
-    """The arrays of a run, merged runs or a sealed store, by name: their table and description.
-
-    InputError where there is no run.
-    """
+def _fields_of(path: str | Path) -> dict[str, tuple[Table, Field]]:
     if is_sealed_store(path):
         sealed = open_sealed(path, ("scene_index", "sample_scene_index"))
         schema = SCHEMAS[sealed.schema].at(sealed.schema_version)
     else:
         schema = open_runs(str(path))[0].schema
     return {field.name: (table, field) for table, field in schema.fields}
-
-
-def refuse_no_path(paths: Paths, function: str) -> None:
-    """InputError where no path is given."""
-    if not paths:
-        raise InputError(function, "paths", "no run is given", "Give the folder of at least one run")
 
 
 def refuse_unknown(names: Sequence[str], valid: Sequence[str], place: str) -> None:

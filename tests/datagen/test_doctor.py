@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from datagen import cli, doctor
-from datagen.doctor import arm, engines, host
+from datagen.doctor import engines, host
 from datagen.doctor.check import Check, probe
 from datagen.doctor.host import ENOUGH_DISK_BYTES
 from datagen.workers.extras import EXTRAS, how_to_get
@@ -72,21 +72,21 @@ def test_what_is_not_installed_is_not_probed_and_its_extra_is_named(monkeypatch:
     assert found["extra labels"].status == "fail"
     assert found["extra sim"].detail == "not installed (coal); would give plan and sim labels"
     assert found["extra sim"].fix == how_to_get("sim") != ""
-    assert not arm.arm_checks()
+    assert not engines.arm_checks()
     assert not {"embree", "pybullet"} & {check.name for check in engines.engine_checks()}
 
 
 def test_arm_libraries_that_do_not_work_are_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arm, "_LIBRARIES", "raise ImportError('libcoal.so: wrong')")
-    (check,) = arm.arm_checks()
+    monkeypatch.setattr(engines, "_LIBRARIES", "raise ImportError('libcoal.so: wrong')")
+    (check,) = engines.arm_checks()
     assert check.status == "warn" and "libcoal" in check.detail and "--force-reinstall" in check.fix
 
 
 def test_what_is_broken_of_the_arm_stack_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arm, "_LIBRARIES", "print('there')")
-    monkeypatch.setattr(arm, "_ROBOT", "raise OSError('no such URDF')")
-    monkeypatch.setattr(arm, "_TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
-    found = {check.name: check for check in arm.arm_checks()}
+    monkeypatch.setattr(engines, "_LIBRARIES", "print('there')")
+    monkeypatch.setattr(engines, "_ROBOT", "raise OSError('no such URDF')")
+    monkeypatch.setattr(engines, "_TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    found = {check.name: check for check in engines.arm_checks()}
     assert found["robot panda"].status == "warn" and "no such URDF" in found["robot panda"].detail
     assert found["grasp trial"].status == "warn" and found["grasp trial"].detail == "crashed with SIGSEGV"
     assert all(check.fix for check in found.values() if check.status != "ok")

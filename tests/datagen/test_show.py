@@ -81,7 +81,7 @@ def test_a_scene_is_drawn_with_its_outcomes(name: str, runs: dict[str, Path], tm
 
 @pytest.mark.parametrize("name", ["plan", "sim", "disturbed"])
 def test_a_candidate_tried_again_ends_as_it_is_stored(name: str, runs: dict[str, Path]) -> None:
-    from datagen.drawing.retrial import try_again
+    from datagen.drawing.trial_picture import try_again
 
     run = Run.open(str(runs[name]))
     spec, rows = run.manifest.spec, read_scene(run, 0)

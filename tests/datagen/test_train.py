@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from datagen import cli
+from datagen.commands.train import model_sizes, read_augmentation, share_cores
 from datagen.schemas.errors import InputError
 from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.train.training.launching import choose_device
-from datagen.training.options import model_sizes, read_augmentation, share_cores
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
 from tests.train.conftest import heuristic_run, shared_folder, sim_run

@@ -224,6 +224,6 @@ def check_run(run: Run, counted: Path, kills: int = 0) -> dict[str, float]:
         "cut at their beginning": len(seen.begins - seen.begun),
         "killed before it": len(unseen),
         "attempts wasted": waste,
-        "of these without account": sum(account.unaccounted for account in recorder.waste.values()),
+        "of these without account": sum(account.without_account for account in recorder.waste.values()),
         "waste share of time": 1 - useful.wall_s / recorder.total_wall_s,
     } | {f"ended {outcome}": recorder.waste[outcome].attempts for outcome in sorted(recorder.waste)}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from datagen.cluster.run_recorder import close_lost_attempts, refresh_index
 from datagen.commands.gc import remove
-from datagen.relabelling.runs import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError

@@ -11,8 +11,7 @@ import pytest
 
 from datagen import cli
 from datagen.regeneration.deep_check import deep_findings
-from datagen.regeneration.scenes import what_differs_here
-from datagen.regeneration.shards import open_sources
+from datagen.regeneration.scenes import open_sources, what_differs_here
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.run import Run

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
-from datagen.relabelling.runs import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.run import Run
 from datagen.schemas.specification import HeuristicParams
 from datagen.schemas.storage import open_storage

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from datagen.cluster.run_recorder import close_lost_attempts
-from datagen.relabelling.runs import relabel_all, relabelled_specification
+from datagen.relabelling import relabel_all, relabelled_specification
 from datagen.schemas.checking.check_runs import Checked, check_runs
 from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError

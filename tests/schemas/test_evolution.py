@@ -12,7 +12,7 @@ import pytest
 
 from datagen import cli
 from datagen.regeneration.deep_check import deep_findings
-from datagen.regeneration.shards import open_sources
+from datagen.regeneration.scenes import open_sources
 from datagen.schemas.fields import OLDEST_SCHEMA_VERSION, SCHEMA_VERSION, SCHEMAS, Field, sized_schema
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene

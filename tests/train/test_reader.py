@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.reports.label_arrays import read_labelled
+from datagen.reports.agreement import read_labelled
 from datagen.schemas import shard_reading
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run

@@ -228,7 +228,7 @@ def test_the_catalogue_is_whole() -> None:
     chosen = [asset.name for asset in select(["procthor-10k/val", "procthor-10k", "ycb"])]
     assert chosen[0] == "ycb" and len(chosen) == len(set(chosen)) == 5
     assert len(select(["ycb-scans"])) > 60
-    with pytest.raises(KeyError):
+    with pytest.raises(InputError, match="is not an asset"):
         select(["yc"])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import sys
 from pathlib import Path
 
 import pytest
@@ -105,8 +103,6 @@ def test_a_page_shows_what_it_is_given() -> None:
     assert escape(EVIL).isprintable() and "<" not in escape(EVIL) and "\\u202e" in escape(EVIL)
 
 
-def test_lines_keep_their_breaks() -> None:
-    stream = io.StringIO()
-    print_lines("one\x1b\r\ntwo\rthree\u2028four\tfive", "> ", stream)
-    assert stream.getvalue() == "> one\\x1b\n> two\n> three\n> four\\tfive\n"
-    assert sys.stdout is not stream
+def test_lines_keep_their_breaks(capsys: pytest.CaptureFixture[str]) -> None:
+    print_lines("one\x1b\r\ntwo\rthree\u2028four\tfive", "> ")
+    assert capsys.readouterr().out == "> one\\x1b\n> two\n> three\n> four\\tfive\n"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from datagen.drawing.film import Film, film_of, pictures, told_moments
+from datagen.drawing.film import Film, pictures, told_moments
 from datagen.drawing.filmstrip import Title, write_motion, write_sheet
 from datagen.drawing.posed_robot import RobotBodies, robot_bodies
 from datagen.workers.rendering.embree_renderer import cast_pixels
@@ -42,7 +42,7 @@ def recording(scene: ReconstructedScene, bodies: RobotBodies) -> Recording:
 @pytest.fixture(scope="module")
 def film(scene: ReconstructedScene, bodies: RobotBodies, recording: Recording) -> Film:
     told = told_moments(recording)
-    return film_of(scene, bodies, base_pose(), recording, told, *SIZES)
+    return Film(scene, bodies, base_pose(), recording, told, *SIZES)
 
 
 def test_eight_moments_tell_a_trial(recording: Recording) -> None:
@@ -86,7 +86,7 @@ def test_the_robot_stands_on_the_floor(bodies: RobotBodies) -> None:
 def test_both_views_show_target_and_hand(film: Film, bodies: RobotBodies) -> None:
     row = next(row for row, words in film.told if words == "at the grasp")
     stage = film.stage(row)
-    for shot in (film.wide, film.near):
+    for shot in film.shots:
         full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
         n = shot.camera.width_px * shot.camera.height_px
         body = cast_pixels(full, shot.camera, np.arange(n)).body - 1
@@ -98,7 +98,7 @@ def test_a_picture_is_what_the_renderer_shows(film: Film) -> None:
     """Casting body by body into its own window gives the frame of the whole stage."""
     stage = film.stage(0)
     (_, near), *_ = pictures(film, [0], 1)
-    shot = film.near
+    shot = film.shots[1]
     full = RayScene(shot.house, stage.objects, stage.radii_m, stage.T_world_object)
     whole = cast_pixels(full, shot.camera, np.arange(near.shape[0] * near.shape[1])).rgb
     assert (whole.reshape(near.shape) == near).all(axis=2).mean() > 0.9999
@@ -114,17 +114,17 @@ def test_walls_before_the_camera_are_left_out(bodies: RobotBodies) -> None:
     ]
     scene = recalled(table_house(closet))
     recording = recording_of(bodies.robot, scene, base_pose())
-    film = film_of(scene, bodies, base_pose(), recording, told_moments(recording), (96, 72), (96, 72))
-    eye_m = film.wide.camera.T_world_camera[:2, 3]
+    film = Film(scene, bodies, base_pose(), recording, told_moments(recording), (96, 72), (96, 72))
+    eye_m = film.shots[0].camera.T_world_camera[:2, 3]
     assert np.abs(eye_m - (cx, cy)).max() > 1.1  # outside
     stage = film.stage(len(recording.phase) - 1)
-    full = RayScene(film.wide.house, stage.objects, stage.radii_m, stage.T_world_object)
-    body = cast_pixels(full, film.wide.camera, np.arange(96 * 72)).body - 1
+    full = RayScene(film.shots[0].house, stage.objects, stage.radii_m, stage.T_world_object)
+    body = cast_pixels(full, film.shots[0].camera, np.arange(96 * 72)).body - 1
     assert (body == 0).any() and (body >= 2).sum() > 200
 
 
 def test_nothing_before_the_lens_is_higher_than_the_ceiling(film: Film) -> None:
-    for shot in (film.wide, film.near):
+    for shot in film.shots:
         assert TABLE_TOP_M < shot.camera.T_world_camera[2, 3] < 3.5
 
 
@@ -144,7 +144,7 @@ def test_a_sheet_of_one_pose(
     scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     still = cut(recording, 1)
-    film = film_of(scene, bodies, base_pose(), still, told_moments(still), *SIZES)
+    film = Film(scene, bodies, base_pose(), still, told_moments(still), *SIZES)
     write_sheet(film, TITLE, tmp_path / "one.png")
     with Image.open(tmp_path / "one.png") as image:
         assert image.size[0] == 10 + 2 * (SIZES[0][0] + 10)
@@ -154,7 +154,7 @@ def test_a_film_moves(
     scene: ReconstructedScene, bodies: RobotBodies, recording: Recording, tmp_path: Path
 ) -> None:
     told = told_moments(recording)
-    film = film_of(scene, bodies, base_pose(), recording, told, *SIZES)
+    film = Film(scene, bodies, base_pose(), recording, told, *SIZES)
     out = tmp_path / "film.gif"
     write_motion(film, TITLE, out)
     with Image.open(out) as image:

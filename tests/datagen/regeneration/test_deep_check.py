@@ -11,7 +11,7 @@ import pytest
 
 from datagen import cli
 from datagen.regeneration.deep_check import deep_findings
-from datagen.regeneration.shards import open_sources
+from datagen.regeneration.scenes import open_sources
 from datagen.schemas.checking.finding import Finding
 from datagen.schemas.record_files import encode_record
 from datagen.schemas.run import Run

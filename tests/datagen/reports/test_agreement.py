@@ -16,9 +16,9 @@ from datagen.reports.agreement import (
     common_candidates,
     compare,
     confusion,
+    join_labelled,
     outcome_report,
 )
-from datagen.reports.label_arrays import join_labelled
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS, DISTANCE_EDGES_M, VISIBILITY_EDGES, bands
 

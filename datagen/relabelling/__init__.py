@@ -1,1 +1,0 @@
-"""Relabel runs by other parameters of the heuristic, sharing their files."""
