@@ -117,9 +117,9 @@ def cleared(
     radius_m: float,
 ) -> np.ndarray[Any, Any]:
     """Clearances (N,) with a base of another radius."""
-    params = params.model_copy(update={"base_radius_m": radius_m})
     heights = (samples["base_height_m"], samples["camera_height_m"])
-    return base_clearance_m(samples["base_xy_m"], *heights, house.obstacles, params)
+    radii_m = np.full(len(samples["base_xy_m"]), radius_m)
+    return base_clearance_m(samples["base_xy_m"], *heights, radii_m, house.obstacles, params.mast_radius_m)
 
 
 def print_shares(counts: Counter[str], scenes: int) -> None:

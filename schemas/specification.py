@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
 from datagen.schemas.identity import digest_of
+
+# The reach that Franka Emika states for the Panda.
+PANDA_REACH_M = 0.855
 
 Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
@@ -118,11 +123,19 @@ class CandidateParams(_Frozen):
     base_height_m: Range = Range(low=0.5, high=1.0)
     arm_reach_m: Range = Range(low=0.3, high=1.0)
     base_radius_m: Metres = 0.25
+    # Bases of arms shorter than the Panda are narrower in proportion; None, as in older runs: all alike.
+    scaled_base: bool | None = None
     mast_radius_m: Metres = 0.05
 
     @property
     def count(self) -> int:
         return self.grid_cells**2 if self.per_scene == "grid" else self.per_scene
+
+    def radius_of_base_m(self, arm_reach_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Radii of the bases that carry arms of these reaches, of the same shape (m)."""
+        reach_m = np.asarray(arm_reach_m, np.float64)
+        share = np.minimum(1.0, reach_m / PANDA_REACH_M) if self.scaled_base else np.ones_like(reach_m)
+        return self.base_radius_m * share
 
 
 class GraspParams(_Frozen):

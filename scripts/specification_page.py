@@ -23,7 +23,8 @@ the command line and the machine alone.
 
 What is absent by default is commented out, with the values that it then has: `arm` is for `plan` and `sim`,
 `arm.trial` and `arm.disturbance` for `sim`. These two sources take whole grids with one robot by default, and
-the reach, height and base of a robot that fixes them. Comments give ranges and choices.
+the reach, height and base of a robot that fixes them. New runs set `candidates.scaled_base` unless the robot
+has a base of its own. Comments give ranges and choices.
 
 """
 _RESERVED = {"label_source", "houses", "objects", "scenes_from", "engines"}
@@ -94,7 +95,7 @@ def _choices(annotation: Any) -> str:
     if not words:
         return ""
     numbers = get_origin(annotation) is not Literal and NoneType not in get_args(annotation)
-    *names, last = [*(["a number"] if numbers else []), *(repr(word) for word in words)]
+    *names, last = [*(["a number"] if numbers else []), *(_toml(word).replace('"', "'") for word in words)]
     return f"{', '.join(names)} or {last}" if names else last
 
 
@@ -102,11 +103,12 @@ def _number(value: float) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _words(annotation: Any) -> list[str]:
+def _words(annotation: Any) -> list[Any]:
     if get_origin(annotation) is Literal:
         return list(get_args(annotation))
     if get_origin(annotation) in (Union, UnionType):
-        return [word for part in get_args(annotation) for word in _words(part)]
+        parts = get_args(annotation)
+        return [word for part in parts for word in ((True, False) if part is bool else _words(part))]
     return []
 
 

@@ -31,7 +31,8 @@ from datagen.workers.houses.house import HouseSource
 from datagen.workers.labels import load_label_source
 from datagen.workers.objects.model import ObjectSource
 from datagen.workers.rendering import RENDERERS, load_renderer
-from datagen.workers.scenes import VERSION as SCENES_VERSION
+from datagen.workers.robots import robot_limits
+from datagen.workers.scenes import scenes_version
 from datagen.workers.settling import SETTLERS, first_settler, load_settler
 
 Options = Mapping[str, Any]  # by dotted name in the specification; None where not given
@@ -76,6 +77,9 @@ def specify(
         narrow_candidates(fields, chosen)
     candidates = fields.setdefault("candidates", {})
     if isinstance(candidates, dict):
+        # A robot with a base of its own has that at every reach.
+        if chosen is None or robot_limits(chosen).base_radius_m is None:
+            candidates.setdefault("scaled_base", True)
         if label_source in ARM_PACKAGES and "within" not in candidates:
             candidates.setdefault("per_scene", "grid")
         if candidates.get("per_scene") == "grid":
@@ -166,7 +170,7 @@ def label_engines(label_source: str) -> dict[str, str]:
 def scene_engines(spec: Specification) -> dict[str, str]:
     """Versions on this machine of what can change bits of the scenes and candidates."""
     packages = sorted(scene_engine_names(spec) - {"scenes"})
-    return {name: version(name) for name in packages} | {"scenes": str(SCENES_VERSION)}
+    return {name: version(name) for name in packages} | {"scenes": str(scenes_version(spec))}
 
 
 def read_toml(

@@ -74,7 +74,7 @@ def draw_trial(shown: Shown, candidate: int | None, out: Path) -> Lines:
         ),
     )
     sizes = (MOTION_WIDE_PX, MOTION_NEAR_PX) if moving else (SHEET_WIDE_PX, SHEET_NEAR_PX)
-    bodies = robot_bodies(robot, shown.spec.candidates.base_radius_m)
+    bodies = robot_bodies(robot, float(shown.spec.candidates.radius_of_base_m(robot.reach_m)))
     film = Film(shown.recalled, bodies, retrial.T_world_base, retrial.recording, retrial.told, *sizes)
     (write_motion if moving else write_sheet)(film, title, out)
     return [

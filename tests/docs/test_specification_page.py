@@ -40,4 +40,4 @@ def test_what_it_comments_out_are_the_defaults_of_what_is_absent() -> None:
     spec = Specification.model_validate(SOURCES | fields)
     assert spec.arm == ArmParams(trial=TrialParams(), disturbance=DisturbanceParams())
     assert set(fields["arm"]) == set(ArmParams.model_fields)
-    assert spec.candidates == CandidateParams(within="clear")
+    assert spec.candidates == CandidateParams(within="clear", scaled_base=True)

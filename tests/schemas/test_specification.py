@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +13,7 @@ from pydantic import ValidationError
 
 from datagen.configuration.specify import layout_of
 from datagen.schemas.fields import SCHEMAS, Field
-from datagen.schemas.specification import Source, Specification
+from datagen.schemas.specification import CandidateParams, Source, Specification
 
 SOURCES = {"houses": Source(kind="a", digest="1" * 64), "objects": Source(kind="b", digest="2" * 64)}
 SPEC = Specification.model_validate(SOURCES)
@@ -72,6 +74,22 @@ def test_the_hash_survives_a_round_trip_through_json() -> None:
 def test_nonsense_is_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         Specification.model_validate(SOURCES | bad)
+
+
+@given(st.floats(0.05, 2.0), st.floats(0.05, 0.6))
+def test_bases_are_scaled_below_the_reach_of_the_panda(reach_m: float, radius_m: float) -> None:
+    alike, scaled = (CandidateParams(base_radius_m=radius_m, scaled_base=s) for s in (None, True))
+    assert alike.radius_of_base_m(reach_m) == radius_m
+    assert scaled.radius_of_base_m(reach_m) == pytest.approx(radius_m * min(1.0, reach_m / 0.855))
+    np.testing.assert_array_equal(scaled.radius_of_base_m(np.array([0.855, 1.0])), [radius_m, radius_m])
+
+
+def test_a_record_without_the_field_has_bases_of_one_size_and_keeps_its_hash() -> None:
+    record = SPEC.document()
+    del record["candidates"]["scaled_base"]
+    stored = Specification.model_validate_json(json.dumps(record))
+    assert stored.candidates.radius_of_base_m(0.4) == 0.25
+    assert stored.hash() == SPEC.hash()
 
 
 def test_it_cannot_be_changed() -> None:

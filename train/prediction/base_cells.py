@@ -35,6 +35,11 @@ class RobotSize:
     base_height_m: float
     arm_reach_m: float
 
+    @property
+    def base_radius_m(self) -> float:
+        """The radius that the base of such an arm has in runs."""
+        return float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m))
+
 
 @dataclass(frozen=True, eq=False)
 class BaseCells:
@@ -59,11 +64,11 @@ def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Can
     is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
-    low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, params.base_radius_m)
+    low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, robot.base_radius_m)
     tops = seen.points_m[above & (z >= mount) & (z < top)]
     high = _counts(tops, base_xy, params.mast_radius_m)
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
-    share = _floor_share(seen.points_m[is_floor], base_xy, params.base_radius_m)
+    share = _floor_share(seen.points_m[is_floor], base_xy, robot.base_radius_m)
     state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
     state[~blocked & (share >= SEEN_SHARE)] = STATES.index(CLEAR)
     return BaseCells(offsets.astype(np.float32), state, share)

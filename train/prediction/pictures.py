@@ -14,7 +14,6 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from datagen.schemas.specification import CandidateParams
 from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNSEEN
@@ -25,7 +24,6 @@ from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet,
 _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}
 _ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9}
 _SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3}  # of a cell's side
-_BASE_RADIUS_M = CandidateParams().base_radius_m
 _MOST_POINTS = 3_000
 
 
@@ -98,8 +96,9 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
         legend.append(axes.scatter(*eyes.T, marker=marker, label=CAMERA.words, zorder=6, **camera))
     if prediction.best is not None:
         xy, yaw = prediction.base_xy_m[prediction.best], prediction.yaw_rad[prediction.best]
-        axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec="black", lw=5, zorder=7))
-        axes.add_patch(Circle(tuple(xy), _BASE_RADIUS_M, fc="none", ec=BEST.colour, lw=3, zorder=7))
+        radius_m = prediction.robot.base_radius_m
+        axes.add_patch(Circle(tuple(xy), radius_m, fc="none", ec="black", lw=5, zorder=7))
+        axes.add_patch(Circle(tuple(xy), radius_m, fc="none", ec=BEST.colour, lw=3, zorder=7))
         tip = xy + 0.38 * np.array([np.cos(yaw), np.sin(yaw)])
         arrow = {"arrowstyle": "-|>", "color": BEST.colour, "lw": 3, "mutation_scale": 22}
         axes.annotate("", tuple(tip), tuple(xy), arrowprops=arrow, zorder=8)
@@ -145,7 +144,8 @@ def robot_lines(prediction: Prediction, row: int) -> list[F64]:
     """Lines (K, 3) of the robot at a base pose: base and mount as circles, heading, and the camera's mast."""
     (x, y), yaw = prediction.base_xy_m[row], float(prediction.yaw_rad[row])
     angle = np.linspace(0, 2 * np.pi, 49) + yaw
-    ring = np.column_stack([x + _BASE_RADIUS_M * np.cos(angle), y + _BASE_RADIUS_M * np.sin(angle)])
+    radius_m = prediction.robot.base_radius_m
+    ring = np.column_stack([x + radius_m * np.cos(angle), y + radius_m * np.sin(angle)])
     mount, top = prediction.robot.base_height_m, prediction.robot.camera_height_m
     return [
         *(np.column_stack([ring, np.full(49, z)]) for z in (0.01, mount)),

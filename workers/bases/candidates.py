@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from datagen.schemas.specification import CandidateParams, Range
-from datagen.workers.bases.clearance import Obstacles, base_clearance_m
+from datagen.workers.bases.clearance import (
+    ObstacleDistances,
+    Obstacles,
+    base_clearance_m,
+    distances_from_obstacles,
+)
 from datagen.workers.geometry.mesh import F32, F64
 
 Bools = npt.NDArray[np.bool_]
 
-# Rounds over all cells, each with new jitter, before a scene is rejected.
-_ROUNDS = 8
+# Rounds over all cells, each with new jitter, in which a robot must find its positions.
+ROUNDS = 8
+# Robots drawn for each one that a scene needs, before the scene is rejected.
+DRAWS_A_ROBOT = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +50,9 @@ class _SceneRobots:
     def __len__(self) -> int:
         return len(self.arm_reach_m)
 
+    def rows(self, rows: list[int]) -> _SceneRobots:
+        return _SceneRobots(self.camera_height_m[rows], self.base_height_m[rows], self.arm_reach_m[rows])
+
 
 def grid_offsets(params: CandidateParams) -> F64:
     """Cell centres (cells^2, 2) of the square grid around the target, row by row from -x, -y.
@@ -61,26 +71,43 @@ def draw_candidates(
 
     Cells are sampled from all without repetition, or from the set `within`. Candidates are assigned in turn
     to `robots_per_scene` robots, so that a model encodes a scene once per robot; or each has its own robot,
-    as in the paper. None where too few cells are in the set for these robots.
+    as in the paper.
+
+    With `within`, robots are drawn from their ranges, one after another, and those stay that find a position
+    in the set for each of their candidates; so a robot's sizes are distributed as in the ranges, given that
+    this target has room for it. Its positions are in the first cells that serve in `ROUNDS` rounds, each over
+    all cells in random order and with new jitter. The scene's robots share the rounds, and use a cell of a
+    round once. Returns None where of `DRAWS_A_ROBOT` times as many robots too few find their positions.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
     robot_index = (np.arange(n) % n_robots).astype(np.int16)
     if params.within is None:
         base_xy_m = (target_center_m[:2] + _offsets(params, rng)).astype(np.float32)
-        robots = _draw_robots(params, n_robots, rng)
-    else:
-        robots = _draw_robots(params, n_robots, rng)
-        base_xy_m = _places_within(target_center_m, obstacles, params, robots, robot_index, rng)
-        if base_xy_m is None:
-            return None
-    return _stand(base_xy_m, robot_index, robots, obstacles, params)
+        return _stand(base_xy_m, robot_index, _draw_robots(params, n_robots, rng), obstacles, params)
+    drawn = _draw_robots(params, DRAWS_A_ROBOT * n_robots, rng)
+    rounds = _Rounds(target_center_m, obstacles, params, rng)
+    base_xy_m = np.empty((n, 2), np.float32)
+    kept: list[int] = []
+    for robot in range(len(drawn)):
+        own = robot_index == len(kept)
+        found = rounds.take(drawn, robot, int(own.sum()))
+        if found is not None:
+            base_xy_m[own] = found
+            kept.append(robot)
+            if len(kept) == n_robots:
+                return _stand(base_xy_m, robot_index, drawn.rows(kept), obstacles, params)
+    return None
 
 
 def distances(candidates: SceneCandidates, target_center_m: F64) -> tuple[F32, F32]:
     """Horizontal distance base to target centre, and distance arm mount to target centre; each (N,)."""
-    planar_m = np.linalg.norm(candidates.base_xy_m.astype(np.float64) - target_center_m[:2], axis=1)
-    rise_m = target_center_m[2] - candidates.base_height_m.astype(np.float64)
+    return _distances(candidates.base_xy_m, candidates.base_height_m, target_center_m)
+
+
+def _distances(base_xy_m: F32, base_height_m: F32 | np.float32, target_center_m: F64) -> tuple[F32, F32]:
+    planar_m = np.linalg.norm(base_xy_m.astype(np.float64) - target_center_m[:2], axis=1)
+    rise_m = target_center_m[2] - np.asarray(base_height_m, np.float64)
     return planar_m.astype(np.float32), np.hypot(planar_m, rise_m).astype(np.float32)
 
 
@@ -115,48 +142,75 @@ def _stand(
 ) -> SceneCandidates:
     """SceneCandidates of robots at positions (N, 2), world, with their clearance."""
     camera_m, base_m = robots.camera_height_m[robot_index], robots.base_height_m[robot_index]
-    clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, obstacles, params)
     reach_m = robots.arm_reach_m[robot_index]
+    radius_m = params.radius_of_base_m(reach_m)
+    clearance_m = base_clearance_m(base_xy_m, base_m, camera_m, radius_m, obstacles, params.mast_radius_m)
     return SceneCandidates(base_xy_m, robot_index, camera_m, base_m, reach_m, clearance_m)
 
 
-def _places_within(
-    target_center_m: F64,
-    obstacles: Obstacles,
-    params: CandidateParams,
-    robots: _SceneRobots,
-    robot_index: npt.NDArray[np.int16],
-    rng: np.random.Generator,
-) -> F32 | None:
-    """Positions (N, 2), world, in the required set for each candidate's robot; None where too few exist.
+class _Rounds:
+    """Rounds over the cells around a target, from which robots take the positions that are in the set."""
 
-    A round visits every cell in random order and uses each at most once; further rounds follow only where one
-    does not give enough.
-    """
-    cells = grid_offsets(params)
-    base_xy_m = np.empty((len(robot_index), 2), np.float32)
-    open_ = np.ones(len(robot_index), np.bool_)
-    for _ in range(_ROUNDS):
-        order = rng.permutation(len(cells))
-        places_m = (target_center_m[:2] + _jittered(cells[order], params, rng)).astype(np.float32)
-        free = np.ones(len(cells), np.bool_)
-        for robot in range(len(robots)):
-            wanted = np.flatnonzero(open_ & (robot_index == robot))
-            if not len(wanted):
-                continue
-            standing = _stand(places_m, np.full(len(cells), robot, np.int16), robots, obstacles, params)
-            found = np.flatnonzero(free & _is_within(standing, target_center_m, params))[: len(wanted)]
-            base_xy_m[wanted[: len(found)]] = places_m[found]
-            open_[wanted[: len(found)]] = False
-            free[found] = False
-        if not open_.any():
-            return base_xy_m
-    return None
+    def __init__(
+        self,
+        target_center_m: F64,
+        obstacles: Obstacles,
+        params: CandidateParams,
+        rng: np.random.Generator,
+    ) -> None:
+        cells = grid_offsets(params)
+        self._target_m, self._obstacles, self._params = target_center_m, obstacles, params
+        self._n_cells = len(cells)
+        # Of all rounds, one after the other.
+        self._cell = np.concatenate([rng.permutation(len(cells)) for _ in range(ROUNDS)])
+        self._xy_m = (target_center_m[:2] + _jittered(cells[self._cell], params, rng)).astype(np.float32)
+        self._free = np.ones(len(self._cell), np.bool_)
+        # How far two positions in one cell can be apart.
+        step_m = 2 * params.grid_half_width_m / (params.grid_cells - 1)
+        self._apart_m = np.sqrt(2.0) * step_m if params.jitter else 0.0
+        # Of the first round, those that any robot can take, or could elsewhere in their cells.
+        first_m = self._xy_m[: len(cells)].astype(np.float64) - target_center_m[:2]
+        far_m = np.inf if params.within == "clear" else params.arm_reach_m.high + self._apart_m
+        self._first = np.flatnonzero(np.linalg.norm(first_m, axis=1) <= far_m)
+        self._around = self._distances(self._xy_m[self._first])
+        # A cell may be indoors in part.
+        self._unbounded = replace(self._around, indoors=np.ones_like(self._around.indoors))
 
+    def take(self, robots: _SceneRobots, robot: int, n: int) -> F32 | None:
+        """Positions (n, 2), world, for a robot, which are not free any more; None where it finds fewer."""
+        rows = self._first
+        margin_m = self._margins_m(self._xy_m[rows], self._around, robots, robot)
+        found = rows[(margin_m >= 0) & self._free[rows]]
+        if len(found) < n:
+            # Clearance and distance change by no more than the way between two positions in a cell.
+            is_possible = np.zeros(self._n_cells, np.bool_)
+            anywhere_m = self._margins_m(self._xy_m[rows], self._unbounded, robots, robot)
+            is_possible[self._cell[rows[anywhere_m >= -self._apart_m]]] = True
+            later = self._n_cells + np.flatnonzero(is_possible[self._cell[self._n_cells :]])
+            if len(found) + len(later) < n:
+                return None
+            xy_m = self._xy_m[later]
+            margin_m = self._margins_m(xy_m, self._distances(xy_m), robots, robot)
+            found = np.concatenate([found, later[(margin_m >= 0) & self._free[later]]])
+        if len(found) < n:
+            return None
+        self._free[found[:n]] = False
+        return self._xy_m[found[:n]]
 
-def _is_within(candidates: SceneCandidates, target_center_m: F64, params: CandidateParams) -> Bools:
-    """Mask (N,) of the candidates in the set `params.within`."""
-    clear = candidates.clearance_m >= 0
-    if params.within == "clear":
-        return clear
-    return clear & (distances(candidates, target_center_m)[1] <= candidates.arm_reach_m)
+    def _distances(self, xy_m: F32) -> ObstacleDistances:
+        params = self._params
+        # Heights of robots are rounded to float32.
+        highest_m = max(params.camera_height_m.high, params.base_height_m.high) + 1e-3
+        around_m = max(params.base_radius_m, params.mast_radius_m)
+        return distances_from_obstacles(xy_m.astype(np.float64), self._obstacles, highest_m, around_m)
+
+    def _margins_m(self, xy_m: F32, around: ObstacleDistances, robots: _SceneRobots, robot: int) -> F32:
+        """The lesser of clearance and reach left (N,); not negative for positions in the set."""
+        camera_m, mount_m, reach_m = (
+            column[robot] for column in (robots.camera_height_m, robots.base_height_m, robots.arm_reach_m)
+        )
+        radius_m = self._params.radius_of_base_m(reach_m)
+        margin_m = around.clearance_m(mount_m, camera_m, radius_m, self._params.mast_radius_m)
+        if self._params.within == "clear":
+            return margin_m
+        return np.minimum(margin_m, reach_m - _distances(xy_m, mount_m, self._target_m)[1])

@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 from datagen.workers.geometry.mesh import F64
 
+_FEW_CORNERS = 4
+
 
 def convex_hull(points_m: F64) -> F64:
     """Counter-clockwise convex hull (K, 2) of planar points (N, 2), by two chains (Andrew 1979).
@@ -47,6 +49,18 @@ def signed_distances_to_convex(points_m: F64, polygons_m: F64) -> F64:
 
     Negative inside. A polygon may repeat corners; one without area has no inside.
     """
+    if polygons_m.shape[1] > _FEW_CORNERS:
+        # Most footprints are rectangles, padded to the length of the few round ones.
+        few = (polygons_m[:, _FEW_CORNERS:] == polygons_m[:, _FEW_CORNERS - 1, None]).all((1, 2))
+        if few.any():
+            distances = np.empty((len(points_m), len(polygons_m)))
+            distances[:, few] = signed_distances_to_convex(points_m, polygons_m[few, :_FEW_CORNERS])
+            distances[:, ~few] = _signed_distances(points_m, polygons_m[~few])
+            return distances
+    return _signed_distances(points_m, polygons_m)
+
+
+def _signed_distances(points_m: F64, polygons_m: F64) -> F64:
     along = np.roll(polygons_m, -1, axis=1) - polygons_m  # (P, K, 2)
     length2 = np.maximum((along**2).sum(2), 1e-18)
     rel = points_m[:, None, None, :] - polygons_m[None]  # (N, P, K, 2)

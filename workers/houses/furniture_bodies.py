@@ -12,7 +12,7 @@ from datagen.workers.furniture.asset_geometry import asset_geometry
 from datagen.workers.furniture.asset_table import Asset
 from datagen.workers.furniture.solids import placed
 from datagen.workers.furniture.support_tops import CARRYING_TYPES, hutch_depth_m, top_height_m, top_rectangles
-from datagen.workers.geometry.mesh import F64
+from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.houses.house import BodyKind, StaticBody, Surface
 from datagen.workers.json_document import JsonNode
 
@@ -122,8 +122,17 @@ def _is_inside(node: JsonNode, below: Asset, T_below: F64) -> bool:
     """Whether a thing's centre lies within a part of what carries it, as food in a closed fridge."""
     x, y, z = node.get("position").point()
     local = (np.array([x, z, y]) - T_below[:3, 3]) @ T_below[:3, :3]
-    _, parts_m = asset_geometry(below)
-    return any((part.min(0) < local).all() and (local < part.max(0)).all() for part in parts_m)
+    low, high = _part_boxes(below)
+    return bool(((low < local) & (local < high)).all(1).any())
+
+
+@lru_cache(maxsize=4096)
+def _part_boxes(asset: Asset) -> tuple[F32, F32]:
+    """Lowest and highest corners (P, 3) of the asset's parts."""
+    _, parts_m = asset_geometry(asset)
+    corners = [(part.min(0), part.max(0)) for part in parts_m]
+    low, high = np.array(corners, np.float32).reshape(-1, 2, 3).transpose(1, 0, 2)
+    return low, high
 
 
 def _rested(T: F64, small: Asset, below: Asset, T_below: F64) -> F64:

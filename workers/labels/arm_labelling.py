@@ -106,7 +106,8 @@ def arm_in_scene(
         reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
         robot = open_robot(arm.robot, reach_m, height_m)
         grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps)
-    return ArmInScene(scene, robot, grasps, arm, spec.candidates.base_radius_m, clock)
+    base_radius_m = float(spec.candidates.radius_of_base_m(candidates.arm_reach_m[row]))
+    return ArmInScene(scene, robot, grasps, arm, base_radius_m, clock)
 
 
 def arm_of(spec: Specification) -> ArmParams:
@@ -235,7 +236,8 @@ def _fits(
     height_m, camera_m = (
         np.repeat(column[row], len(xy)) for column in (candidates.base_height_m, candidates.camera_height_m)
     )
-    return base_clearance_m(xy, height_m, camera_m, at.scene.house.obstacles, spec.candidates) >= 0
+    radius_m, mast_m = np.full(len(xy), at.base_radius_m), spec.candidates.mast_radius_m
+    return base_clearance_m(xy, height_m, camera_m, radius_m, at.scene.house.obstacles, mast_m) >= 0
 
 
 def disturbances_of(at: ArmInScene, row: int, spec: Specification) -> list[Disturbance]:

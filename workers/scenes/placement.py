@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from datagen.schemas.specification import SceneParams
 from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.geometry.planar import convex_hull
+from datagen.workers.geometry.planar import convex_hull, stack_polygons
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
@@ -17,7 +17,10 @@ from datagen.workers.scene_rejected import SceneRejected
 
 _GAP_M = 0.004  # kept between things that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40
+_BLOCK = 8  # tries that are checked together; the first few mostly suffice
 _ABOVE_M = 0.5  # things this far above the surface cannot be in the way of a drop
+
+Bools = npt.NDArray[np.bool_]
 
 
 def eligible_surfaces(house: House, params: SceneParams) -> list[Surface]:
@@ -68,55 +71,76 @@ def drop_poses(
     """
     half = np.array(surface.size_m) / 2 - params.edge_margin_m
     placed: list[F64] = [np.asarray(p) for p in taken]
-    low = np.array([p.min(0) for p in placed]).reshape(-1, 2)
-    high = np.array([p.max(0) for p in placed]).reshape(-1, 2)
     poses = np.empty((len(models), 4, 4))
     target_xy = np.zeros(2)
     for k, model in enumerate(models):
-        tries = _FAR_TRIES if k == 0 else _NEAR_TRIES + _FAR_TRIES
-        for attempt in range(tries):
-            yaw = rng.uniform(-np.pi, np.pi)
-            if k > 0 and attempt < _NEAR_TRIES:
-                # The ring widens with every try, so that a crowded middle is left step by step.
-                reach_m = params.clutter_radius_m * (1 + attempt / _NEAR_TRIES)
-                angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0, reach_m)
-                xy = target_xy + radius * np.array([np.cos(angle), np.sin(angle)])
-            else:
-                xy = rng.uniform(-half, half)
-            outline = _outline(model, xy, yaw)
-            on_surface = (np.abs(outline) <= half).all()
-            if on_surface and not any(_overlap(outline, placed[i]) for i in _boxes_meet(outline, low, high)):
-                break
-        else:
+        near_tries = 0 if k == 0 else _NEAR_TRIES
+        footprints = stack_polygons([*placed, np.zeros((4, 2))])[:-1]  # of at least four corners
+        state = rng.bit_generator.state
+        # Each try takes three numbers from the stream: the yaw, then angle and radius, or x and y.
+        numbers = rng.random((near_tries + _FAR_TRIES, 3))
+        positions = _positions(numbers, near_tries, half, target_xy, params.clutter_radius_m)
+        outlines = _outlines(model, positions, _between(-np.pi, np.pi, numbers[:, 0]))
+        attempt = _first_free(outlines, half, footprints)
+        if attempt is None:
             raise SceneRejected("no_placement")
+        # The tries after it are not used up.
+        rng.bit_generator.state = state
+        rng.random((attempt + 1, 3))
+        xy, yaw = positions[attempt], float(_between(-np.pi, np.pi, numbers[attempt, 0]))
         if k == 0:
             target_xy = xy
-        placed.append(outline)
-        low, high = np.vstack([low, outline.min(0)]), np.vstack([high, outline.max(0)])
+        placed.append(outlines[attempt])
         height_m = model.size_m[2] / 2 + params.drop_height_m
-        poses[k] = surface.T_world_surface @ yaw_pose(xy[0], xy[1], height_m, yaw)
+        poses[k] = surface.T_world_surface @ yaw_pose(float(xy[0]), float(xy[1]), height_m, yaw)
     return poses
 
 
-def _outline(model: ObjectModel, xy: F64, yaw: float) -> F64:
-    """Bounding rectangle (4, 2) of an object, turned and moved, with half the gap around it."""
+def _positions(numbers: F64, near_tries: int, half: F64, target_xy: F64, radius_m: float) -> F64:
+    """Positions (T, 2) of the tries: the first `near_tries` around the target, the others anywhere."""
+    near, far = numbers[:near_tries], numbers[near_tries:]
+    # The ring widens with every try, so that a crowded middle is left step by step.
+    reach_m = radius_m * (1 + np.arange(near_tries) / _NEAR_TRIES)
+    angle, apart_m = _between(-np.pi, np.pi, near[:, 1]), 0.0 + (reach_m - 0.0) * near[:, 2]
+    around = target_xy + apart_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([around, _between(-half, half, far[:, 1:])])
+
+
+def _between(low: F64 | float, high: F64 | float, numbers: F64 | np.float64) -> F64:
+    """What `Generator.uniform` makes of random numbers in [0, 1)."""
+    return np.asarray(low + (high - low) * numbers)
+
+
+def _outlines(model: ObjectModel, xy: F64, yaw: F64) -> F64:
+    """Bounding rectangles (T, 4, 2) of an object, turned and moved, with half the gap around it."""
     x, y = model.size_m[0] / 2 + _GAP_M / 2, model.size_m[1] / 2 + _GAP_M / 2
     c, s = np.cos(yaw), np.sin(yaw)
     corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
-    return corners @ np.array([[c, s], [-s, c]]) + xy
+    rotations = np.array([[c, s], [-s, c]]).transpose(2, 0, 1)
+    return corners @ rotations + xy[:, None]
 
 
-def _boxes_meet(outline: F64, low: F64, high: F64) -> npt.NDArray[np.intp]:
-    """Rows of the bounding boxes from `low` to `high`, each (P, 2), that meet the outline's own."""
-    return np.flatnonzero(((outline.max(0) >= low) & (outline.min(0) <= high)).all(1))
+def _first_free(outlines: F64, half: F64, footprints: F64) -> int | None:
+    """The first of the rectangles (T, 4, 2) that is on the surface and overlaps no footprint (P, K, 2)."""
+    on_surface = np.flatnonzero((np.abs(outlines) <= half).all((1, 2)))
+    for start in range(0, len(on_surface), _BLOCK):
+        rows = on_surface[start : start + _BLOCK]
+        free = np.flatnonzero(~_overlap(outlines[rows], footprints).any(1))
+        if len(free):
+            return int(rows[free[0]])
+    return None
 
 
-def _overlap(a: F64, b: F64) -> bool:
-    """Whether two convex polygons (K, 2) overlap, by the separating axis theorem."""
-    for polygon in (a, b):
-        edges = np.roll(polygon, -1, axis=0) - polygon
-        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-        on_a, on_b = normals @ a.T, normals @ b.T
-        if ((on_a.max(1) < on_b.min(1)) | (on_b.max(1) < on_a.min(1))).any():
-            return False
-    return True
+def _overlap(a: F64, b: F64) -> Bools:
+    """Whether convex polygons (T, J, 2) and (P, K, 2) overlap (T, P), by the separating axis theorem."""
+    return ~(_separated(a, b) | _separated(b, a).T)
+
+
+def _separated(a: F64, b: F64) -> Bools:
+    """Whether a side of polygon a (T, J, 2) has polygon b (P, K, 2) beyond it (T, P)."""
+    edges = np.roll(a, -1, axis=1) - a
+    normals = np.stack([edges[..., 1], -edges[..., 0]], axis=2)  # (T, J, 2), outward
+    on_a = normals @ a.transpose(0, 2, 1)  # (T, J, J)
+    on_b = (normals.reshape(-1, 2) @ b.reshape(-1, 2).T).reshape(*normals.shape[:2], *b.shape[:2])
+    beyond = (on_a.max(2)[..., None] < on_b.min(3)) | (on_b.max(3) < on_a.min(2)[..., None])
+    return beyond.any(1)

@@ -40,7 +40,11 @@ def draw_viewpoint(
     xy = target_center_m[:2] + distance_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     column = height_m.astype(np.float32)
-    free = base_clearance_m(xy.astype(np.float32), column, column, obstacles, robot) >= 0
+    radius_m = np.full(n, robot.base_radius_m)
+    clearance_m = base_clearance_m(
+        xy.astype(np.float32), column, column, radius_m, obstacles, robot.mast_radius_m
+    )
+    free = clearance_m >= 0
     usable = np.flatnonzero(free & inside_polygon(xy, room.polygon_m))
     eyes_m = np.column_stack([xy, height_m])
     for start in range(0, len(usable), _BLOCK):

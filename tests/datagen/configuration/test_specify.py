@@ -30,3 +30,23 @@ def test_one_robot_stands_on_a_whole_grid_unless_another_number_is_given(
     options = {"candidates.per_scene": option, "candidates.robots_per_scene": None}
     spec = specify("heuristic", open_houses("builtin"), open_objects("builtin"), options, config)
     assert spec.candidates.robots_per_scene == robots
+
+
+@pytest.mark.parametrize(("robot", "scaled"), [(None, True), ("panda-scaled", True), ("fetch", None)])
+def test_new_runs_scale_the_bases_of_robots_that_have_none_of_their_own(
+    robot: str | None, scaled: bool | None, tmp_path: Path
+) -> None:
+    sources = open_houses("builtin"), open_objects("builtin")
+    assert specify("heuristic", *sources, {}, None, robot).candidates.scaled_base is scaled
+    config = tmp_path / "run.toml"
+    config.write_text("[candidates]\nscaled_base = false\n")
+    assert specify("heuristic", *sources, {}, config, robot).candidates.scaled_base is False
+
+
+def test_scenes_with_a_required_set_have_a_version_of_their_own() -> None:
+    sources = open_houses("builtin"), open_objects("builtin")
+    versions = [
+        specify("heuristic", *sources, {"candidates.within": within}, None).engines["scenes"]
+        for within in (None, "clear", "in-range")
+    ]
+    assert versions == ["1", "2", "2"]

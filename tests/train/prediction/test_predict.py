@@ -196,8 +196,9 @@ def test_cell_states_agree_with_the_house(seen: Seen, scorer: ModelScorer) -> No
         answer.base_xy_m.astype(np.float32),
         np.full(n, ROBOT.base_height_m, np.float32),
         np.full(n, ROBOT.camera_height_m, np.float32),
+        np.full(n, ROBOT.base_radius_m),
         seen.scene.house.obstacles,
-        CandidateParams(),
+        CandidateParams().mast_radius_m,
     )
     blocked, clear = (answer.cells.state == STATES.index(name) for name in ("blocked", "clear"))
     assert blocked.sum() > 20 and clear.sum() > 5

@@ -95,8 +95,9 @@ def test_clearance_is_that_of_the_robot_where_it_stands() -> None:
                 candidates.base_xy_m[k : k + 1],
                 candidates.base_height_m[k : k + 1],
                 candidates.camera_height_m[k : k + 1],
+                np.array([0.25]),
                 OBSTACLES,
-                CandidateParams(),
+                0.05,
             )[0]
             for k in range(0, len(candidates), 7)
         ]

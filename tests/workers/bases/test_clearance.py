@@ -25,7 +25,8 @@ def clearance(
         np.array([[x, y]], np.float32),
         np.array([[base_height_m], [camera_height_m]], np.float32),
     )
-    return float(base_clearance_m(place, *heights, obstacles, PARAMS)[0])
+    radius_m = np.array([PARAMS.base_radius_m])
+    return float(base_clearance_m(place, *heights, radius_m, obstacles, PARAMS.mast_radius_m)[0])
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.3])

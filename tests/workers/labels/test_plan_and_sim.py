@@ -62,7 +62,8 @@ def candidates(at: SettledScene) -> SceneCandidates:
     ones = np.ones(n, np.float32)
     camera_m, height_m = ones * np.float32(1.2), ones * np.float32(HEIGHT_M)
     params = CandidateParams(base_radius_m=0.2)
-    clearance = base_clearance_m(xy, height_m, camera_m, at.house.obstacles, params)
+    radius_m = np.full(len(xy), params.base_radius_m)
+    clearance = base_clearance_m(xy, height_m, camera_m, radius_m, at.house.obstacles, params.mast_radius_m)
     return SceneCandidates(
         xy, np.zeros(n, np.int16), camera_m, height_m, ones * np.float32(REACH_M), clearance
     )
