@@ -32,7 +32,7 @@ _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015
 _BLOCKED_RAD = 0.3
 _EMPTY_OPENING_M = 0.001
 LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
-_RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping, and to be clear of what stands around
+RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping, and to be clear of what stands around
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
 _PLAYED_STEP_RAD = 0.04  # of the joint that moves farthest
@@ -40,6 +40,8 @@ _LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
 # An object whose energy would carry it this much higher than the hand rises has been thrown by the solver.
 _THROWN_M = 0.15
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
+# Held for good: so little motion of the target in the hand in each of so many control periods of holding.
+_STILL_M, _STILL_RAD, _STILL_PERIODS = 0.0005, 0.01, 2
 _SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0
 
@@ -55,7 +57,8 @@ def run_trial(
     """Executes a plan in a fresh physics scene.
 
     Free motion is not simulated as contacts are: the reach is played where the arm touches nothing on it, and
-    the solver takes fewer iterations until something is near the arm; `whole` simulates all alike.
+    the solver takes fewer iterations until something is near the arm, and holding ends once the target rests
+    in the hand; `whole` simulates all alike and to its end.
 
     `T_world_base` (4, 4) is where the plan expects the mount; the disturbance says where things truly
     are. Equal arguments give equal results, bit by bit, whatever ran before. Never raises for what
@@ -89,6 +92,8 @@ class _Trial:
     supported: bool = False  # when last looked: whether anything but the robot pushed the target
     T_tcp_target: F64 | None = None  # when the hand had closed
     grasped_z_m: float = 0.0  # height of the TCP then
+    T_tcp_held: F64 | None = None  # after the last control period of holding
+    still_periods: int = 0  # of holding, without a break, in which the target hardly moved in the hand
     moments: list[tuple[float, F64, F64, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -139,6 +144,8 @@ class _Trial:
         for tick in ticks:
             if ended := self._take(tick):
                 return ended
+            if tick.phase == "hold" and not self.whole and self._is_held_for_good():
+                return self._held(tick) or "success"
             if tick.ends_phase and (ended := ask_at_end[tick.phase](tick)):
                 return ended
         return "success"
@@ -187,7 +194,8 @@ class _Trial:
             finger_m = pressing_target_m(joints[-2:], self.prepared.params.grip_force_n)
         targets = np.concatenate([tick.arm_rad, [finger_m, finger_m]])
         grips = PHASES.index(tick.phase) >= PHASES.index("close")
-        if ended := self._step(tick.phase, targets, look=grips and tick.ends_phase):
+        look = tick.phase == "hold" or (grips and tick.ends_phase)
+        if ended := self._step(tick.phase, targets, look):
             return ended
         blocked = np.abs(self.world.joints[:-2] - tick.joints_rad).max() > _BLOCKED_RAD
         return "not_reached" if blocked and not grips else None
@@ -250,7 +258,7 @@ class _Trial:
         return None
 
     def _lifted(self, tick: ControlPeriod) -> str | None:
-        risen = self.risen_m >= _RISEN_SHARE * self.rise_m
+        risen = self.risen_m >= RISEN_SHARE * self.rise_m
         return None if self.gripped and risen else self._lost()
 
     def _held(self, tick: ControlPeriod) -> str | None:
@@ -259,8 +267,21 @@ class _Trial:
         lifted = self._lift_m() >= LIFTED_SHARE * self.rise_m and self._is_off_its_support()
         return None if lifted and self._slip_m() <= self.prepared.params.max_slip_m else "slipped"
 
+    def _is_held_for_good(self) -> bool:
+        """Whether the target no longer moves in the hand; asked after each control period of holding."""
+        now = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
+        before, self.T_tcp_held = self.T_tcp_held, now
+        if before is None:
+            return False
+        moved_m = np.linalg.norm(now[:3, 3] - before[:3, 3])
+        # Of a rotation by a small angle, the part off the identity has the norm sqrt(2) of it.
+        turned_rad = np.linalg.norm(now[:3, :3] @ before[:3, :3].T - np.eye(3)) / np.sqrt(2)
+        is_still = bool(moved_m < _STILL_M and turned_rad < _STILL_RAD)
+        self.still_periods = self.still_periods + 1 if is_still else 0
+        return self.still_periods >= _STILL_PERIODS
+
     def _lost(self) -> str:
-        return "dropped" if self.risen_m >= _RISEN_SHARE * self.rise_m else "slipped"
+        return "dropped" if self.risen_m >= RISEN_SHARE * self.rise_m else "slipped"
 
     # -- measures -----------------------------------------------------------------------------------
 
@@ -297,7 +318,7 @@ class _Trial:
         corners_m = np.concatenate(self.prepared.parts_m[0]).astype(np.float64)
         T_start = disturbed_things(self.prepared, self.disturbance).T_world_object[0]
         was, now = ((corners_m @ T[2, :3] + T[2, 3]).min() for T in (T_start, self.world.T_world_object[0]))
-        return bool(now - was >= _RISEN_SHARE * self.rise_m)
+        return bool(now - was >= RISEN_SHARE * self.rise_m)
 
     def _note(self, phase: str) -> None:
         if self.record:
