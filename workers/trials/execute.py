@@ -92,7 +92,7 @@ class _Trial:
     supported: bool = False  # when last looked: whether anything but the robot pushed the target
     T_tcp_target: F64 | None = None  # when the hand had closed
     grasped_z_m: float = 0.0  # height of the TCP then
-    T_tcp_held: F64 | None = None  # after the last control period of holding
+    T_tcp_held: F64 | None = None  # at the end of lifting, then after each control period of holding
     still_periods: int = 0  # of holding, without a break, in which the target hardly moved in the hand
     moments: list[tuple[float, F64, F64, str]] = field(default_factory=list)
 
@@ -259,6 +259,7 @@ class _Trial:
 
     def _lifted(self, tick: ControlPeriod) -> str | None:
         risen = self.risen_m >= RISEN_SHARE * self.rise_m
+        self.T_tcp_held = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
         return None if self.gripped and risen else self._lost()
 
     def _held(self, tick: ControlPeriod) -> str | None:
@@ -271,8 +272,7 @@ class _Trial:
         """Whether the target no longer moves in the hand; asked after each control period of holding."""
         now = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
         before, self.T_tcp_held = self.T_tcp_held, now
-        if before is None:
-            return False
+        assert before is not None  # since the end of lifting
         moved_m = np.linalg.norm(now[:3, 3] - before[:3, 3])
         # Of a rotation by a small angle, the part off the identity has the norm sqrt(2) of it.
         turned_rad = np.linalg.norm(now[:3, :3] @ before[:3, :3].T - np.eye(3)) / np.sqrt(2)
