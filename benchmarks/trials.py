@@ -70,6 +70,9 @@ def main() -> None:
     assert trial is not None
     print(f"{len(cases)} planned candidates in {options.scenes} scenes")
     own_s, results = print_cost(cases, trial)
+    if options.plans >= options.candidates:
+        n, failed = options.scenes * options.candidates, sum(r.outcome != "success" for r in results)
+        print(f"plan and sim agree on {n - failed} of {n} candidates in range ({interval(n - failed, n)})")
     print_paired(cases, trial, results, options.repeat_share)
     if options.maniskill:
         print_maniskill(cases[: options.maniskill], trial, results, own_s)
