@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,8 +18,6 @@ with warnings.catch_warnings():
     from sapien import physx
 
 _UNSCALED = [1.0, 1.0, 1.0]
-# From points (V, 3) and a material to a shape: `convex_shape`, or one that keeps hulls.
-ShapeOf = Callable[[F32, physx.PhysxMaterial], physx.PhysxCollisionShapeConvexMesh]
 
 
 def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxMaterial:
@@ -32,16 +30,13 @@ def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxM
     return physx.PhysxMaterial(pad, pad, 0.0)
 
 
-def static_body(
-    parts_m: Sequence[F32], material: physx.PhysxMaterial, shape_of: ShapeOf | None = None
-) -> physx.PhysxRigidStaticComponent:
+def static_body(parts_m: Sequence[F32], material: physx.PhysxMaterial) -> physx.PhysxRigidStaticComponent:
     """One body that never moves, of convex parts (V, 3) each in the world frame."""
-    shape_of = shape_of or convex_shape
     body = physx.PhysxRigidStaticComponent()
     for part in parts_m:
         # PhysX wants hulls near their own origin: cooking loses precision far from it.
         centre_m = part.mean(axis=0)
-        shape = shape_of(part - centre_m, material)
+        shape = convex_shape(part - centre_m, material)
         shape.set_local_pose(sapien.Pose(centre_m.tolist()))
         body.attach(shape)
     return body
@@ -71,12 +66,12 @@ def add_object(
 
 
 def object_body(
-    parts_m: Sequence[F32], mass_kg: float, material: physx.PhysxMaterial, shape_of: ShapeOf | None = None
+    parts_m: Sequence[F32], mass_kg: float, material: physx.PhysxMaterial
 ) -> physx.PhysxRigidDynamicComponent:
     """A body of convex parts (V, 3) each, in no scene yet."""
-    body, shape_of = physx.PhysxRigidDynamicComponent(), shape_of or convex_shape
+    body = physx.PhysxRigidDynamicComponent()
     for part in parts_m:
-        body.attach(shape_of(part, material))
+        body.attach(convex_shape(part, material))
     # Scaling mass and inertia together keeps the mass distribution of the parts, which
     # overlap a little, at the object's own mass.
     scale = mass_kg / body.mass

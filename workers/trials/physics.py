@@ -11,6 +11,7 @@ from datagen.schemas.specification import TrialParams
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.robots.robot import Robot
 from datagen.workers.settling.sapien_bodies import (
+    convex_shape,
     object_body,
     pad_material,
     pose_of,
@@ -18,7 +19,6 @@ from datagen.workers.settling.sapien_bodies import (
     static_body,
 )
 from datagen.workers.trials.articulation import Articulation
-from datagen.workers.trials.cooked_hulls import cooked_shape
 from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNESS
 from datagen.workers.trials.trial_scene import MovableObjects
 
@@ -46,7 +46,7 @@ GRAVITY_MPS2 = 9.81  # PhysX's
 
 def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:
     """What does not move, of convex parts (V, 3) each in the world frame."""
-    body = static_body(parts_m, physx.PhysxMaterial(friction, friction, 0.0), cooked_shape)
+    body = static_body(parts_m, physx.PhysxMaterial(friction, friction, 0.0))
     for shape in body.get_collision_shapes():
         tune_shape(shape, groups)
     return body
@@ -54,7 +54,7 @@ def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> ph
 
 def thing_body(parts_m: Sequence[F32], mass_kg: float, friction: float) -> physx.PhysxRigidDynamicComponent:
     """A movable object of convex parts (V, 3) each in its own frame."""
-    body = object_body(parts_m, mass_kg, physx.PhysxMaterial(friction, friction, 0.0), cooked_shape)
+    body = object_body(parts_m, mass_kg, physx.PhysxMaterial(friction, friction, 0.0))
     for shape in body.get_collision_shapes():
         tune_shape(shape, THING)
     tune_body(body)
@@ -216,7 +216,7 @@ class TrialWorld:
         for body, centre in zip(self._things, self._centres, strict=True):
             velocity = body.linear_velocity
             height_m = (body.entity_pose * centre).p[2]
-            found.append(float(height_m) + float(velocity @ velocity) / (2 * GRAVITY_MPS2))
+            found.append(float(height_m) + float(np.dot(velocity, velocity)) / (2 * GRAVITY_MPS2))
         return np.array(found)
 
     def gap_m(self) -> float:
@@ -273,7 +273,7 @@ def _robot_links(
     for k, body in enumerate(articulation.bodies):
         link = physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
         for part in body.parts_m:
-            shape = cooked_shape(part, material)
+            shape = convex_shape(part, material)
             tune_shape(shape, CARRIER if k == 0 else SHOULDER if k == shoulder else ARM)
             if k in fingers:
                 tune_pad(shape, friction, params.finger_friction, sum(robot.gripper.pad_size_m) / 2)
