@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 
 from benchmarks.options import scene_options
 from datagen.configuration.specify import specify
-from datagen.drawing.film import Lens, film_of, told_moments
+from datagen.drawing.film import Film, Lens, told_moments
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.schemas.cost import StageClock
 from datagen.schemas.specification import Specification
@@ -87,10 +87,10 @@ def strip(
     assert recording is not None
     bodies = robot_bodies(at.robot, spec.candidates.base_radius_m)
     told = told_moments(recording)
-    film = film_of(cast(Any, scene), bodies, trial.T_world_base[0], recording, told, _VIEW_PX, _VIEW_PX)
+    film = Film(cast(Any, scene), bodies, trial.T_world_base[0], recording, told, _VIEW_PX, _VIEW_PX)
     phase, last = np.array(recording.phase), len(recording.phase) - 1
     grasp, closed = (int(np.flatnonzero(phase == name)[-1]) for name in ("approach", "close"))
-    lens = Lens(film.near, 2, outlined=False)
+    lens = Lens(film.shots[1], 2, outlined=False)
     (w, h), moments = _VIEW_PX, (grasp, closed, (closed + last) // 2, last)
     image = Image.new("RGB", (w * len(moments), h + _TEXT_PX + 3), "#ffffff")
     ImageDraw.Draw(image).text((2, 1), words, "#141414")
