@@ -4,8 +4,8 @@
 
 Planned candidates (clear and in range) are executed once by default, once more to see that nothing
 changes, then with other friction, mass, grip force, timestep and disturbances. A row says how many
-succeed, and how many of the default's labels flip. "label" counts up to `max_attempts` grasps, as
-`sim` does; the other rows execute the first plan alone.
+succeed, and how many of the default's labels flip. "label" is what `sim` gives, plans included; the other
+rows execute the first plan alone.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def off(spec: Specification, target_m: float, base_m: float) -> Callable[[Case],
 def print_labels(spec: Specification, cases: list[Case], trial: TrialParams) -> None:
     """Whole labels, by timestep."""
     base = labels(spec, cases, trial)
-    print(f"\n{'label, up to max_attempts grasps':34}{'success':>9}{'flips':>8}   failures")
+    print(f"\n{'label':34}{'success':>9}{'flips':>8}   failures")
     print_row(f"timestep {1000 * trial.timestep_s:.3g} ms", base, base)
     half = trial.model_copy(update={"timestep_s": trial.timestep_s / 2})
     print_row(f"timestep {1000 * half.timestep_s:.3g} ms", labels(spec, cases, half), base)

@@ -13,14 +13,14 @@ from typing import Any, Literal
 import numpy as np
 
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES
+from datagen.schemas.outcomes import OUTCOMES, REDRAW_CAUSES, RETRY_OUTCOMES
 from datagen.schemas.specification import Specification
 
 Table = Literal["scene", "sample"]
 TABLES: tuple[Table, Table] = ("scene", "sample")
 
 # Version of all schemas. New fields raise it and note it in `since`; fields are never removed or changed.
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 OLDEST_SCHEMA_VERSION = 2
 
 
@@ -210,6 +210,9 @@ SIM_FIELDS = (
     Field("slip_m", "float32", (), "m", "tcp", "motion of the target in the hand from closing on", 0, 100),
     Field("disturbed_m", "float32", (), "m", "world", "largest motion of any other object", 0, 100),
     Field("simulated_s", "float32", (), "s", "", "simulated time of all executions", 0, 1e6),
+    Field("retry_outcome", "uint8", (), "1", "",
+          "outcome of the last execution after a first that failed; the label is the first's",
+          0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES, since=3),
 )
 # fmt: on
 

@@ -32,5 +32,8 @@ OUTCOMES: dict[str, str] = {
     "missed": "execute",  # closed, with nothing between the fingers
     "slipped": "execute",  # held after closing, not lifted with the hand
     "dropped": "execute",  # lifted, and lost before the end of holding
-    "unstable": "execute",  # the physics diverged: NaN, or impossible speeds
+    "unstable": "execute",  # the physics diverged: NaN, impossible speeds, or an object thrown
 }
+
+# How the last of further executions ended, after a first that failed; the order is part of the data format.
+RETRY_OUTCOMES = ("none", *OUTCOMES)

@@ -179,8 +179,9 @@ class TrialParams(_Frozen):
     hold_s: float = Field(default=0.5, gt=0, le=60)
     # Allowed motion of the object in the hand from the end of closing to the end of holding.
     max_slip_m: Metres = 0.03
-    # Grasps to execute one after the other, each in a new scene, until one lifts the target.
-    max_attempts: int = Field(default=3, ge=1, le=100)
+    # Grasps to execute one after the other, each in a new scene, until one lifts the target. The label is
+    # the first's; how the last ended is stored.
+    max_attempts: int = Field(default=1, ge=1, le=100)
 
     @model_validator(mode="after")
     def _ordered(self) -> TrialParams:

@@ -51,6 +51,7 @@ def evaluate(
     seed: Whole = 0,
     allow_seen_houses: bool = False,
     allow_incomplete: AllowIncomplete = False,
+    allow_mixed_labels: bool = False,
     threads: Whole | None = None,
     html: File | None = None,
     json: AsJson = False,
@@ -74,6 +75,7 @@ def evaluate(
         seed: Seed of the resamples and example scenes.
         allow_seen_houses: Report training houses separately instead of failing.
         allow_incomplete: Accept runs that lack planned samples instead of failing.
+        allow_mixed_labels: Accept labels of one source in different versions instead of failing.
         threads: CPU threads of the models [chosen by torch].
         html: HTML page to write, with tables, curves and example grids.
         json: Report progress as JSON lines.
@@ -114,7 +116,7 @@ def evaluate(
         from datagen.train.scorers import use_threads
 
         use_threads(threads)
-    opened = open_evaluated_runs(runs, allow_incomplete)
+    opened = open_evaluated_runs(runs, allow_incomplete, allow_mixed_labels)
     sets = candidate_sets_of(opened, candidates or [])
     models = open_models(checkpoints)
     if not allow_seen_houses:

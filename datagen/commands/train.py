@@ -100,6 +100,7 @@ def train_model(
     threads: Whole | None = None,
     tensorboard: Place | None = None,
     allow_incomplete: AllowIncomplete = False,
+    allow_mixed_labels: bool = False,
     json: AsJson = False,
 ) -> CheckpointHead:
     """Train a model; the checkpoint records the data, settings and history.
@@ -133,6 +134,7 @@ def train_model(
         threads: Threads per process [cores / processes].
         tensorboard: Folder for TensorBoard logs.
         allow_incomplete: Accept runs that lack planned samples instead of failing.
+        allow_mixed_labels: Accept labels of one source in different versions instead of failing.
         json: Report progress as JSON lines.
 
     Returns:
@@ -189,6 +191,7 @@ def train_model(
         tensorboard=None if tensorboard is None else str(tensorboard),
         json_lines=json,
         allow_incomplete=allow_incomplete,
+        allow_mixed_labels=allow_mixed_labels,
     )
     if not _train(job, n_processes):
         head = read_checkpoint(out).head if Path(out).exists() else None

@@ -143,12 +143,12 @@ class Retrial:
 
 
 def try_again(scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification) -> Retrial:
-    """Plan, and for `sim` execute, candidate `row` again; the last execution with its outcome is shown."""
+    """Plan, and for `sim` execute, candidate `row` again; the first execution with its outcome is shown."""
     at = arm_in_scene(scene, candidates, row, spec, StageClock())
     trial = try_candidate(at, candidates, row, spec, record=True)
     T_world_base = at.base_pose(candidates, row)
     alike = [k for k, result in enumerate(trial.results) if result.outcome == trial.outcome]
-    shown = alike[-1] if alike else None
+    shown = alike[0] if alike else None
     recording = None if shown is None else trial.results[shown].recording
     if shown is not None and recording is not None:
         T_world_base = trial.T_world_base[shown]

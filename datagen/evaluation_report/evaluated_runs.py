@@ -14,6 +14,7 @@ from datagen.schemas.specification import Specification
 from datagen.train.baselines import FIELDS
 from datagen.train.dataset import SampleStream
 from datagen.train.evaluation.columns import EXTRA
+from datagen.train.label_versions import refuse_mixed_labels
 from datagen.workers.bases.candidate_sets import CANDIDATE_SETS
 
 if TYPE_CHECKING:
@@ -73,8 +74,14 @@ def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
     return checkpoints, runs
 
 
-def open_evaluated_runs(places: Sequence[str], allow_incomplete: bool = False) -> list[EvaluatedRun]:
-    """Open the runs. InputError for heuristic labels, and for runs of different kinds or of equal scenes."""
+def open_evaluated_runs(
+    places: Sequence[str], allow_incomplete: bool = False, allow_mixed_labels: bool = False
+) -> list[EvaluatedRun]:
+    """Open the runs.
+
+    InputError for heuristic labels, for runs of different kinds or of equal scenes, and, unless
+    `allow_mixed_labels`, for labels of different versions.
+    """
     opened: list[EvaluatedRun] = []
     by_scenes: dict[str, str] = {}
     kinds: dict[str, str] = {}
@@ -96,6 +103,8 @@ def open_evaluated_runs(places: Sequence[str], allow_incomplete: bool = False) -
             allow_incomplete=allow_incomplete,
         )
         opened.append(EvaluatedRun(place, specs, stream))
+    if not allow_mixed_labels:
+        refuse_mixed_labels([(run.place, spec) for run in opened for spec in run.specs])
     return opened
 
 

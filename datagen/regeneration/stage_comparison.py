@@ -37,7 +37,9 @@ STAGES: dict[str, tuple[str, ...]] = {
     "plan": (
         "grasps_tried", "T_target_tcp", "grasp_score", "q_grasp_rad", "path_length_rad", "path_clearance_m",
     ),
-    "execute": ("attempts", "trials", "successes", "lift_m", "slip_m", "disturbed_m", "simulated_s"),
+    "execute": (
+        "attempts", "trials", "successes", "lift_m", "slip_m", "disturbed_m", "simulated_s", "retry_outcome",
+    ),
     "labels": (
         "heuristic_score", "heuristic_label", "outcome", "label", "label_source", "label_version",
     ),

@@ -17,6 +17,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.progress import Progress
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
+from datagen.train.label_versions import refuse_mixed_labels
 from datagen.train.models import Model, build_model
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.callbacks import TensorBoardCallback, TrainingCallback, TrainingProgress
@@ -53,6 +54,7 @@ class TrainingJob:
     tensorboard: str | None = None
     json_lines: bool = False  # as progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
+    allow_mixed_labels: bool = False  # labels of one source in different versions
 
 
 def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
@@ -150,6 +152,9 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
         train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
     for stream in (train, val):
         _refuse_other_labels(options.stage, stream)
+    if not job.allow_mixed_labels:
+        parts = [summary.part for stream in (train, val) for summary in stream.parts]
+        refuse_mixed_labels([(part.place, spec) for part in parts for spec in part.specs])
     refuse_shared_houses(train, val)
     train.use_rank(ranks.rank, ranks.world)
     # Of fewer scenes than processes each process judges all; `validate` counts a sample once.

@@ -1,7 +1,7 @@
 """Plan and trials of one candidate, shared by the label sources `plan` and `sim`.
 
 base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
--> executed in physics, up to `max_attempts` grasps, or `repeats` times where a robot arrived nearby   (`sim`)
+-> executed in physics once, or `repeats` times where a robot arrived nearby   (`sim`)
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ class CandidateTrial:
 
     outcome: str
     report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
-    plan: MotionPlan | None = None  # the last one that was made
+    plan: MotionPlan | None = None  # that of the first execution
     results: tuple[TrialResult, ...] = ()  # of the executions
     T_world_base: tuple[F64, ...] = ()  # (4, 4) each, where the mount stood in them
     successes: int = 0
     trials: int = 0  # what the label is a rate of: 1, or the disturbed repeats; 0 where nothing was planned
+    retry_outcome: str | None = None  # of the last grasp that was executed after a first that failed
 
 
 @dataclass(eq=False)
@@ -153,32 +154,29 @@ def _attempt(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Execute grasps one after the other, each in a new scene, until one lifts the target."""
+    """Execute the plan. Where it fails, further grasps, each in a new scene, until one lifts the target.
+
+    The label is that of the first: a robot that has dropped the target has changed the world.
+    """
     trial = at.arm.trial
     assert trial is not None
-    results: list[TrialResult] = []
-    failed: set[int] = set()
     planning, trials, clock = at.planning, at.trials, at.clock
     undisturbed = Disturbance.none(trial.object_friction)
-
-    def bases() -> tuple[F64, ...]:
-        return (T_world_base,) * len(results)
-
-    while True:
+    results: list[TrialResult] = []
+    failed: set[int] = set()
+    executed: MotionPlan | None = plan
+    while executed is not None:
         with clock.stage("execute"):
-            results.append(run_trial(trials, T_world_base, plan, undisturbed, record))
-        failed.add(plan.grasp)
-        if results[-1].outcome == "success":
-            return CandidateTrial("success", report, plan, tuple(results), bases(), 1, 1)
-        if len(results) == trial.max_attempts:
+            results.append(run_trial(trials, T_world_base, executed, undisturbed, record))
+        failed.add(executed.grasp)
+        if results[-1].outcome == "success" or len(results) == trial.max_attempts:
             break
         with clock.stage("plan"):
-            next_plan = plan_candidate(planning, T_world_base, rng, frozenset(failed)).plan
-        if next_plan is None:
-            break
-        plan = next_plan
-    outcome = max((r.outcome for r in results), key=_PROGRESS.index)
-    return CandidateTrial(outcome, report, plan, tuple(results), bases(), 0, 1)
+            executed = plan_candidate(planning, T_world_base, rng, frozenset(failed)).plan
+    outcome = results[0].outcome
+    retry_outcome = results[-1].outcome if len(results) > 1 else None
+    bases, successes = (T_world_base,) * len(results), int(outcome == "success")
+    return CandidateTrial(outcome, report, plan, tuple(results), bases, successes, 1, retry_outcome)
 
 
 def _repeat(

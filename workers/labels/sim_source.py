@@ -7,13 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from datagen.schemas.cost import StageClock
+from datagen.schemas.outcomes import RETRY_OUTCOMES
 from datagen.schemas.specification import Specification
 from datagen.workers.bases.candidates import SceneCandidates
 from datagen.workers.labels import plan_source
 from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.scenes.scene import SettledScene
 
-VERSION = 1
+# 2: the first grasp alone decides, lift and slip are measured at the grasp, thrown objects are `unstable`.
+VERSION = 2
+_RETRY_CODES = {name: code for code, name in enumerate(RETRY_OUTCOMES)}
 
 
 def label(
@@ -31,6 +34,7 @@ def label(
 
     columns |= {
         "attempts": column("int16", [len(t.results) for t in trials]),
+        "retry_outcome": column("uint8", [_RETRY_CODES[t.retry_outcome or "none"] for t in trials]),
         "trials": column("int16", [t.trials for t in trials]),
         "successes": column("int16", [t.successes for t in trials]),
         "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),

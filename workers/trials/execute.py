@@ -17,7 +17,7 @@ from datagen.workers.trials.drive_targets import (
     planned_rise_m,
     pressing_target_m,
 )
-from datagen.workers.trials.physics import TrialWorld
+from datagen.workers.trials.physics import NEAR_M, TrialWorld
 from datagen.workers.trials.trial import Disturbance, Recording, TrialResult
 from datagen.workers.trials.trial_scene import (
     TrialScene,
@@ -32,19 +32,33 @@ _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015
 _BLOCKED_RAD = 0.3
 _EMPTY_OPENING_M = 0.001
 LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
-_RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping
+RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping, and to be clear of what stands around
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
+_PLAYED_STEP_RAD = 0.04  # of the joint that moves farthest
 _LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
+# An object whose energy would carry it this much higher than the hand rises has been thrown by the solver.
+_THROWN_M = 0.15
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
+# Held for good: so little motion of the target in the hand in each of so many control periods of holding.
+_STILL_M, _STILL_RAD, _STILL_PERIODS = 0.0005, 0.01, 2
 _SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0
 
 
 def run_trial(
-    prepared: TrialScene, T_world_base: F64, plan: MotionPlan, disturbance: Disturbance, record: bool = False
+    prepared: TrialScene,
+    T_world_base: F64,
+    plan: MotionPlan,
+    disturbance: Disturbance,
+    record: bool = False,
+    whole: bool = False,
 ) -> TrialResult:
     """Executes a plan in a fresh physics scene.
+
+    Free motion is not simulated as contacts are: the reach is played where the arm touches nothing on it, and
+    the solver takes fewer iterations until something is near the arm, and holding ends once the target rests
+    in the hand; `whole` simulates all alike and to its end.
 
     `T_world_base` (4, 4) is where the plan expects the mount; the disturbance says where things truly
     are. Equal arguments give equal results, bit by bit, whatever ran before. Never raises for what
@@ -54,7 +68,7 @@ def run_trial(
     paths = (plan.q_reach_rad, plan.q_approach_rad, plan.q_lift_rad)
     if not all(np.isfinite(values).all() for values in (*poses, *paths)):
         return TrialResult("unstable", 0.0, 0.0, 0.0, 0.0)
-    trial = _Trial(prepared, T_world_base @ disturbance.T_base_moved, plan, disturbance, record)
+    trial = _Trial(prepared, T_world_base @ disturbance.T_base_moved, plan, disturbance, record, whole)
     return trial.result(trial.run())
 
 
@@ -67,15 +81,25 @@ class _Trial:
     plan: MotionPlan
     disturbance: Disturbance
     record: bool
+    whole: bool
     ticks: int = 0
+    is_free: bool = False  # whether nothing has come near the arm so far
     commanded: F64 = field(default_factory=lambda: np.zeros(0))  # (A + 2,) targets of the drives
     start_m: F64 = field(default_factory=lambda: np.zeros((0, 3)))
-    risen_m: float = 0.0  # the target's highest rise so far
+    start_energy_m: F64 = field(default_factory=lambda: np.zeros(0))
+    risen_m: float = 0.0  # highest rise so far of the target where it is grasped
     gripped: bool = False  # when last looked
+    supported: bool = False  # when last looked: whether anything but the robot pushed the target
     T_tcp_target: F64 | None = None  # when the hand had closed
+    grasped_z_m: float = 0.0  # height of the TCP then
+    T_tcp_held: F64 | None = None  # at the end of lifting, then after each control period of holding
+    still_periods: int = 0  # of holding, without a break, in which the target hardly moved in the hand
     moments: list[tuple[float, F64, F64, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self._build()
+
+    def _build(self) -> None:
         prepared, plan, params = self.prepared, self.plan, self.prepared.params
         self.steps = max(1, round(params.control_period_s / params.timestep_s))
         self.world = TrialWorld(
@@ -90,8 +114,12 @@ class _Trial:
         )
         self.world.place_arm(plan.q_reach_rad[0], plan.opening_m)
         self.commanded = np.concatenate([plan.q_reach_rad[0], [plan.opening_m / 2] * 2])
-        self.start_m = self.world.positions_m()
+        self.ticks, self.is_free, self.moments = 0, False, []
+        self._start()
         self._note(PHASES[0])
+
+    def _start(self) -> None:
+        self.start_m, self.start_energy_m = self.world.positions_m(), self.world.energies_m()
 
     def run(self) -> str:
         """All phases; the outcome."""
@@ -104,9 +132,20 @@ class _Trial:
         }
         if ended := self._settle():
             return ended
-        for tick in drive_targets(self.plan, self.prepared.robot, self.prepared.params):
+        ticks = drive_targets(self.plan, self.prepared.robot, self.prepared.params)
+        if not self.whole:
+            reach = [tick for tick in ticks if tick.phase == "reach"]
+            if self._played(reach):
+                ticks = ticks[len(reach) :]
+            else:
+                self._build()
+                if ended := self._settle():
+                    return ended
+        for tick in ticks:
             if ended := self._take(tick):
                 return ended
+            if tick.phase == "hold" and not self.whole and self._is_held_for_good():
+                return self._held(tick) or "success"
             if tick.ends_phase and (ended := ask_at_end[tick.phase](tick)):
                 return ended
         return "success"
@@ -123,8 +162,29 @@ class _Trial:
                 return ended
             if self.world.speeds_mps().max() < _SETTLED_MPS:
                 break
-        self.start_m = self.world.positions_m()
+        self._start()
         return None
+
+    def _played(self, reach: list[ControlPeriod]) -> bool:
+        """Puts the arm along its reach to the end; False where it touches something on the way.
+
+        The drives follow a path through free space without lag, and nothing else moves meanwhile.
+        """
+        world, opening_m = self.world, self.plan.opening_m
+        self.is_free = True
+        world.be_free(True)
+        before = self.commanded[:-2]
+        for tick in reach:
+            steps = max(1, int(np.ceil(np.abs(tick.joints_rad - before).max() / _PLAYED_STEP_RAD)))
+            for share in np.arange(1, steps + 1) / steps:
+                if world.look_at(before + (tick.joints_rad - before) * share, opening_m) <= 0:
+                    return False
+            before = tick.joints_rad
+            self.ticks += 1
+            self._note(tick.phase)
+        world.place_arm(before, opening_m)
+        self.commanded = np.concatenate([before, [opening_m / 2] * 2])
+        return True
 
     # -- a tick -------------------------------------------------------------------------------------
 
@@ -134,7 +194,8 @@ class _Trial:
             finger_m = pressing_target_m(joints[-2:], self.prepared.params.grip_force_n)
         targets = np.concatenate([tick.arm_rad, [finger_m, finger_m]])
         grips = PHASES.index(tick.phase) >= PHASES.index("close")
-        if ended := self._step(tick.phase, targets, look=grips and tick.ends_phase):
+        look = tick.phase == "hold" or (grips and tick.ends_phase)
+        if ended := self._step(tick.phase, targets, look):
             return ended
         blocked = np.abs(self.world.joints[:-2] - tick.joints_rad).max() > _BLOCKED_RAD
         return "not_reached" if blocked and not grips else None
@@ -143,21 +204,31 @@ class _Trial:
         """One control period. Where `look`, `gripped` says afterwards whether both fingers hold."""
         world, steps = self.world, self.steps
         seen = min(_LOOK_STEPS, steps) if look else 0
-        world.drive(steps - seen, self.commanded, targets)
+        taken = 0
+        if self.is_free:
+            taken = world.drive_free(steps - seen, self.commanded, targets)
+            if world.gap_m() < NEAR_M or look:
+                self.is_free = False
+                world.be_free(False)
+        world.drive(steps - seen, self.commanded, targets, taken)
         if look:
-            self.gripped = False
+            self.gripped = self.supported = False
             for _ in range(seen):
                 world.drive(1, targets, targets)
                 self.gripped = self.gripped or self._holds()
+                self.supported = self.supported or world.is_supported()
         self.commanded = targets
         self.ticks += 1
-        positions_m, joints = world.positions_m(), world.joints
-        if not (np.isfinite(positions_m).all() and np.isfinite(joints).all()):
+        positions_m, joints, energies_m = world.positions_m(), world.joints, world.energies_m()
+        if not (
+            np.isfinite(positions_m).all() and np.isfinite(joints).all() and np.isfinite(energies_m).all()
+        ):
             return "unstable"
+        thrown = (energies_m - self.start_energy_m).max() > self.rise_m + _THROWN_M
         gone = np.abs(positions_m - self.start_m).max() > _GONE_M
-        if gone or world.speeds_mps().max() > _SPEED_WITHOUT_SENSE_MPS:
+        if thrown or gone or world.speeds_mps().max() > _SPEED_WITHOUT_SENSE_MPS:
             return "unstable"
-        self.risen_m = max(self.risen_m, float(positions_m[0, 2] - self.start_m[0, 2]))
+        self.risen_m = max(self.risen_m, self._lift_m())
         self._note(phase)
         return None
 
@@ -181,21 +252,36 @@ class _Trial:
     def _closed(self, tick: ControlPeriod) -> str | None:
         if self.world.joints[-2:].sum() < _EMPTY_OPENING_M or not self.gripped:
             return "missed"
-        self.T_tcp_target = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
+        T_world_tcp = self._T_world_tcp()
+        self.T_tcp_target = inverse(T_world_tcp) @ self.world.T_world_object[0]
+        self.grasped_z_m, self.risen_m = float(T_world_tcp[2, 3]), 0.0
         return None
 
     def _lifted(self, tick: ControlPeriod) -> str | None:
-        risen = self.risen_m >= _RISEN_SHARE * self.rise_m
+        risen = self.risen_m >= RISEN_SHARE * self.rise_m
+        self.T_tcp_held = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
         return None if self.gripped and risen else self._lost()
 
     def _held(self, tick: ControlPeriod) -> str | None:
         if not self.gripped:
             return self._lost()
-        lifted = self._lift_m() >= LIFTED_SHARE * self.rise_m
+        lifted = self._lift_m() >= LIFTED_SHARE * self.rise_m and self._is_off_its_support()
         return None if lifted and self._slip_m() <= self.prepared.params.max_slip_m else "slipped"
 
+    def _is_held_for_good(self) -> bool:
+        """Whether the target no longer moves in the hand; asked after each control period of holding."""
+        now = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
+        before, self.T_tcp_held = self.T_tcp_held, now
+        assert before is not None  # since the end of lifting
+        moved_m = np.linalg.norm(now[:3, 3] - before[:3, 3])
+        # Of a rotation by a small angle, the part off the identity has the norm sqrt(2) of it.
+        turned_rad = np.linalg.norm(now[:3, :3] @ before[:3, :3].T - np.eye(3)) / np.sqrt(2)
+        is_still = bool(moved_m < _STILL_M and turned_rad < _STILL_RAD)
+        self.still_periods = self.still_periods + 1 if is_still else 0
+        return self.still_periods >= _STILL_PERIODS
+
     def _lost(self) -> str:
-        return "dropped" if self.risen_m >= _RISEN_SHARE * self.rise_m else "slipped"
+        return "dropped" if self.risen_m >= RISEN_SHARE * self.rise_m else "slipped"
 
     # -- measures -----------------------------------------------------------------------------------
 
@@ -207,16 +293,32 @@ class _Trial:
     def _T_world_tcp(self) -> F64:
         return self.T_world_base @ self.prepared.robot.T_base_tcp(self.world.joints[:-2])
 
+    def _grasped_m(self) -> F64:
+        """World position (3,) of the target's point that was between the pads when the hand had closed."""
+        assert self.T_tcp_target is not None
+        T = self.world.T_world_object[0]
+        return T[:3, :3] @ inverse(self.T_tcp_target)[:3, 3] + T[:3, 3]
+
     def _lift_m(self) -> float:
-        return float(self.world.positions_m()[0, 2] - self.start_m[0, 2])
+        """Rise of the target: of that point from when the hand had closed; before, of its frame."""
+        if self.T_tcp_target is None:
+            return float(self.world.positions_m()[0, 2] - self.start_m[0, 2])
+        return float(self._grasped_m()[2] - self.grasped_z_m)
 
     def _slip_m(self) -> float:
-        """How far the point of the target that was between the pads has moved in the hand."""
+        """How far that point has moved in the hand."""
         if self.T_tcp_target is None:
             return 0.0
-        now = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
-        point_m = inverse(self.T_tcp_target)[:3, 3]
-        return float(np.linalg.norm(now[:3, :3] @ point_m + now[:3, 3]))
+        return float(np.linalg.norm(self._grasped_m() - self._T_world_tcp()[:3, 3]))
+
+    def _is_off_its_support(self) -> bool:
+        """Whether nothing but the robot carries the target, or all of it is well above where it was."""
+        if not self.supported:
+            return True
+        corners_m = np.concatenate(self.prepared.parts_m[0]).astype(np.float64)
+        T_start = disturbed_things(self.prepared, self.disturbance).T_world_object[0]
+        was, now = ((corners_m @ T[2, :3] + T[2, 3]).min() for T in (T_start, self.world.T_world_object[0]))
+        return bool(now - was >= RISEN_SHARE * self.rise_m)
 
     def _note(self, phase: str) -> None:
         if self.record:

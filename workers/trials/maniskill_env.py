@@ -32,7 +32,7 @@ from datagen.workers.trials.drive_targets import (
     planned_rise_m,
     pressing_target_m,
 )
-from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE
+from datagen.workers.trials.execute import HOLDS_SHARE, LIFTED_SHARE, RISEN_SHARE
 from datagen.workers.trials.maniskill_agent import agent_of
 from datagen.workers.trials.physics import (
     ARM,
@@ -54,6 +54,8 @@ from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, ped
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
+_RISING_M = 0.002  # a hand that holds the target has begun to lift it
+_TOUCHES_N = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,35 +223,55 @@ class DatagenGraspEnv(BaseEnv):
         robot.set_qpos(torch.from_numpy(q).to(self.device))
         robot.set_qvel(torch.zeros_like(torch.from_numpy(q)).to(self.device))
         self.finger_columns = [active.index(name) for name in names[-2:]]
-        self.start_m = self.target.pose.p[:, 2].clone()
-        # (N, 3): the point of the target between the pads when they first held it.
+        # (N, 3): the point of the target between the pads when they held it and had not yet lifted it, its
+        # height (N,) then, and the hand's when they first held it.
         self.held_at = torch.zeros((self.num_envs, 3), device=self.device)
+        self.held_z_m, self.hand_z_m = (torch.zeros(self.num_envs, device=self.device) for _ in range(2))
         self.was_held = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.start_low_m = self._lowest_m()
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Success as `run_trial` has it: lifted, between both fingers, and hardly moved in the hand.
+        """Success as `run_trial` has it: off its support, between both fingers, hardly moved in the hand.
 
-        After the last action of the plan it is the trial's outcome. Shapes (N,).
+        Rise and slip are those of the point that was between the pads when the hand began to rise. After the
+        last action of the plan it is the trial's outcome. Shapes (N,).
         """
         tcp = self.palm.pose * self.palm_tcp
         matrix = tcp.to_transformation_matrix()
         closing = matrix[:, :3, 1]
-        on_first, on_second = (
-            (self.scene.get_pairwise_contact_forces(finger, self.target) * closing).sum(dim=1)
-            for finger in self.fingers
-        )
+        by_link = {
+            link.name: self.scene.get_pairwise_contact_forces(link, self.target)
+            for link in self.agent.robot.get_links()
+        }
+        on_first, on_second = ((by_link[finger.name] * closing).sum(dim=1) for finger in self.fingers)
         least_n = HOLDS_SHARE * self.params.grip_force_n
         held = (on_first > least_n) & (on_second < -least_n)
+        by_others = self.target.get_net_contact_forces() + torch.stack(list(by_link.values())).sum(dim=0)
         target = self.target.pose.to_transformation_matrix()
         now = torch.linalg.solve(target, matrix)[:, :3, 3]
-        fresh = ~self.was_held
+        self.hand_z_m = torch.where(self.was_held, self.hand_z_m, matrix[:, 2, 3])
+        fresh = ~self.was_held | (matrix[:, 2, 3] - self.hand_z_m < _RISING_M)
         self.held_at = torch.where(fresh[:, None], now, self.held_at)
+        self.held_z_m = torch.where(fresh, matrix[:, 2, 3], self.held_z_m)
         self.was_held = self.was_held | held
         slip_m = torch.linalg.norm(now - self.held_at, dim=1)
-        lift_m = self.target.pose.p[:, 2] - self.start_m
-        enough_m = LIFTED_SHARE * torch.tensor(self.rises_m, device=self.device, dtype=lift_m.dtype)
-        success = held & (lift_m >= enough_m) & (slip_m <= self.params.max_slip_m)
+        point_m = (target[:, :3, :3] @ self.held_at[:, :, None])[:, :, 0] + target[:, :3, 3]
+        lift_m = point_m[:, 2] - self.held_z_m
+        planned_m = torch.tensor(self.rises_m, device=self.device, dtype=lift_m.dtype)
+        is_alone = torch.linalg.norm(by_others, dim=1) <= _TOUCHES_N
+        is_clear = self._lowest_m() - self.start_low_m >= RISEN_SHARE * planned_m
+        success = held & (is_alone | is_clear) & (lift_m >= LIFTED_SHARE * planned_m)
+        success &= slip_m <= self.params.max_slip_m
         return {"success": success, "held": held, "lift_m": lift_m, "slip_m": slip_m}
+
+    def _lowest_m(self) -> torch.Tensor:
+        """Height (N,) of the targets' lowest points."""
+        target = self.target.pose.to_transformation_matrix().cpu().numpy().astype(np.float64)
+        lowest = [
+            (np.concatenate(task.prepared.parts_m[0]) @ T[2, :3] + T[2, 3]).min()
+            for task, T in zip(self.tasks, target, strict=True)
+        ]
+        return torch.tensor(lowest, dtype=torch.float32, device=self.device)
 
     def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         tcp = self.palm.pose * self.palm_tcp

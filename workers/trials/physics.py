@@ -36,9 +36,12 @@ ARM, SHOULDER, CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
 # With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep (docs/explanation/trials.md).
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 40, 8
+# Of the arm while nothing is within `NEAR_M` of it: its drives alone need no more.
+FREE_ITERATIONS, NEAR_M = (4, 1), 0.003
 # PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
 CONTACT_OFFSET_M = 0.005
 SLEEP_THRESHOLD = 0.005  # PhysX's, joules a kilogram
+GRAVITY_MPS2 = 9.81  # PhysX's
 
 
 def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:
@@ -112,7 +115,9 @@ class TrialWorld:
         ]
         for body, T in zip(self._things, things.T_world_object, strict=True):
             self._add(body, T)
+        self._centres = [body.cmass_local_pose for body in self._things]
         links = _robot_links(robot, articulation, friction, params)
+        self._links = frozenset(links)
         for link in links:
             self._add(link, T_world_base @ articulation.T_base_root if link is links[0] else None)
         self._arm = links[0].articulation
@@ -141,17 +146,39 @@ class TrialWorld:
         self._arm.set_qvel(np.zeros_like(ordered))
         self._drive(q.tolist())
 
-    def drive(self, steps: int, start: F64, end: F64) -> None:
-        """Takes `steps` steps while the targets (A + 2,) go evenly from `start` to `end`."""
+    def drive(self, steps: int, start: F64, end: F64, first: int = 0) -> None:
+        """Takes steps `first` to `steps` while the targets (A + 2,) go evenly from `start` to `end`."""
         if np.array_equal(start, end):
             self._drive(end.tolist())
-            for _ in range(steps):
+            for _ in range(first, steps):
                 self._system.step()
             return
-        shares = (np.arange(1, steps + 1) / steps)[:, None]
+        shares = (np.arange(first + 1, steps + 1) / steps)[:, None]
         for targets in (start + (end - start) * shares).tolist():
             self._drive(targets)
             self._system.step()
+
+    def drive_free(self, steps: int, start: F64, end: F64) -> int:
+        """As `drive`, with fewer iterations and until something is near the arm: the steps taken."""
+        shares = (np.arange(1, steps + 1) / steps)[:, None]
+        for k, targets in enumerate((start + (end - start) * shares).tolist(), start=1):
+            self._drive(targets)
+            self._system.step()
+            if self.gap_m() < NEAR_M:
+                return k
+        return steps
+
+    def be_free(self, is_free: bool) -> None:
+        """Whether the arm moves with the few iterations of free motion."""
+        iterations = FREE_ITERATIONS if is_free else (POSITION_ITERATIONS, VELOCITY_ITERATIONS)
+        self._arm.set_solver_position_iterations(iterations[0])
+        self._arm.set_solver_velocity_iterations(iterations[1])
+
+    def look_at(self, q_rad: F64, opening_m: float) -> float:
+        """`gap_m` with the arm put at joints (A,); what is asleep stays so unless the arm touches it."""
+        self.place_arm(q_rad, opening_m)
+        self._system.step()
+        return self.gap_m()
 
     def rest(self, rows: Sequence[int]) -> None:
         """Puts objects to sleep until something touches them."""
@@ -182,6 +209,35 @@ class TrialWorld:
         """(K,) of the objects."""
         velocities = np.array([body.linear_velocity for body in self._things], np.float64)
         return np.linalg.norm(velocities, axis=1)
+
+    def energies_m(self) -> F64:
+        """(K,) of the objects: potential and kinetic energy, as the height that its centre would reach."""
+        found: list[float] = []
+        for body, centre in zip(self._things, self._centres, strict=True):
+            velocity = body.linear_velocity
+            height_m = (body.entity_pose * centre).p[2]
+            found.append(float(height_m) + float(np.dot(velocity, velocity)) / (2 * GRAVITY_MPS2))
+        return np.array(found)
+
+    def gap_m(self) -> float:
+        """Smallest gap in the last step between the arm and anything else; inf beyond the contact offset."""
+        gap_m = np.inf
+        for contact in self._system.get_contacts():
+            if contact.bodies[0] in self._links or contact.bodies[1] in self._links:
+                gap_m = min([gap_m, *(point.separation for point in contact.points)])
+        return gap_m
+
+    def is_supported(self) -> bool:
+        """Whether anything but the robot pushed the target in the last step."""
+        target = self._things[0]
+        for contact in self._system.get_contacts():
+            first, second = contact.bodies
+            if first is target or second is target:
+                other = second if first is target else first
+                pushes = other not in self._links and any(point.impulse.any() for point in contact.points)
+                if pushes:
+                    return True
+        return False
 
     def finger_impulses(self) -> F64:
         """(2, 3): what each finger gave the target in the last step, in newton seconds, world frame."""

@@ -40,8 +40,8 @@ class TrialResult:
     """`outcome` is a key of OUTCOMES that stage `execute` decides."""
 
     outcome: str
-    lift_m: float  # rise of the target, end against start
-    slip_m: float  # motion of the target relative to the hand, end of closing to end of holding
+    lift_m: float  # rise of the target at the grasp from the end of closing on; before it, of its frame
+    slip_m: float  # motion of the target at the grasp, relative to the hand, from the end of closing on
     disturbed_m: float  # largest motion of any other object
     simulated_s: float
     recording: Recording | None = None

@@ -10,7 +10,7 @@ import pytest
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.outcomes import OUTCOMES, RETRY_OUTCOMES
 from datagen.schemas.specification import (
     ArmParams,
     CandidateParams,
@@ -115,11 +115,8 @@ def test_every_positive_says_how(labelled: dict[str, Any]) -> None:
 
 
 def test_sim_plans_as_plan_does(labelled: dict[str, Any]) -> None:
-    first_worked = labelled["sim"]["attempts"] <= 1
     for name in ("T_target_tcp", "q_grasp_rad", "path_length_rad", "grasps_free", "heuristic_label"):
-        np.testing.assert_array_equal(
-            labelled["plan"][name][first_worked], labelled["sim"][name][first_worked]
-        )
+        np.testing.assert_array_equal(labelled["plan"][name], labelled["sim"][name])
 
 
 def test_a_candidate_alone_has_the_label_it_has_among_others(labelled: dict[str, Any]) -> None:
@@ -131,20 +128,26 @@ def test_a_candidate_alone_has_the_label_it_has_among_others(labelled: dict[str,
         assert NAMES[labelled["sim"]["outcome"][row]] == trial.outcome
 
 
-def test_every_attempt_takes_another_grasp_and_the_one_that_came_furthest_counts() -> None:
-    """Without friction nothing holds: one candidate, three grasps, and the last of them is not the best."""
-    at, spec = scene(), specification(trial=TrialParams(object_friction=0.0))
+def test_the_first_grasp_decides_and_later_ones_are_stored() -> None:
+    """Without friction nothing holds: one candidate, three grasps."""
+    at, spec = scene(), specification(trial=TrialParams(object_friction=0.0, max_attempts=3))
     _, trials = plan_source.label_with_trials(at, candidates(at), spec, StageClock())
     tried = [trial for trial in trials if trial.results]
     assert len(tried) == 3
     for trial in tried:
         assert len({(r.outcome, r.lift_m, r.slip_m) for r in trial.results}) == 3 == len(trial.results)
-        assert trial.outcome == max((r.outcome for r in trial.results), key=NAMES.index)
-    assert any(trial.outcome != trial.results[-1].outcome for trial in tried)
+        assert (trial.outcome, trial.retry_outcome) == (trial.results[0].outcome, trial.results[-1].outcome)
     columns = load_label_source("sim").label(at, candidates(at), spec, StageClock())
     np.testing.assert_array_equal(columns["attempts"], [3, 3, 3, 0, 0, 0])
     np.testing.assert_array_equal(columns["trials"], [1, 1, 1, 0, 0, 0])
     assert not columns["successes"].any() and not columns["label"].any()
+    retries = [RETRY_OUTCOMES[code] for code in columns["retry_outcome"]]
+    assert retries == [trial.retry_outcome or "none" for trial in trials]
+    assert "none" not in retries[:3] and set(retries[3:]) == {"none"}
+
+
+def test_by_default_one_grasp_is_executed(labelled: dict[str, Any]) -> None:
+    assert labelled["sim"]["attempts"].max() == 1 and not labelled["sim"]["retry_outcome"].any()
 
 
 def test_repeats_are_counted(labelled: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots import open_robot
 from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.execute import run_trial
+from datagen.workers.trials.physics import TrialWorld
 from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import prepare_trials
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
@@ -115,6 +116,63 @@ def test_what_makes_the_arm_sag_is_held_and_not_lifted() -> None:
     assert result.outcome == "slipped" and result.slip_m < 0.003
     assert 0.05 < result.lift_m < 0.08
     assert trial(box(mass_kg=4.0), sticky).outcome == "success"
+
+
+def test_what_hangs_in_the_hand_is_lifted() -> None:
+    """A bar grasped at its end tilts by its weight: its middle rises less than the point between the pads."""
+    bar = box_model("bar", (0.3, 0.04, 0.04), 1.0)
+    scene = scene_with([bar], [(0.0, 0.0)])
+    end_m = on_top_m(scene, 0.02) + [-0.13, 0.0, 0.0]
+    plan = plan_from_above(ROBOT, BASE, end_m, 0.07)
+    result = trial(scene, Disturbance.none(0.3), plan=plan, record=True)
+    assert result.recording is not None
+    origin_rise_m = np.ptp(result.recording.T_world_object[[0, -1], 0, 2, 3])
+    assert result.lift_m > origin_rise_m + 0.01
+    assert result.slip_m < 0.01
+
+
+def test_what_still_leans_on_something_is_not_lifted() -> None:
+    """The same bar, so long that its far end stays on the table."""
+    bar = box_model("bar", (0.6, 0.04, 0.04), 1.5)
+    scene = scene_with([bar], [(0.1, 0.0)])
+    end_m = on_top_m(scene, 0.02) + [-0.28, 0.0, 0.0]
+    plan = plan_from_above(ROBOT, BASE, end_m, 0.07)
+    assert trial(scene, Disturbance.none(0.3), plan=plan).outcome == "slipped"
+
+
+@pytest.mark.parametrize(("speed_mps", "outcome"), [(3.0, "unstable"), (1.0, "success")])
+def test_what_is_thrown_is_unstable(monkeypatch: pytest.MonkeyPatch, speed_mps: float, outcome: str) -> None:
+    """3 m/s carry 46 cm up, more than a hand that rises by 10 cm can have given; 1 m/s carries 5 cm up."""
+    drive = TrialWorld.drive
+
+    def kicking(self: TrialWorld, steps: int, start: F64, end: F64, first: int = 0) -> None:
+        other = self._things[1]
+        if not hasattr(self, "kicked"):
+            self.kicked = True
+            other.wake_up()
+            other.set_linear_velocity([0.0, 0.0, speed_mps])
+        drive(self, steps, start, end, first)
+
+    monkeypatch.setattr(TrialWorld, "drive", kicking)
+    assert trial(box()).outcome == outcome
+
+
+def test_whole_simulation_comes_to_the_same_end() -> None:
+    scene = box()
+    plan = plan_from_above(ROBOT, BASE, on_top_m(scene, 0.03), 0.07)
+    prepared = prepare_trials(scene, ROBOT, PARAMS, 0.1)
+    short, whole = (
+        run_trial(prepared, BASE, plan, Disturbance.none(0.6), record=True, whole=whole)
+        for whole in (False, True)
+    )
+    assert short.outcome == whole.outcome == "success"
+    assert short.lift_m == pytest.approx(whole.lift_m, abs=1e-3)
+    assert short.simulated_s < whole.simulated_s  # holding ends once the target rests
+    assert short.recording is not None and whole.recording is not None
+    reach = [phase == "reach" for phase in short.recording.phase]
+    np.testing.assert_allclose(
+        short.recording.q_rad[: len(reach)][reach], whole.recording.q_rad[: len(reach)][reach], atol=0.02
+    )
 
 
 def test_slip_is_bounded_as_asked() -> None:
