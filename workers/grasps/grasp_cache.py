@@ -36,23 +36,25 @@ _ENGINES = ("sapien", "coal", "scipy", "numpy")
 _kept: OrderedDict[str, ScoredGrasps] = OrderedDict()
 
 
-def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams) -> GraspSet:
+def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0) -> GraspSet:
     """The grasps worth offering to an arm: those with at least `min_score`, best first.
 
     A pure function of the object's collision parts and mass, the gripper and the parameters: equal
     content gives equal bits in every process and order. None where the object cannot be grasped.
     """
-    scored = scored_grasps(model, gripper, params)
+    scored = scored_grasps(model, gripper, params, draw)
     good = scored.score >= params.min_score
     return GraspSet(scored.T_object_tcp[good], scored.opening_m[good], scored.score[good])
 
 
-def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> ScoredGrasps:
+def scored_grasps(
+    model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0
+) -> ScoredGrasps:
     """All scored grasps, from memory, from the cache folder, or computed and then cached.
 
     A cache that is broken or cannot be written costs seconds, never a result.
     """
-    digest = content_digest(model, gripper, params)
+    digest = content_digest(model, gripper, params, draw)
     if digest in _kept:
         _kept.move_to_end(digest)
         return _kept[digest]
@@ -69,15 +71,17 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> 
     return found
 
 
-def content_digest(model: ObjectModel, gripper: Gripper, params: GraspParams) -> str:
+def content_digest(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0) -> str:
     """sha256 over all that decides the grasps: it seeds their draws and names their file."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)
+    other = {"draw": draw} if draw else {}
     return digest_of(
         {
             "version": VERSION,
             "per_object": params.per_object,
             "object": [_parts_digest(model.convex_parts_m), model.mass_kg, model.size_m[2]],
             "gripper": [*hand, *map(_parts_digest, (gripper.palm_parts_m, *gripper.finger_parts_m))],
+            **other,
         }
     )
 

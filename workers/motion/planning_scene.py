@@ -76,12 +76,13 @@ def prepare(
     params: MotionParams,
     max_grasps: int,
     base_radius_m: float,
+    draw: int = 0,
 ) -> PlanningScene:
     """Place the scene's parts, and keep at most `max_grasps` good and different grasps the hand can take.
 
     `base_radius_m` is the radius of the pedestal of a robot that has no base of its own.
     """
-    moving = moving_of(robot)
+    moving = moving_of(robot, draw)
     target, T_world_target = scene.models[0], scene.T_world_object[0]
     around_m = 2 * (robot.reach_m + ROOM_AROUND_M)
     static, floor = _static_around(scene, around_m)
@@ -121,7 +122,7 @@ def prepare(
     )
 
 
-def moving_of(robot: Robot) -> Moving:
+def moving_of(robot: Robot, draw: int = 0) -> Moving:
     """The robot's kinematics, shape and reach table."""
     kinematics = forward_kinematics(robot)
     T_tcp = kinematics.T_base_frame[-1]
@@ -130,7 +131,7 @@ def moving_of(robot: Robot) -> Moving:
         () if _is_of_hand(parts, T, T_tcp, hand) else parts
         for parts, T in zip(robot.link_parts_m, kinematics.T_base_frame, strict=False)
     ]
-    return Moving(kinematics, hulls_of(parts), hand_of(robot.gripper), reach_table(robot, kinematics))
+    return Moving(kinematics, hulls_of(parts), hand_of(robot.gripper), reach_table(robot, kinematics, draw))
 
 
 def pose_of_base(base_xy_m: F64, base_height_m: float, target_center_m: F64) -> F64:

@@ -50,9 +50,9 @@ class ReachTable:
         return distance[:, 0], np.clip(seeds, self.lower_rad, self.upper_rad)
 
 
-def reach_table(robot: Robot, kinematics: ForwardKinematics) -> ReachTable:
+def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:
     """The table of a robot; equal robots have equal tables."""
-    rng = np.random.Generator(np.random.PCG64(0))
+    rng = np.random.Generator(np.random.PCG64(draw))
     lower = np.maximum(robot.q_lower_rad, -np.pi)
     upper = np.minimum(robot.q_upper_rad, np.pi)
     q = rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
