@@ -17,7 +17,7 @@ import argparse
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,8 +26,9 @@ import numpy.typing as npt
 
 from datagen.configuration.specify import put_field
 from datagen.schemas.cost import StageClock
+from datagen.schemas.fields import SceneRows
 from datagen.schemas.run import Run
-from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.specification import Specification
 from datagen.train.evaluation.bootstrap import resample_weights
 from datagen.workers.bases.candidates import SceneCandidates, distances
@@ -75,10 +76,7 @@ def main() -> None:
     world = open_world(run.manifest.spec, options.houses, options.objects)
     scene_of: list[int] = []
     target_of: list[str] = []
-    for number in range(options.scenes):
-        stored = read_scene(run, number)
-        if stored is None:
-            break
+    for number, stored in stored_scenes(run, options.scenes):
         scene = reconstruct_scene(world, stored.record)
         candidates = reconstruct_candidates(stored.samples, scene)
         rows = within_reach(scene, candidates)
@@ -94,6 +92,13 @@ def main() -> None:
             print_by_target(labellings[0], labelling, target_of)
     for labelling in labellings:
         print_cost(labelling)
+
+
+def stored_scenes(run: Run, count: int) -> Iterator[tuple[int, SceneRows]]:
+    """The first `count` scenes of committed shards, with their numbers."""
+    each = run.layout.scenes_per_shard
+    numbers = [shard * each + k for shard in sorted(run.committed()) for k in range(each)][:count]
+    return zip(numbers, read_scenes(run, numbers), strict=True)
 
 
 def changed(spec: Specification, settings: Sequence[str]) -> Specification:
