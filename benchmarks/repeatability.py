@@ -62,7 +62,9 @@ def main() -> None:
     parser.add_argument("--objects", default="builtin")
     parser.add_argument("--scenes", type=int, default=60)
     parser.add_argument("--draws", type=int, default=1, help="other draws to compare with draw 0")
-    parser.add_argument("--base", action="append", default=[], metavar="FIELD=VALUE", help="of all labellings")
+    parser.add_argument(
+        "--base", action="append", default=[], metavar="FIELD=VALUE", help="of all labellings"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE[,FIELD=VALUE]")
     parser.add_argument("--per-object", action="store_true")
     options = parser.parse_args()
@@ -84,7 +86,9 @@ def main() -> None:
         target_of += [scene.models[0].name] * len(rows)
         for labelling in labellings:
             label_scene(labelling, scene, candidates, rows)
-    print(f"{len(scene_of)} candidates within reach of {len(set(scene_of))} scenes, {len(set(target_of))} targets")
+    print(
+        f"{len(scene_of)} candidates within reach of {len(set(scene_of))} scenes, {len(set(target_of))} targets"
+    )
     scenes = np.array(scene_of)
     for labelling in labellings[1:]:
         print_flips(labellings[0], labelling, scenes)

@@ -129,7 +129,7 @@ class GraspParams(_Frozen):
     """Grasps of the target: the number to search, and the number to keep per scene."""
 
     per_object: int = Field(default=300, ge=1, le=10_000)
-    per_scene: int = Field(default=40, ge=1, le=1000)
+    per_scene: int = Field(default=1000, ge=1, le=10_000)
     # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
 

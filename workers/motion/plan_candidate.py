@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -11,11 +11,10 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion.arm_collision import Surroundings, surroundings
 from datagen.workers.motion.cartesian_path import follow_line
-from datagen.workers.motion.collision import Ints
+from datagen.workers.motion.collision import Bools, Ints
 from datagen.workers.motion.grasp_filter import backed, line_offsets_m, raised
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
 from datagen.workers.motion.planning_scene import PlanningScene
-from datagen.workers.motion.reach_table import order_by_distance
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
 # The order of checks of a grasp, cheap ones first: a path is searched only for grasps with approach and
@@ -25,6 +24,8 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where none is straight
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
+_FIRST_BATCH = 4  # grasps checked together; each batch has as many as all before, and these
+_SORTED_AT_ONCE = 24
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -34,7 +35,24 @@ class _Search:
 
     at: Surroundings
     T_base_world: F64
-    far: list[_Reachable]  # to which no straight path leads
+    rows: Ints  # of the kept grasps, in the order in which they are tried
+    T_base_tcp: F64  # (G, 4, 4), at the grasps of `rows`
+    seeds_rad: F64  # (G, S, A)
+    far: list[_Reachable] = field(default_factory=list)  # to which no straight path leads
+    furthest: str = "no_ik"
+
+    def reached(self, stage: str) -> None:
+        """Note how far a try came."""
+        self.furthest = max(self.furthest, stage, key=STAGES.index)
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Joints at a grasp and at its pregrasp."""
+
+    g: int  # row of the search
+    q_grasp: F64  # (A,)
+    q_pregrasp: F64  # (A,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,83 +73,121 @@ def plan_candidate(
     `skip` are rows of the GraspSet. Depends on the arguments alone: neither on candidates before nor on
     time. `rng` is drawn from only where no grasp has a straight path.
     """
-    rows = np.flatnonzero(~np.isin(prepared.grasp, sorted(skip)))
+    around, params = prepared.around, prepared.params
+    rows = np.flatnonzero(~np.isin(around.grasp, sorted(skip)))
     if len(rows) == 0:
-        return PlanReport("no_grasp", None, prepared.grasps_free, 0)
+        return PlanReport("no_grasp", None, around.grasps_free, 0)
     T_base_world = inverse(T_world_base)
-    T_base_tcp = np.matmul(T_base_world, prepared.T_world_tcp[rows])
-    distance, seeds = prepared.moving.table.nearest(T_base_tcp, prepared.params.ik_seeds)
-    order = order_by_distance(distance)[: prepared.params.max_grasps_tried]
+    T_base_tcp = np.matmul(T_base_world, around.T_world_tcp[rows])
+    within = _is_within_reach(prepared, T_base_world, T_base_tcp)
+    rows, T_base_tcp = rows[within], T_base_tcp[within]
+    distance, seeds = prepared.moving.table.nearest(T_base_tcp, params.ik_seeds)
+    order = _order(distance, params.max_grasps_tried)
     if len(order) == 0:
-        return PlanReport("no_ik", None, prepared.grasps_free, 0)
+        return PlanReport("no_ik", None, around.grasps_free, 0)
     at = surroundings(prepared, T_world_base)
-    search = _Search(at, T_base_world, [])
-    tried: set[int] = set()
-    furthest = 0
-    for k in order.tolist():
-        tried.add(int(prepared.grasp[rows[k]]))
-        outcome, plan = _try_grasp(search, int(rows[k]), T_base_tcp[k], seeds[k])
-        furthest = max(furthest, STAGES.index(outcome))
-        if plan is not None or outcome == "no_start":
-            return PlanReport(outcome, plan, prepared.grasps_free, len(tried))
-    plan = _search_paths(search, rng)
-    if plan is not None:
-        return PlanReport("success", plan, prepared.grasps_free, len(tried))
-    return PlanReport(STAGES[furthest], None, prepared.grasps_free, len(tried))
+    search = _Search(at, T_base_world, rows[order], T_base_tcp[order], seeds[order])
+    plan, end = None, 0
+    while plan is None and end < len(order) and search.furthest != "no_start":
+        start, end = end, min(len(order), 2 * end + _FIRST_BATCH)
+        plan = _try_grasps(search, range(start, end))
+    tried = len(set(around.grasp[search.rows[:end]].tolist()))
+    if plan is None and search.furthest != "no_start":
+        plan = _search_paths(search, rng)
+    outcome = search.furthest if plan is None else "success"
+    return PlanReport(outcome, plan, around.grasps_free, tried)
 
 
-def _try_grasp(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tuple[str, MotionPlan | None]:
-    """The arm's ways to take one grasp, one a seed, until one leads to a whole plan."""
-    scene, furthest = search.at.scene, "no_ik"
-    params = scene.params
-    T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
-    T_up = np.stack(
-        [search.T_base_world @ raised(scene.T_world_tcp[k], float(r)) for r in line_offsets_m(params.lift_m)]
-    )
-    seen: list[F64] = []
-    for seed in seeds_rad:
-        q_grasp = scene.robot.ik(T_base_tcp, seed)
-        if q_grasp is None or any(np.abs(q_grasp - q).max() < _SAME_RAD for q in seen):
-            continue
-        seen.append(q_grasp)
-        outcome, plan = _try_arm(search, k, q_grasp, T_back, T_up)
-        furthest = max(furthest, outcome, key=STAGES.index)
-        if plan is not None or outcome == "no_start":
-            return outcome, plan
-    return furthest, None
+def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
+    """Where the TCP is no farther from the shoulder than the reach: at grasp, pregrasp and end of the lift."""
+    robot, params = prepared.robot, prepared.params
+    to_grasp = T_base_tcp[:, :3, 3] - robot.shoulder_m
+    ways = (0.0, -params.pregrasp_m * T_base_tcp[:, :3, 2], params.lift_m * T_base_world[:3, 2])
+    farthest_m = np.max([np.linalg.norm(to_grasp + way, axis=1) for way in ways], axis=0)
+    return farthest_m <= robot.reach_m
 
 
-def _try_arm(search: _Search, k: int, q_grasp: F64, T_back: F64, T_up: F64) -> tuple[str, MotionPlan | None]:
-    """On from joints at grasp `k`; `T_back` and `T_up` (K, 4, 4) are the hand's lines away from it."""
+def _order(distance: F64, count: int) -> Ints:
+    """The first `count` rows with seeds near by. The nearest come first in each of a few rows: the rows as they
+    come are the best grasps and differ much, while those nearest to a seed resemble each other.
+    """
+    rows = np.flatnonzero(np.isfinite(distance))[:count]
+    return rows[np.lexsort((distance[rows], np.arange(len(rows)) // _SORTED_AT_ONCE))]
+
+
+def _try_grasps(search: _Search, grasps: range) -> MotionPlan | None:
+    """The arm's ways to take some grasps: all are checked for collisions together, then one by one further."""
     at, scene = search.at, search.at.scene
-    q_pregrasp = scene.robot.ik(T_back[-1], q_grasp)
-    if q_pregrasp is None:
-        return "no_ik", None
-    opening_m = float(scene.opening_m[k])
-    if (
-        at.is_base_stuck
-        or at.first_arm_blocked(q_grasp[None], is_target_held=False) == 0
-        or at.first_blocked(q_pregrasp[None], opening_m) == 0
-    ):
-        return "arm_collision", None
-    homes = np.flatnonzero(at.free_homes(opening_m))
-    if len(homes) == 0:
-        return "no_start", None
-    back = follow_line(at, T_back, q_grasp, q_pregrasp, is_target_held=False)
+    ways = [way for g in grasps for way in _ways(search, g)]
+    if not ways:
+        return None
+    search.reached("arm_collision")
+    if at.is_base_stuck:
+        return None
+    openings_m = scene.around.opening_m[search.rows[[way.g for way in ways]]]
+    free = np.flatnonzero(~at.blocked(np.array([way.q_pregrasp for way in ways]), openings_m))
+    free = free[~at.blocked(np.array([ways[k].q_grasp for k in free]), None)] if len(free) else free
+    for k in free.tolist():
+        if len(at.free_homes) == 0:
+            search.reached("no_start")
+            return None
+        plan = _try_way(search, ways[k])
+        if plan is not None:
+            return plan
+    return None
+
+
+def _ways(search: _Search, g: int) -> list[_Way]:
+    """Joints at a grasp and its pregrasp, at most one for each seed."""
+    robot, params = search.at.scene.robot, search.at.scene.params
+    T_grasp = search.T_base_tcp[g]
+    T_pregrasp = backed(T_grasp, params.pregrasp_m)
+    ways: list[_Way] = []
+    for seed in search.seeds_rad[g]:
+        q_grasp = robot.ik(T_grasp, seed)
+        if q_grasp is None or any(np.abs(q_grasp - way.q_grasp).max() < _SAME_RAD for way in ways):
+            continue
+        q_pregrasp = robot.ik(T_pregrasp, q_grasp)
+        if q_pregrasp is not None:
+            ways.append(_Way(g, q_grasp, q_pregrasp))
+    return ways
+
+
+def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
+    """On from joints that are free at a grasp and its pregrasp: both lines and a straight path."""
+    at, scene = search.at, search.at.scene
+    params, robot = scene.params, scene.robot
+    k, T_base_tcp = int(search.rows[way.g]), search.T_base_tcp[way.g]
+    T_up = np.stack(
+        [
+            search.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
+            for r in line_offsets_m(params.lift_m)
+        ]
+    )
+    search.reached("no_approach")
+    T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
+    # The end of the lift is asked for first: where the arm is too short for it, the lines cost most.
+    if robot.ik(T_up[-1], way.q_grasp) is None:
+        search.reached("no_lift")
+        return None
+    back = follow_line(at, T_back, way.q_grasp, way.q_pregrasp, is_target_held=False)
     if back is None:
-        return "no_approach", None
-    lift = follow_line(at, T_up, q_grasp, None, is_target_held=True)
+        return None
+    search.reached("no_lift")
+    lift = follow_line(at, T_up, way.q_grasp, None, is_target_held=True)
     if lift is None:
-        return "no_lift", None
-    gaps = np.linalg.norm(scene.robot.homes_rad[homes] - q_pregrasp, axis=1)
+        return None
+    search.reached("no_path")
+    homes, opening_m = at.free_homes, float(scene.around.opening_m[k])
+    gaps = np.linalg.norm(robot.homes_rad[homes] - way.q_pregrasp, axis=1)
     found = _Reachable(k, back[::-1], lift, homes[np.argsort(gaps, kind="stable")])
-    step_rad, first_blocked = scene.params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
+    step_rad, first_blocked = params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
     for home in found.homes[:_STARTS].tolist():
-        if is_line_free(scene.robot.homes_rad[home], q_pregrasp, first_blocked, step_rad):
-            path = straight(scene.robot.homes_rad[home], q_pregrasp, step_rad)
-            return "success", _plan(search, found, home, path)
+        if is_line_free(robot.homes_rad[home], way.q_pregrasp, first_blocked, step_rad):
+            path = straight(robot.homes_rad[home], way.q_pregrasp, step_rad)
+            return _plan(search, found, home, path)
     search.far.append(found)
-    return "no_path", None
+    return None
 
 
 def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | None:
@@ -141,7 +197,7 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
     left, far = params.path_iterations, search.far[:_SEARCHES]
     for rank, found in enumerate(far):
         home = int(found.homes[0])
-        first_blocked = partial(search.at.first_blocked, opening_m=float(scene.opening_m[found.k]))
+        first_blocked = partial(search.at.first_blocked, opening_m=float(scene.around.opening_m[found.k]))
         corners, used = connect(
             robot.homes_rad[home],
             found.q_approach_rad[0],
@@ -162,12 +218,12 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
 
 def _plan(search: _Search, found: _Reachable, home: int, q_reach: F64) -> MotionPlan:
     scene = search.at.scene
-    opening_m = float(scene.opening_m[found.k])
+    opening_m = float(scene.around.opening_m[found.k])
     ways = (q_reach, found.q_approach_rad)
     length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in ways)
     some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
     clearance_m = search.at.clearance_m(q_reach[some], opening_m)
-    grasp = int(scene.grasp[found.k])
+    grasp = int(scene.around.grasp[found.k])
     return MotionPlan(
         grasp, home, q_reach, found.q_approach_rad, found.q_lift_rad, opening_m, length, clearance_m
     )
