@@ -86,9 +86,8 @@ def main() -> None:
         target_of += [scene.models[0].name] * len(rows)
         for labelling in labellings:
             label_scene(labelling, scene, candidates, rows)
-    print(
-        f"{len(scene_of)} candidates within reach of {len(set(scene_of))} scenes, {len(set(target_of))} targets"
-    )
+    counts = f"{len(set(scene_of))} scenes, {len(set(target_of))} targets"
+    print(f"{len(scene_of)} candidates within reach of {counts}")
     scenes = np.array(scene_of)
     for labelling in labellings[1:]:
         print_flips(labellings[0], labelling, scenes)

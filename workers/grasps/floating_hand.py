@@ -25,7 +25,7 @@ Bools = npt.NDArray[np.bool_]
 _GRAVITY_MPS2 = 9.81
 # A finger's joint: its x axis, along which it moves, is the hand's y for finger 0 and -y for finger 1.
 _JOINT_AXES = (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
-_NO_TORQUE = np.zeros(3, np.float32)
+_NO_TORQUE = [0.0, 0.0, 0.0]
 _FINGER_MASS_KG = 0.05
 _FINGER_INERTIA_KGM2 = 1e-4
 
@@ -52,7 +52,7 @@ class HandTest:
     position_iterations: int = 10
     velocity_iterations: int = 2
     contact_offset_m: float = 0.002
-    hands_at_once: int = 64
+    hands_at_once: int = 32
 
 
 # Down for an object that stands upright, out of the hand, and along its pads.
@@ -79,6 +79,7 @@ def held_trials(
     held = np.zeros((n, len(PULLS)), bool)
     errors = [_error(rng, test) for _ in range(n)]
     T_tcp_object = np.array([inverse(T) @ error for T, error in zip(T_object_tcp, errors, strict=True)])
+    T_tcp_object = T_tcp_object.reshape(n, 4, 4)
     pulls_mps2 = np.stack([_pull_directions(name, T_object_tcp) * test.pull_mps2 for name in PULLS])
     for start in range(0, n, test.hands_at_once):
         some = slice(start, start + test.hands_at_once)

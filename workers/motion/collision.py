@@ -29,7 +29,7 @@ Ints = npt.NDArray[np.int64]
 class Shape:
     """A convex part as coal's polyhedron, built when it is first asked for: most parts never are."""
 
-    __slots__ = ("_corners_m", "_built")
+    __slots__ = ("_built", "_corners_m")
 
     def __init__(self, corners_m: F32 | F64) -> None:
         self._corners_m, self._built = corners_m, None

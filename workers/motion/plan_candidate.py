@@ -99,7 +99,7 @@ def plan_candidate(
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
-    """Where the TCP is no farther from the shoulder than the reach: at grasp, pregrasp and end of the lift."""
+    """Where the TCP is within the reach: at the grasp, at the pregrasp and at the end of the lift."""
     robot, params = prepared.robot, prepared.params
     to_grasp = T_base_tcp[:, :3, 3] - robot.shoulder_m
     ways = (0.0, -params.pregrasp_m * T_base_tcp[:, :3, 2], params.lift_m * T_base_world[:3, 2])
@@ -108,15 +108,16 @@ def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64
 
 
 def _order(distance: F64, count: int) -> Ints:
-    """The first `count` rows with seeds near by. The nearest come first in each of a few rows: the rows as they
-    come are the best grasps and differ much, while those nearest to a seed resemble each other.
+    """The first `count` rows that have seeds near by, the nearest first among a few neighbours.
+
+    Rows come best first and differ much, while those nearest to a seed resemble each other.
     """
     rows = np.flatnonzero(np.isfinite(distance))[:count]
     return rows[np.lexsort((distance[rows], np.arange(len(rows)) // _SORTED_AT_ONCE))]
 
 
 def _try_grasps(search: _Search, grasps: range) -> MotionPlan | None:
-    """The arm's ways to take some grasps: all are checked for collisions together, then one by one further."""
+    """Look for a plan to some grasps: collisions are checked together, all else one by one."""
     at, scene = search.at, search.at.scene
     ways = [way for g in grasps for way in _ways(search, g)]
     if not ways:

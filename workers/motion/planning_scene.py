@@ -168,8 +168,7 @@ def grasps_free_of_target(
 ) -> tuple[Ints, F64]:
     """Rows (K,) of the grasps, best first, in which the hand keeps clear of the target, and poses (K, 4, 4).
 
-    Each pose comes as it is and turned by half a turn about its approach. This depends on the object alone, so
-    that all scenes share it.
+    Each pose comes as it is and turned by half a turn about its approach. No scene changes them.
     """
     known = _free_of_target.setdefault(grasps, {})
     key = (hand.digest, params)
