@@ -7,7 +7,7 @@ as labels are made, and with --draws others. Printed are the share of labels tha
 within reach and of those that are negative by draw 0, by outcome, with 95% intervals by bootstrap over
 scenes; then the CPU time of planning by outcome.
 
-    --set arm.grasps.per_object=600        compare with other parameters, under draw 0, instead of other draws
+    --set arm.grasps.per_object=600        compare also with other parameters, under draw 0
     --per-object                           also by object
 """
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -71,10 +72,8 @@ def main() -> None:
     run = Run.open(options.run)
     base = _plan_spec(changed(run.manifest.spec, options.base))
     labellings = [Labelling("draw 0", base, 0)]
-    if options.set:
-        labellings += [Labelling(text, changed(base, text.split(",")), 0) for text in options.set]
-    else:
-        labellings += [Labelling(f"draw {draw}", base, draw) for draw in range(1, options.draws + 1)]
+    labellings += [Labelling(f"draw {draw}", base, draw) for draw in range(1, options.draws + 1)]
+    labellings += [Labelling(text, changed(base, text.split(",")), 0) for text in options.set]
     world = open_world(run.manifest.spec, options.houses, options.objects)
     scene_of: list[int] = []
     target_of: list[str] = []
@@ -86,6 +85,7 @@ def main() -> None:
         target_of += [scene.models[0].name] * len(rows)
         for labelling in labellings:
             label_scene(labelling, scene, candidates, rows)
+        print(f"scene {number}", file=sys.stderr, flush=True)
     counts = f"{len(set(scene_of))} scenes, {len(set(target_of))} targets"
     print(f"{len(scene_of)} candidates within reach of {counts}")
     scenes = np.array(scene_of)
