@@ -3,8 +3,8 @@
     python -m benchmarks.graspability [--objects ycb:DIR] [--robot panda] [--stability] [--cold]
 
 `free`: poses in which the open hand and its last 8 cm of way touch nothing of the object; `clear`: of
-these, poses that also keep above what the upright object stands on; `scored`: varied ones of them, with
-their flips, tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
+these, poses that also keep above what the upright object stands on; `scored`: varied ones of them,
+tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
 share of these among the scored and clear ones. CPU seconds are those of this process; 0.0 where the grasps
 were kept from before.
 

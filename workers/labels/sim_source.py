@@ -13,7 +13,7 @@ from datagen.workers.labels import plan_source
 from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.scenes.scene import SettledScene
 
-VERSION = 1
+VERSION = 2
 
 
 def label(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -48,6 +49,10 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _NOTHING = place([])
 
 
+# From what poses (N, 4, 4) and openings (N,) are free in a scene to grasps that are.
+Further = Callable[[Callable[[F64, F64], Bools]], GraspSet]
+
+
 @dataclass(frozen=True, eq=False)
 class Moving:
     """A robot's shape for planning, built once a robot.
@@ -75,6 +80,7 @@ class HandScene:
     floor: Bools  # of the static parts, which are low enough to stand on
     objects: Placed  # the target's parts, then those of the other objects
     target_parts: int
+    grasps: GraspSet  # the object's, or where the hand can take none of these, those searched for this scene
     grasps_free: int  # of the whole GraspSet
     grasp: Ints  # (K,), row of the GraspSet; best first, and both turns of the hand where they are free
     T_world_tcp: F64  # (K, 4, 4)
@@ -105,12 +111,14 @@ def prepare(
     max_grasps: int,
     base_radius_m: float,
     draw: int = 0,
+    further: Further | None = None,
 ) -> PlanningScene:
     """A robot among the scene's parts, with the best `max_grasps` grasps that its hand can take there.
 
-    `base_radius_m` is the radius of the pedestal of a robot that has no base of its own.
+    `base_radius_m` is the radius of the pedestal of a robot that has no base of its own. `further` searches
+    grasps among free poses, and is asked where the hand can take none of `grasps`.
     """
-    around = _hand_scene(scene, robot, grasps, params, max_grasps)
+    around = _hand_scene(scene, robot, grasps, params, max_grasps, further)
     pedestal_m = _pedestal_m(robot, base_radius_m) if robot.base_radius_m is None else None
     return PlanningScene(robot, params, moving_of(robot, draw), around, pedestal_m)
 
@@ -121,18 +129,30 @@ _hand_scenes: WeakKeyDictionary[SettledScene, dict[_HandSceneKey, HandScene]] = 
 
 
 def _hand_scene(
-    scene: SettledScene, robot: Robot, grasps: GraspSet, params: MotionParams, max_grasps: int
+    scene: SettledScene,
+    robot: Robot,
+    grasps: GraspSet,
+    params: MotionParams,
+    max_grasps: int,
+    further: Further | None,
 ) -> HandScene:
     around_m = max(_AROUND_M, 2 * (robot.reach_m + ROOM_AROUND_M))
     known = _hand_scenes.setdefault(scene, {})
     key = (robot.gripper.digest, grasps, params, max_grasps, around_m)
     if key not in known:
-        known[key] = hand_scene(scene, hand_of(robot.gripper), grasps, params, max_grasps, around_m)
+        hand = hand_of(robot.gripper)
+        known[key] = hand_scene(scene, hand, grasps, params, max_grasps, around_m, further)
     return known[key]
 
 
 def hand_scene(
-    scene: SettledScene, hand: Hand, grasps: GraspSet, params: MotionParams, max_grasps: int, around_m: float
+    scene: SettledScene,
+    hand: Hand,
+    grasps: GraspSet,
+    params: MotionParams,
+    max_grasps: int,
+    around_m: float,
+    further: Further | None = None,
 ) -> HandScene:
     """Place the scene's parts up to `around_m` from the target, and keep what grasps the hand can take."""
     target, T_world_target = scene.models[0], scene.T_world_object[0]
@@ -145,22 +165,58 @@ def hand_scene(
     near = static.within(center - room_m, center + room_m)
     around = joined([static.rows(near), *others])
     hulls = object_hulls(target)
-    grasp, T, opening_m = np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0)
-    n_free = 0
     # A target within another thing can be held by nothing, whatever the hand alone may do there.
     is_sunk = (
         bool(hits(hulls, T_world_target[None, None], joined(others), -_SUNK_M).any()) if others else False
     )
+    kept = _Kept(grasps, 0, np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     if len(grasps) and not is_sunk and can_be_lifted(hulls, T_world_target, static.rows(near), params.lift_m):
-        grasp, T_object_tcp = grasps_free_of_target(hand, grasps, target, params)
-        T, opening_m = np.matmul(T_world_target, T_object_tcp), grasps.opening_m[grasp].astype(np.float64)
-        free = free_grasps(hand, T, opening_m, around, _NOTHING, params)
-        rows, which = np.unique(grasp[free]), np.flatnonzero(free)
-        n_free = len(rows)
-        which = which[np.isin(grasp[which], rows[:max_grasps])]
-        grasp, T, opening_m = grasp[which], T[which], opening_m[which]
+
+        def is_free(T_object_tcp: F64, opening_m: F64) -> Bools:
+            return free_grasps(
+                hand, np.matmul(T_world_target, T_object_tcp), opening_m, around, _NOTHING, params
+            )
+
+        kept = _kept(hand, grasps, target, params, is_free, max_grasps)
+        if kept.n_free == 0 and further is not None:
+            kept = _kept(hand, further(is_free), target, params, is_free, max_grasps)
+    opening_m = kept.grasps.opening_m[kept.row].astype(np.float64)
+    T_world_tcp = np.matmul(T_world_target, kept.T_object_tcp)
     objects = joined([placed_target, *others])
-    return HandScene(static, floor, objects, len(placed_target), n_free, grasp, T, opening_m)
+    return HandScene(
+        static,
+        floor,
+        objects,
+        len(placed_target),
+        kept.grasps,
+        kept.n_free,
+        kept.row,
+        T_world_tcp,
+        opening_m,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    grasps: GraspSet
+    n_free: int
+    row: Ints  # (K,) of the set
+    T_object_tcp: F64  # (K, 4, 4)
+
+
+def _kept(
+    hand: Hand,
+    grasps: GraspSet,
+    target: ObjectModel,
+    params: MotionParams,
+    is_free: Callable[[F64, F64], Bools],
+    max_grasps: int,
+) -> _Kept:
+    row, T_object_tcp = grasps_free_of_target(hand, grasps, target, params)
+    free = is_free(T_object_tcp, grasps.opening_m[row].astype(np.float64))
+    rows = np.unique(row[free])
+    free &= np.isin(row, rows[:max_grasps])
+    return _Kept(grasps, len(rows), row[free], T_object_tcp[free])
 
 
 def grasps_free_of_target(
