@@ -19,7 +19,7 @@ from datagen.schemas.specification import GraspParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps import grasp_cache
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import content_digest, grasps_of, scored_grasps
+from datagen.workers.grasps.grasp_cache import content_digest, further_grasps, grasps_of, scored_grasps
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
 from datagen.workers.grasps.search import BLOCK, TABLE_GAP_M
 from datagen.workers.objects.model import ObjectModel
@@ -79,6 +79,24 @@ def test_any_first_few_grasps_are_spread_over_the_object() -> None:
     for n in (8, 16, 32, 64):
         assert np.ptp(scored.T_object_tcp[:n, 2, 3]) > 0.25
         assert 0.7 <= scored.is_clear[:n].mean() <= 0.8
+
+
+def test_further_grasps_are_free_ones_beyond_the_set() -> None:
+    model, params = ORDER[0], GraspParams(per_object=BLOCK)
+    asked: list[F64] = []
+
+    def from_above(T: F64, opening_m: F64) -> np.ndarray:
+        asked.append(T)
+        return T[:, 2, 2] < -0.9
+
+    first = scored_grasps(model, GRIPPER, BLOCK).T_object_tcp
+    found = further_grasps(model, GRIPPER, params, from_above)
+    assert 0 < len(found) <= BLOCK
+    assert (found.T_object_tcp[:, 2, 2] < -0.9).all() and (found.score >= params.min_score).all()
+    assert (np.abs(found.T_object_tcp[:, None] - first).max(axis=(2, 3)) > 0).all()
+    assert (np.abs(asked[0][:, None] - first).max(axis=(2, 3)) > 0).all()
+    assert same(found, further_grasps(model, GRIPPER, params, from_above))
+    assert len(further_grasps(model, GRIPPER, params, lambda T, _: np.zeros(len(T), bool))) == 0
 
 
 def test_another_draw_gives_other_grasps() -> None:
