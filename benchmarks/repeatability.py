@@ -135,7 +135,7 @@ def label_scene(
         start_s = time.process_time()
         if key not in arms:
             arms[key] = arm_in_scene(scene, candidates, row, labelling.spec, StageClock(), labelling.draw)
-            _ = arms[key].planning
+            _ = arms[key].planning  # timed as preparation
         labelling.prepare_s += time.process_time() - start_s
         start_s = time.process_time()
         trial = try_candidate(arms[key], candidates, row, labelling.spec)

@@ -130,7 +130,7 @@ class CandidateParams(_Frozen):
 class GraspParams(_Frozen):
     """Grasps of the target: the number to search, and the number to keep per scene."""
 
-    per_object: int = Field(default=300, ge=1, le=10_000)
+    per_object: int = Field(default=1000, ge=1, le=10_000)
     per_scene: int = Field(default=1000, ge=1, le=10_000)
     # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
@@ -147,7 +147,7 @@ class MotionParams(_Frozen):
     # Spacing of the configurations at which a path is checked for collisions.
     check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
     # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
-    max_grasps_tried: int = Field(default=24, ge=1, le=10_000)
+    max_grasps_tried: int = Field(default=400, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)

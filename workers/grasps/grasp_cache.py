@@ -39,6 +39,8 @@ _POSES = CacheFolder(
     most_bytes=20_000_000,
 )
 _SCORES = CacheFolder("grasps", {"score": (np.float32, ("n",))}, most_files=65_536, most_bytes=10_000)
+# Grasps of an object that are scored before any arm asks for one.
+SCORED_FIRST = 128
 # Searches of one object, one after the other until there are poses enough.
 _MOST_SEARCHES = 16
 _FURTHER_SEARCHES = 2  # of an object, for a scene in which all grasps of the set are taken
@@ -76,20 +78,46 @@ _kept: OrderedDict[str, _Known] = OrderedDict()
 
 
 def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0) -> GraspSet:
-    """The grasps worth offering to an arm: of the first `per_object` those with `min_score`, best first.
+    """The grasps worth offering to an arm: of the first `per_object` those with `min_score`.
+
+    The first `SCORED_FIRST` are scored now, and the good ones of them come best first. The others follow in
+    the object's order, and are scored when an arm has a plan to one: most scenes need none of them.
 
     A pure function of the object's collision parts and mass, the gripper and the parameters: equal
     content gives equal bits in every process and order. None where the object cannot be grasped. `draw` is
     another draw of all that is random.
     """
     digest = content_digest(model, gripper, draw)
-    sets, key = _known(digest).sets, (params.per_object, params.min_score)
-    if key not in sets:
-        scored = scored_grasps(model, gripper, params.per_object, draw)
-        order = np.argsort(-scored.score, kind="stable")
-        rows = order[scored.score[order] >= params.min_score]
-        sets[key] = GraspSet(scored.T_object_tcp[rows], scored.opening_m[rows], scored.score[rows])
-    return sets[key]
+    known, key = _known(digest), (params.per_object, params.min_score)
+    if key in known.sets:
+        return known.sets[key]
+    first = scored_grasps(model, gripper, min(params.per_object, SCORED_FIRST), draw)
+    order = np.argsort(-first.score, kind="stable")
+    rows = order[first.score[order] >= params.min_score]
+    T, openings = [first.T_object_tcp[rows]], [first.opening_m[rows]]
+    later: list[tuple[int, int]] = []  # search and row of each
+    left = params.per_object if len(rows) else 0
+    skip = len(first)
+    for search in range(_MOST_SEARCHES if left else 0):
+        poses = _poses(known, digest, model, gripper, search)
+        some = min(left, len(poses))
+        begin = min(skip, some)
+        T.append(poses.T_object_tcp[begin:some])
+        openings.append(poses.opening_m[begin:some].astype(np.float32))
+        later += [(search, row) for row in range(begin, some)]
+        left, skip = left - some, skip - begin
+        if left == 0 or len(poses) == 0:
+            break
+
+    def later_score(k: int) -> float:
+        search, row = later[k]
+        return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
+
+    found = GraspSet(
+        np.concatenate(T), np.concatenate(openings), first.score[rows], params.min_score, later_score
+    )
+    known.sets[key] = found
+    return found
 
 
 def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -> ScoredGrasps:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -24,8 +25,8 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where none is straight
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
-_FIRST_BATCH = 4  # grasps checked together; each batch has as many as all before, and these
-_SORTED_AT_ONCE = 24
+_FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
+_FIRST_PORTION = 24  # grasps sorted by distance together; each portion has as many as all before, and these
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -33,24 +34,40 @@ _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take 
 class _Search:
     """What the grasps of one candidate share."""
 
-    at: Surroundings
+    scene: PlanningScene
+    T_world_base: F64
     T_base_world: F64
-    rows: Ints  # of the kept grasps, in the order in which they are tried
-    T_base_tcp: F64  # (G, 4, 4), at the grasps of `rows`
-    seeds_rad: F64  # (G, S, A)
     far: list[_Reachable] = field(default_factory=list)  # to which no straight path leads
     furthest: str = "no_ik"
+
+    @cached_property
+    def at(self) -> Surroundings:
+        return surroundings(self.scene, self.T_world_base)
 
     def reached(self, stage: str) -> None:
         """Note how far a try came."""
         self.furthest = max(self.furthest, stage, key=STAGES.index)
+
+    def holds(self, k: int) -> bool:
+        """Whether the hand holds the object in kept grasp `k`; physics where no arm has asked before."""
+        around = self.scene.around
+        return around.grasps.holds(int(around.grasp[k]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Goal:
+    """A kept grasp, seen from the base."""
+
+    k: int
+    T_base_tcp: F64  # (4, 4)
+    seeds_rad: F64  # (S, A)
 
 
 @dataclass(frozen=True, eq=False)
 class _Way:
     """Joints at a grasp and at its pregrasp."""
 
-    g: int  # row of the search
+    goal: _Goal
     q_grasp: F64  # (A,)
     q_pregrasp: F64  # (A,)
 
@@ -73,29 +90,43 @@ def plan_candidate(
     `skip` are rows of the GraspSet. Depends on the arguments alone: neither on candidates before nor on
     time. `rng` is drawn from only where no grasp has a straight path.
     """
-    around, params = prepared.around, prepared.params
+    around = prepared.around
     rows = np.flatnonzero(~np.isin(around.grasp, sorted(skip)))
     if len(rows) == 0:
         return PlanReport("no_grasp", None, around.grasps_free, 0)
-    T_base_world = inverse(T_world_base)
-    T_base_tcp = np.matmul(T_base_world, around.T_world_tcp[rows])
-    within = _is_within_reach(prepared, T_base_world, T_base_tcp)
-    rows, T_base_tcp = rows[within], T_base_tcp[within]
-    distance, seeds = prepared.moving.table.nearest(T_base_tcp, params.ik_seeds)
-    order = _order(distance, params.max_grasps_tried)
-    if len(order) == 0:
-        return PlanReport("no_ik", None, around.grasps_free, 0)
-    at = surroundings(prepared, T_world_base)
-    search = _Search(at, T_base_world, rows[order], T_base_tcp[order], seeds[order])
-    plan, end = None, 0
-    while plan is None and end < len(order) and search.furthest != "no_start":
-        start, end = end, min(len(order), 2 * end + _FIRST_BATCH)
-        plan = _try_grasps(search, range(start, end))
-    tried = len(set(around.grasp[search.rows[:end]].tolist()))
+    search = _Search(prepared, T_world_base, inverse(T_world_base))
+    plan, tried = None, set[int]()
+    for goals in _goals(prepared, search.T_base_world, rows):
+        tried.update(int(around.grasp[goal.k]) for goal in goals)
+        plan = _try_goals(search, goals)
+        if plan is not None or search.furthest == "no_start":
+            break
     if plan is None and search.furthest != "no_start":
         plan = _search_paths(search, rng)
     outcome = search.furthest if plan is None else "success"
-    return PlanReport(outcome, plan, around.grasps_free, tried)
+    return PlanReport(outcome, plan, around.grasps_free, len(tried))
+
+
+def _goals(prepared: PlanningScene, T_base_world: F64, rows: Ints) -> Iterator[list[_Goal]]:
+    """At most `max_grasps_tried` of the kept grasps `rows` that have seeds near by, in growing batches.
+
+    They come in their own order, best first and such that neighbours differ much; of each portion of them
+    those nearest to a seed come first.
+    """
+    params = prepared.params
+    T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
+    within = _is_within_reach(prepared, T_base_world, T_base_tcp)
+    rows, T_base_tcp = rows[within], T_base_tcp[within]
+    left, end, batch = params.max_grasps_tried, 0, _FIRST_BATCH
+    while left > 0 and end < len(rows):
+        start, end = end, min(len(rows), 2 * end + _FIRST_PORTION)
+        distance, seeds = prepared.moving.table.nearest(T_base_tcp[start:end], params.ik_seeds)
+        order = np.argsort(distance, kind="stable")[: min(left, int(np.isfinite(distance).sum()))]
+        left -= len(order)
+        goals = [_Goal(int(rows[start + g]), T_base_tcp[start + g], seeds[g]) for g in order.tolist()]
+        while goals:
+            yield goals[:batch]
+            goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
@@ -107,25 +138,16 @@ def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64
     return farthest_m <= robot.reach_m
 
 
-def _order(distance: F64, count: int) -> Ints:
-    """The first `count` rows that have seeds near by, the nearest first among a few neighbours.
-
-    Rows come best first and differ much, while those nearest to a seed resemble each other.
-    """
-    rows = np.flatnonzero(np.isfinite(distance))[:count]
-    return rows[np.lexsort((distance[rows], np.arange(len(rows)) // _SORTED_AT_ONCE))]
-
-
-def _try_grasps(search: _Search, grasps: range) -> MotionPlan | None:
+def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
     """Look for a plan to some grasps: collisions are checked together, all else one by one."""
-    at, scene = search.at, search.at.scene
-    ways = [way for g in grasps for way in _ways(search, g)]
+    ways = [way for goal in goals for way in _ways(search.scene, goal)]
     if not ways:
         return None
     search.reached("arm_collision")
+    at = search.at
     if at.is_base_stuck:
         return None
-    openings_m = scene.around.opening_m[search.rows[[way.g for way in ways]]]
+    openings_m = search.scene.around.opening_m[[way.goal.k for way in ways]]
     free = np.flatnonzero(~at.blocked(np.array([way.q_pregrasp for way in ways]), openings_m))
     free = free[~at.blocked(np.array([ways[k].q_grasp for k in free]), None)] if len(free) else free
     for k in free.tolist():
@@ -138,27 +160,26 @@ def _try_grasps(search: _Search, grasps: range) -> MotionPlan | None:
     return None
 
 
-def _ways(search: _Search, g: int) -> list[_Way]:
+def _ways(scene: PlanningScene, goal: _Goal) -> list[_Way]:
     """Joints at a grasp and its pregrasp, at most one for each seed."""
-    robot, params = search.at.scene.robot, search.at.scene.params
-    T_grasp = search.T_base_tcp[g]
-    T_pregrasp = backed(T_grasp, params.pregrasp_m)
+    robot = scene.robot
+    T_pregrasp = backed(goal.T_base_tcp, scene.params.pregrasp_m)
     ways: list[_Way] = []
-    for seed in search.seeds_rad[g]:
-        q_grasp = robot.ik(T_grasp, seed)
+    for seed in goal.seeds_rad:
+        q_grasp = robot.ik(goal.T_base_tcp, seed)
         if q_grasp is None or any(np.abs(q_grasp - way.q_grasp).max() < _SAME_RAD for way in ways):
             continue
         q_pregrasp = robot.ik(T_pregrasp, q_grasp)
         if q_pregrasp is not None:
-            ways.append(_Way(g, q_grasp, q_pregrasp))
+            ways.append(_Way(goal, q_grasp, q_pregrasp))
     return ways
 
 
 def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     """On from joints that are free at a grasp and its pregrasp: both lines and a straight path."""
-    at, scene = search.at, search.at.scene
+    at, scene = search.at, search.scene
     params, robot = scene.params, scene.robot
-    k, T_base_tcp = int(search.rows[way.g]), search.T_base_tcp[way.g]
+    k, T_base_tcp = way.goal.k, way.goal.T_base_tcp
     T_up = np.stack(
         [
             search.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
@@ -185,6 +206,8 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     step_rad, first_blocked = params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
     for home in found.homes[:_STARTS].tolist():
         if is_line_free(robot.homes_rad[home], way.q_pregrasp, first_blocked, step_rad):
+            if not search.holds(k):
+                return None
             path = straight(robot.homes_rad[home], way.q_pregrasp, step_rad)
             return _plan(search, found, home, path)
     search.far.append(found)
@@ -193,7 +216,7 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
 
 def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | None:
     """RRT-Connect to the first grasps that no straight path leads to; they share the iterations evenly."""
-    scene = search.at.scene
+    scene = search.scene
     robot, params = scene.robot, scene.params
     left, far = params.path_iterations, search.far[:_SEARCHES]
     for rank, found in enumerate(far):
@@ -210,7 +233,7 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
             rng,
         )
         left -= used
-        if corners is not None:
+        if corners is not None and search.holds(found.k):
             path = dense(corners, params.check_step_rad)
             path = shortened(path, first_blocked, params.check_step_rad, _SHORTCUTS, rng)
             return _plan(search, found, home, path)
@@ -218,7 +241,7 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
 
 
 def _plan(search: _Search, found: _Reachable, home: int, q_reach: F64) -> MotionPlan:
-    scene = search.at.scene
+    scene = search.scene
     opening_m = float(scene.around.opening_m[found.k])
     ways = (q_reach, found.q_approach_rad)
     length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in ways)

@@ -13,8 +13,8 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.forward_kinematics import ForwardKinematics
 from datagen.workers.robots.robot import Robot
 
-_SAMPLES = 16384
-_PROBES = 1024
+_SAMPLES = 65536
+_PROBES = 2048
 # Poses further from all samples than this share of reachable ones are not asked for.
 _QUANTILE = 0.97
 _LENGTHS_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions, in arm lengths
