@@ -128,10 +128,11 @@ class CandidateParams(_Frozen):
 
 
 class GraspParams(_Frozen):
-    """Grasps of the target: the number to search, and the number to keep per scene."""
+    """Grasps of the target: the number to search, and the number to look at for all candidates of a scene."""
 
-    per_object: int = Field(default=1000, ge=1, le=10_000)
-    per_scene: int = Field(default=1000, ge=1, le=10_000)
+    per_object: int = Field(default=4000, ge=1, le=10_000)
+    # The others are looked at for candidates to which none of these leads.
+    per_scene: int = Field(default=400, ge=1, le=10_000)
     # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
 
@@ -139,7 +140,7 @@ class GraspParams(_Frozen):
 class MotionParams(_Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
-    ik_seeds: int = Field(default=3, ge=1, le=100)
+    ik_seeds: int = Field(default=2, ge=1, le=100)
     pregrasp_m: float = Field(default=0.08, ge=0, le=0.5)
     lift_m: float = Field(default=0.10, ge=0.01, le=0.5)
     # Largest joint motion between neighbouring points of a straight line.
@@ -147,7 +148,7 @@ class MotionParams(_Frozen):
     # Spacing of the configurations at which a path is checked for collisions.
     check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
     # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
-    max_grasps_tried: int = Field(default=400, ge=1, le=10_000)
+    max_grasps_tried: int = Field(default=150, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -22,7 +21,6 @@ from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper, Parts
 
 Bools = npt.NDArray[np.bool_]
-IsFree = Callable[[F64, F64], Bools]  # of poses (N, 4, 4) in the object's frame and openings (N,)
 
 _NO_SCORE = np.zeros(0, np.float32)
 _KEPT_IN_MEMORY = 128
@@ -43,7 +41,6 @@ _SCORES = CacheFolder("grasps", {"score": (np.float32, ("n",))}, most_files=65_5
 SCORED_FIRST = 128
 # Searches of one object, one after the other until there are poses enough.
 _MOST_SEARCHES = 16
-_FURTHER_SEARCHES = 2  # of an object, for a scene in which all grasps of the set are taken
 # What moves a bit of the result beside our own code.
 _ENGINES = ("sapien", "coal", "scipy", "numpy")
 
@@ -154,35 +151,6 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -
         int(first.is_clear.sum()),
         reason,
     )
-
-
-def further_grasps(
-    model: ObjectModel, gripper: Gripper, params: GraspParams, is_free: IsFree, draw: int = 0
-) -> GraspSet:
-    """Good grasps beyond the first `per_object`, among the poses that `is_free` says are free in a scene.
-
-    Of each of `_FURTHER_SEARCHES` searches the first `BLOCK` free poses are tried. Their scores are not kept,
-    because they depend on the scene's choice.
-    """
-    digest = content_digest(model, gripper, draw)
-    known = _known(digest)
-    left = params.per_object
-    for search in range(_FURTHER_SEARCHES):
-        poses = _poses(known, digest, model, gripper, search)
-        some = min(left, len(poses))
-        left -= some
-        rows = np.arange(some, len(poses))
-        rows = rows[is_free(poses.T_object_tcp[rows], poses.opening_m[rows])][:BLOCK]
-        if len(rows) == 0:
-            continue
-        chosen = HandPoses(poses.T_object_tcp[rows], poses.opening_m[rows], poses.is_clear[rows], 0, "")
-        score = score_block(model, gripper, chosen, 0, _generator([digest, search, rows.tolist()]))
-        best = np.argsort(-score, kind="stable")
-        best = best[score[best] >= params.min_score]
-        if len(best):
-            T, opening_m = chosen.T_object_tcp[best], chosen.opening_m[best].astype(np.float32)
-            return GraspSet(T, opening_m, score[best])
-    return GraspSet(np.zeros((0, 4, 4)), _NO_SCORE, _NO_SCORE)
 
 
 def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:

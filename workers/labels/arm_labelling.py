@@ -22,7 +22,7 @@ from datagen.workers.bases.clearance import base_clearance_m
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse, translation, yaw_pose
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import IsFree, further_grasps, grasps_of
+from datagen.workers.grasps.grasp_cache import grasps_of
 from datagen.workers.motion.collision import Bools
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
@@ -73,12 +73,7 @@ class ArmInScene:
                 self.arm.grasps.per_scene,
                 self.base_radius_m,
                 self.draw,
-                self._further,
             )
-
-    def _further(self, is_free: IsFree) -> GraspSet:
-        """Grasps for this scene alone, where the hand can take none of the object's."""
-        return further_grasps(self.scene.models[0], self.robot.gripper, self.arm.grasps, is_free, self.draw)
 
     @cached_property
     def trials(self) -> TrialScene:

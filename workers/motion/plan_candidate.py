@@ -26,7 +26,8 @@ _SEARCHES = 4  # grasps for which a path is searched where none is straight
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
 _FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
-_FIRST_PORTION = 24  # grasps sorted by distance together; each portion has as many as all before, and these
+# Poses sorted by distance together; each portion has as many as all before, and these.
+_FIRST_PORTION, _PORTION_OF_REST = 24, 1000
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -50,8 +51,7 @@ class _Search:
 
     def holds(self, k: int) -> bool:
         """Whether the hand holds the object in kept grasp `k`; physics where no arm has asked before."""
-        around = self.scene.around
-        return around.grasps.holds(int(around.grasp[k]))
+        return self.scene.around.holds(int(self.scene.around.grasp[k]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +91,12 @@ def plan_candidate(
     time. `rng` is drawn from only where no grasp has a straight path.
     """
     around = prepared.around
-    rows = np.flatnonzero(~np.isin(around.grasp, sorted(skip)))
-    if len(rows) == 0:
+    kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
+    if around.grasps_free == 0 or len(kept) + len(rest) == 0:
         return PlanReport("no_grasp", None, around.grasps_free, 0)
     search = _Search(prepared, T_world_base, inverse(T_world_base))
     plan, tried = None, set[int]()
-    for goals in _goals(prepared, search.T_base_world, rows):
+    for goals in _goals(prepared, search.T_base_world, kept, rest):
         tried.update(int(around.grasp[goal.k]) for goal in goals)
         plan = _try_goals(search, goals)
         if plan is not None or search.furthest == "no_start":
@@ -107,26 +107,35 @@ def plan_candidate(
     return PlanReport(outcome, plan, around.grasps_free, len(tried))
 
 
-def _goals(prepared: PlanningScene, T_base_world: F64, rows: Ints) -> Iterator[list[_Goal]]:
-    """At most `max_grasps_tried` of the kept grasps `rows` that have seeds near by, in growing batches.
+def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -> Iterator[list[_Goal]]:
+    """At most `max_grasps_tried` of the free poses `kept` and `rest` with seeds near by, in growing batches.
 
     They come in their own order, best first and such that neighbours differ much; of each portion of them
     those nearest to a seed come first.
     """
-    params = prepared.params
-    T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
-    within = _is_within_reach(prepared, T_base_world, T_base_tcp)
-    rows, T_base_tcp = rows[within], T_base_tcp[within]
-    left, end, batch = params.max_grasps_tried, 0, _FIRST_BATCH
-    while left > 0 and end < len(rows):
-        start, end = end, min(len(rows), 2 * end + _FIRST_PORTION)
-        distance, seeds = prepared.moving.table.nearest(T_base_tcp[start:end], params.ik_seeds)
-        order = np.argsort(distance, kind="stable")[: min(left, int(np.isfinite(distance).sum()))]
-        left -= len(order)
-        goals = [_Goal(int(rows[start + g]), T_base_tcp[start + g], seeds[g]) for g in order.tolist()]
-        while goals:
-            yield goals[:batch]
-            goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
+    left, batch = prepared.params.max_grasps_tried, _FIRST_BATCH
+    for rows, portion in ((kept, _FIRST_PORTION), (rest, _PORTION_OF_REST)):
+        if left == 0:
+            return
+        T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
+        within = _is_within_reach(prepared, T_base_world, T_base_tcp)
+        rows, T_base_tcp = rows[within], T_base_tcp[within]
+        end = 0
+        while left > 0 and end < len(rows):
+            start, end = end, min(len(rows), 2 * end + portion)
+            goals = _with_seeds(prepared, rows[start:end], T_base_tcp[start:end], left)
+            left -= len(goals)
+            while goals:
+                yield goals[:batch]
+                goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
+
+
+def _with_seeds(prepared: PlanningScene, rows: Ints, T_base_tcp: F64, count: int) -> list[_Goal]:
+    """The free poses among `rows` that have seeds near by, nearest first, at most `count`."""
+    distance, seeds = prepared.moving.table.nearest(T_base_tcp, prepared.params.ik_seeds)
+    near = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
+    near = near[prepared.around.is_free(rows[near])][:count]
+    return [_Goal(int(rows[g]), T_base_tcp[g], seeds[g]) for g in near.tolist()]
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:

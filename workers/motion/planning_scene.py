@@ -49,10 +49,6 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _NOTHING = place([])
 
 
-# From what poses (N, 4, 4) and openings (N,) are free in a scene to grasps that are.
-Further = Callable[[Callable[[F64, F64], Bools]], GraspSet]
-
-
 @dataclass(frozen=True, eq=False)
 class Moving:
     """A robot's shape for planning, built once a robot.
@@ -69,22 +65,41 @@ class Moving:
     table: ReachTable
 
 
+class FreePoses:
+    """Which of N poses are free; each is looked at when it is first asked for."""
+
+    def __init__(self, count: int, look: Callable[[Ints], Bools]) -> None:
+        self._state = np.zeros(count, np.int8)  # 1 free, -1 not, 0 not known
+        self._look = look
+
+    def __call__(self, rows: Ints) -> Bools:
+        """Whether the poses of some rows are free."""
+        new = rows[self._state[rows] == 0]
+        if len(new):
+            self._state[new] = np.where(self._look(new), 1, -1)
+        return self._state[rows] == 1
+
+
 @dataclass(frozen=True, eq=False)
 class HandScene:
     """A scene and a hand: what stands around, and the target's grasps that the hand alone can take.
 
-    It depends on no arm, so that all robots with one hand share it.
+    It depends on no arm, so that all robots with one hand share it. The K poses are those of the GraspSet,
+    each as it is and turned by half a turn about its approach.
     """
 
     static: Placed  # convex parts of the house around
     floor: Bools  # of the static parts, which are low enough to stand on
     objects: Placed  # the target's parts, then those of the other objects
     target_parts: int
-    grasps: GraspSet  # the object's, or where the hand can take none of these, those searched for this scene
-    grasps_free: int  # of the whole GraspSet
-    grasp: Ints  # (K,), row of the GraspSet; best first, and both turns of the hand where they are free
+    grasp: Ints  # (K,), row of the GraspSet
     T_world_tcp: F64  # (K, 4, 4)
     opening_m: F64  # (K,)
+    is_free: FreePoses
+    kept: Ints  # rows of the poses that are free among the grasps that are looked at in every scene
+    rest: Ints  # rows of the poses of all other grasps, which may be free
+    grasps_free: int  # grasps of `kept`
+    holds: Callable[[int], bool]  # whether a row of the GraspSet holds the object
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +123,16 @@ def prepare(
     robot: Robot,
     grasps: GraspSet,
     params: MotionParams,
-    max_grasps: int,
+    per_scene: int,
     base_radius_m: float,
     draw: int = 0,
-    further: Further | None = None,
 ) -> PlanningScene:
-    """A robot among the scene's parts, with the best `max_grasps` grasps that its hand can take there.
+    """A robot among the scene's parts, with the grasps that its hand can take there.
 
-    `base_radius_m` is the radius of the pedestal of a robot that has no base of its own. `further` searches
-    grasps among free poses, and is asked where the hand can take none of `grasps`.
+    The hand's way is looked at for the first `per_scene` grasps, and for others when a candidate needs them.
+    `base_radius_m` is the radius of the pedestal of a robot that has no base of its own.
     """
-    around = _hand_scene(scene, robot, grasps, params, max_grasps, further)
+    around = _hand_scene(scene, robot, grasps, params, per_scene)
     pedestal_m = _pedestal_m(robot, base_radius_m) if robot.base_radius_m is None else None
     return PlanningScene(robot, params, moving_of(robot, draw), around, pedestal_m)
 
@@ -129,118 +143,97 @@ _hand_scenes: WeakKeyDictionary[SettledScene, dict[_HandSceneKey, HandScene]] = 
 
 
 def _hand_scene(
-    scene: SettledScene,
-    robot: Robot,
-    grasps: GraspSet,
-    params: MotionParams,
-    max_grasps: int,
-    further: Further | None,
+    scene: SettledScene, robot: Robot, grasps: GraspSet, params: MotionParams, per_scene: int
 ) -> HandScene:
     around_m = max(_AROUND_M, 2 * (robot.reach_m + ROOM_AROUND_M))
     known = _hand_scenes.setdefault(scene, {})
-    key = (robot.gripper.digest, grasps, params, max_grasps, around_m)
+    key = (robot.gripper.digest, grasps, params, per_scene, around_m)
     if key not in known:
-        hand = hand_of(robot.gripper)
-        known[key] = hand_scene(scene, hand, grasps, params, max_grasps, around_m, further)
+        known[key] = hand_scene(scene, hand_of(robot.gripper), grasps, params, per_scene, around_m)
     return known[key]
 
 
 def hand_scene(
-    scene: SettledScene,
-    hand: Hand,
-    grasps: GraspSet,
-    params: MotionParams,
-    max_grasps: int,
-    around_m: float,
-    further: Further | None = None,
+    scene: SettledScene, hand: Hand, grasps: GraspSet, params: MotionParams, per_scene: int, around_m: float
 ) -> HandScene:
-    """Place the scene's parts up to `around_m` from the target, and keep what grasps the hand can take."""
+    """Place the scene's parts up to `around_m` from the target, and look at the first `per_scene` grasps.
+
+    Where none of them is free, all are looked at.
+    """
     target, T_world_target = scene.models[0], scene.T_world_object[0]
     static, floor = _static_around(scene, around_m)
     placed_target = place_object(target, T_world_target)
     others = [place_object(m, T) for m, T in zip(scene.models[1:], scene.T_world_object[1:], strict=True)]
     # The hand is never farther from the target than this: the other parts need not be looked at.
-    center = scene.target_center_m
-    room_m = _HAND_ROOM_M + max(params.pregrasp_m, params.lift_m)
-    near = static.within(center - room_m, center + room_m)
-    around = joined([static.rows(near), *others])
+    center, room_m = scene.target_center_m, _HAND_ROOM_M + max(params.pregrasp_m, params.lift_m)
+    near = static.rows(static.within(center - room_m, center + room_m))
+    around = joined([near, *others])
     hulls = object_hulls(target)
     # A target within another thing can be held by nothing, whatever the hand alone may do there.
     is_sunk = (
         bool(hits(hulls, T_world_target[None, None], joined(others), -_SUNK_M).any()) if others else False
     )
-    kept = _Kept(grasps, 0, np.zeros(0, np.int64), np.zeros((0, 4, 4)))
-    if len(grasps) and not is_sunk and can_be_lifted(hulls, T_world_target, static.rows(near), params.lift_m):
+    turned = _turned_grasps(hand, grasps, target, params)
+    T_world_tcp = np.matmul(T_world_target, turned.T_object_tcp)
 
-        def is_free(T_object_tcp: F64, opening_m: F64) -> Bools:
-            return free_grasps(
-                hand, np.matmul(T_world_target, T_object_tcp), opening_m, around, _NOTHING, params
-            )
+    def look(rows: Ints) -> Bools:
+        free = turned.is_free(rows)
+        some = rows[free]
+        free[free] = free_grasps(hand, T_world_tcp[some], turned.opening_m[some], around, _NOTHING, params)
+        return free
 
-        kept = _kept(hand, grasps, target, params, is_free, max_grasps)
-        if kept.n_free == 0 and further is not None:
-            kept = _kept(hand, further(is_free), target, params, is_free, max_grasps)
-    opening_m = kept.grasps.opening_m[kept.row].astype(np.float64)
-    T_world_tcp = np.matmul(T_world_target, kept.T_object_tcp)
-    objects = joined([placed_target, *others])
+    is_free = FreePoses(len(T_world_tcp), look)
+    every = np.arange(len(T_world_tcp))
+    if is_sunk or not can_be_lifted(hulls, T_world_target, near, params.lift_m):
+        every = every[:0]
+    first, rest = every[: 2 * per_scene], every[2 * per_scene :]
+    kept = first[is_free(first)]
+    if len(kept) == 0:
+        kept, rest = rest[is_free(rest)], rest[:0]
     return HandScene(
         static,
         floor,
-        objects,
+        joined([placed_target, *others]),
         len(placed_target),
-        kept.grasps,
-        kept.n_free,
-        kept.row,
+        turned.grasp,
         T_world_tcp,
-        opening_m,
+        turned.opening_m,
+        is_free,
+        kept,
+        rest,
+        len(np.unique(turned.grasp[kept])),
+        grasps.holds,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    grasps: GraspSet
-    n_free: int
-    row: Ints  # (K,) of the set
+class _TurnedGrasps:
+    """Poses of a GraspSet, each as it is and turned by half a turn; free where the hand clears the target."""
+
+    grasp: Ints  # (K,)
     T_object_tcp: F64  # (K, 4, 4)
+    opening_m: F64  # (K,)
+    is_free: FreePoses
 
 
-def _kept(
-    hand: Hand,
-    grasps: GraspSet,
-    target: ObjectModel,
-    params: MotionParams,
-    is_free: Callable[[F64, F64], Bools],
-    max_grasps: int,
-) -> _Kept:
-    row, T_object_tcp = grasps_free_of_target(hand, grasps, target, params)
-    free = is_free(T_object_tcp, grasps.opening_m[row].astype(np.float64))
-    rows = np.unique(row[free])
-    free &= np.isin(row, rows[:max_grasps])
-    return _Kept(grasps, len(rows), row[free], T_object_tcp[free])
+_turned: WeakKeyDictionary[GraspSet, dict[tuple[str, MotionParams], _TurnedGrasps]] = WeakKeyDictionary()
 
 
-def grasps_free_of_target(
-    hand: Hand, grasps: GraspSet, target: ObjectModel, params: MotionParams
-) -> tuple[Ints, F64]:
-    """Rows (K,) of the grasps, best first, in which the hand keeps clear of the target, and poses (K, 4, 4).
-
-    Each pose comes as it is and turned by half a turn about its approach. No scene changes them.
-    """
-    known = _free_of_target.setdefault(grasps, {})
-    key = (hand.digest, params)
+def _turned_grasps(hand: Hand, grasps: GraspSet, target: ObjectModel, params: MotionParams) -> _TurnedGrasps:
+    """Built once an object: no scene changes them."""
+    known, key = _turned.setdefault(grasps, {}), (hand.digest, params)
     if key not in known:
-        row = np.repeat(np.arange(len(grasps)), 2)
+        grasp = np.repeat(np.arange(len(grasps)), 2)
         T = np.repeat(grasps.T_object_tcp, 2, axis=0)
         T[1::2] = T[1::2] @ _HALF_TURN
-        opening_m = grasps.opening_m[row].astype(np.float64)
-        free = free_grasps(hand, T, opening_m, _NOTHING, place_object(target, np.eye(4)), params)
-        known[key] = (row[free], T[free])
+        opening_m = grasps.opening_m[grasp].astype(np.float64)
+        placed = place_object(target, np.eye(4))
+
+        def look(rows: Ints) -> Bools:
+            return free_grasps(hand, T[rows], opening_m[rows], _NOTHING, placed, params)
+
+        known[key] = _TurnedGrasps(grasp, T, opening_m, FreePoses(len(T), look))
     return known[key]
-
-
-_free_of_target: WeakKeyDictionary[GraspSet, dict[tuple[str, MotionParams], tuple[Ints, F64]]] = (
-    WeakKeyDictionary()
-)
 
 
 def moving_of(robot: Robot, draw: int = 0) -> Moving:
