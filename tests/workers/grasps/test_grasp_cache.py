@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from datagen.schemas.specification import GraspParams
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps import grasp_cache
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.grasp_cache import content_digest, further_grasps, grasps_of, scored_grasps
+from datagen.workers.grasps.grasp_cache import SCORED_FIRST, content_digest, grasps_of, scored_grasps
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
 from datagen.workers.grasps.search import BLOCK, TABLE_GAP_M
 from datagen.workers.objects.model import ObjectModel
@@ -81,22 +82,23 @@ def test_any_first_few_grasps_are_spread_over_the_object() -> None:
         assert 0.7 <= scored.is_clear[:n].mean() <= 0.8
 
 
-def test_further_grasps_are_free_ones_beyond_the_set() -> None:
-    model, params = ORDER[0], GraspParams(per_object=BLOCK)
-    asked: list[F64] = []
+def test_later_grasps_are_scored_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, n = ORDER[0], SCORED_FIRST + 2 * BLOCK
+    grasps = grasps_of(model, GRIPPER, GraspParams(per_object=n))
+    known = len(grasps.score)
+    assert known <= SCORED_FIRST and len(grasps) == known + 2 * BLOCK
+    scored: list[int] = []
+    real = grasp_cache.score_block
 
-    def from_above(T: F64, opening_m: F64) -> np.ndarray:
-        asked.append(T)
-        return T[:, 2, 2] < -0.9
+    def counted(*arguments: Any) -> Any:
+        scored.append(arguments[3])
+        return real(*arguments)
 
-    first = scored_grasps(model, GRIPPER, BLOCK).T_object_tcp
-    found = further_grasps(model, GRIPPER, params, from_above)
-    assert 0 < len(found) <= BLOCK
-    assert (found.T_object_tcp[:, 2, 2] < -0.9).all() and (found.score >= params.min_score).all()
-    assert (np.abs(found.T_object_tcp[:, None] - first).max(axis=(2, 3)) > 0).all()
-    assert (np.abs(asked[0][:, None] - first).max(axis=(2, 3)) > 0).all()
-    assert same(found, further_grasps(model, GRIPPER, params, from_above))
-    assert len(further_grasps(model, GRIPPER, params, lambda T, _: np.zeros(len(T), bool))) == 0
+    monkeypatch.setattr(grasp_cache, "score_block", counted)
+    asked = [grasps.score_of(row) for row in (known + BLOCK, known + BLOCK + 5)]
+    assert scored == [SCORED_FIRST // BLOCK + 1]
+    np.testing.assert_array_equal(asked, scored_grasps(model, GRIPPER, n).score[-BLOCK:][[0, 5]])
+    assert [grasps.holds(row) for row in (0, known + BLOCK)] == [True, asked[0] >= 0.5]
 
 
 def test_another_draw_gives_other_grasps() -> None:
