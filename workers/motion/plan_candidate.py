@@ -27,7 +27,7 @@ _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
 _FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
 # Poses sorted by distance together; each portion has as many as all before, and these.
-_FIRST_PORTION, _PORTION_OF_REST = 24, 1000
+_FIRST_PORTION = 24
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -110,11 +110,11 @@ def plan_candidate(
 def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -> Iterator[list[_Goal]]:
     """At most `max_grasps_tried` of the free poses `kept` and `rest` with seeds near by, in growing batches.
 
-    They come in their own order, best first and such that neighbours differ much; of each portion of them
-    those nearest to a seed come first.
+    `kept` come in their own order, best first and such that neighbours differ much; of each portion of them
+    those nearest to a seed come first. Of `rest` those nearest of all come first.
     """
     left, batch = prepared.params.max_grasps_tried, _FIRST_BATCH
-    for rows, portion in ((kept, _FIRST_PORTION), (rest, _PORTION_OF_REST)):
+    for rows, portion in ((kept, _FIRST_PORTION), (rest, len(rest))):
         if left == 0:
             return
         T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
@@ -123,16 +123,27 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
         end = 0
         while left > 0 and end < len(rows):
             start, end = end, min(len(rows), 2 * end + portion)
-            goals = _with_seeds(prepared, rows[start:end], T_base_tcp[start:end], left)
+            goals = _with_seeds(prepared, T_base_world, rows[start:end], T_base_tcp[start:end], left)
             left -= len(goals)
             while goals:
                 yield goals[:batch]
                 goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
 
 
-def _with_seeds(prepared: PlanningScene, rows: Ints, T_base_tcp: F64, count: int) -> list[_Goal]:
-    """The free poses among `rows` that have seeds near by, nearest first, at most `count`."""
-    distance, seeds = prepared.moving.table.nearest(T_base_tcp, prepared.params.ik_seeds)
+def _with_seeds(
+    prepared: PlanningScene, T_base_world: F64, rows: Ints, T_base_tcp: F64, count: int
+) -> list[_Goal]:
+    """The free poses among `rows` that have seeds near by, nearest first, at most `count`.
+
+    Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts.
+    """
+    table, params = prepared.moving.table, prepared.params
+    distance, seeds = table.nearest(T_base_tcp, params.ik_seeds)
+    T_lifted = T_base_tcp.copy()
+    T_lifted[:, :3, 3] += params.lift_m * T_base_world[:3, 2]
+    for T in (backed(T_base_tcp, params.pregrasp_m), T_lifted):
+        some = np.flatnonzero(np.isfinite(distance))
+        distance[some] = np.maximum(distance[some], table.nearest(T[some], 1)[0])
     near = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
     near = near[prepared.around.is_free(rows[near])][:count]
     return [_Goal(int(rows[g]), T_base_tcp[g], seeds[g]) for g in near.tolist()]
