@@ -28,6 +28,7 @@ _CLEARANCE_POSES = 8
 _FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
 # Poses sorted by distance together; each portion has as many as all before, and these.
 _FIRST_PORTION = 24
+_FILTERED_AT_ONCE = 200
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -123,17 +124,20 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
         end = 0
         while left > 0 and end < len(rows):
             start, end = end, min(len(rows), 2 * end + portion)
-            goals = _with_seeds(prepared, T_base_world, rows[start:end], T_base_tcp[start:end], left)
-            left -= len(goals)
-            while goals:
-                yield goals[:batch]
-                goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
+            some, near, seeds = slice(start, end), *_near_seeds(prepared, T_base_world, T_base_tcp[start:end])
+            while left > 0 and len(near):
+                # The hand's way is looked at for few at a time: most candidates need no more.
+                free = near[:_FILTERED_AT_ONCE]
+                free, near = free[prepared.around.is_free(rows[some][free])][:left], near[len(free) :]
+                left -= len(free)
+                goals = [_Goal(int(rows[some][g]), T_base_tcp[some][g], seeds[g]) for g in free.tolist()]
+                while goals:
+                    yield goals[:batch]
+                    goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
 
 
-def _with_seeds(
-    prepared: PlanningScene, T_base_world: F64, rows: Ints, T_base_tcp: F64, count: int
-) -> list[_Goal]:
-    """The free poses among `rows` that have seeds near by, nearest first, at most `count`.
+def _near_seeds(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> tuple[Ints, F64]:
+    """Rows of the poses (G, 4, 4) that have seeds near by, nearest first, and seeds (G, S, A) of all.
 
     Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts.
     """
@@ -144,9 +148,7 @@ def _with_seeds(
     for T in (backed(T_base_tcp, params.pregrasp_m), T_lifted):
         some = np.flatnonzero(np.isfinite(distance))
         distance[some] = np.maximum(distance[some], table.nearest(T[some], 1)[0])
-    near = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
-    near = near[prepared.around.is_free(rows[near])][:count]
-    return [_Goal(int(rows[g]), T_base_tcp[g], seeds[g]) for g in near.tolist()]
+    return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())], seeds
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
