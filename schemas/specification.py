@@ -117,8 +117,8 @@ class CandidateParams(_Frozen):
     camera_height_m: Range = Range(low=0.8, high=1.5)
     base_height_m: Range = Range(low=0.5, high=1.0)
     arm_reach_m: Range = Range(low=0.3, high=1.0)
-    # Reaches are drawn in whole steps, so that workers open few arms; None, as in older runs: any reach.
-    arm_reach_step_m: float | None = Field(default=None, ge=0.001, le=0.1)
+    # Reaches are drawn in whole steps, so that workers open few arms; 0, as in older runs: any reach.
+    arm_reach_step_m: float = Field(default=0.0, ge=0, le=0.1)
     base_radius_m: Metres = 0.25
     mast_radius_m: Metres = 0.05
 

@@ -110,7 +110,7 @@ def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _
 def _stepped(reach_m: F32, params: CandidateParams) -> F32:
     """Reaches (R,) at the nearest whole step within the range."""
     step_m, limits = params.arm_reach_step_m, params.arm_reach_m
-    if step_m is None:
+    if step_m == 0:
         return reach_m
     whole = np.round(reach_m.astype(np.float64) / step_m) * step_m
     return np.clip(whole, limits.low, limits.high).astype(np.float32)
