@@ -3,8 +3,8 @@
     python -m benchmarks.graspability [--objects ycb:DIR] [--robot panda] [--stability] [--cold]
 
 `free`: poses in which the open hand and its last 8 cm of way touch nothing of the object; `clear`: of
-these, poses that also keep above what the upright object stands on; `scored`: varied ones of them, with
-their flips, tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
+these, poses that also keep above what the upright object stands on; `scored`: varied ones of them,
+tried in physics; `good`: scored, clear and held in at least `min_score` of the trials; `held`:
 share of these among the scored and clear ones. CPU seconds are those of this process; 0.0 where the grasps
 were kept from before.
 
@@ -25,7 +25,7 @@ import numpy as np
 from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.floating_hand import HandTest, held_trials
 from datagen.workers.grasps.grasp_cache import scored_grasps
-from datagen.workers.grasps.targets import Graspability, Targets, graspability
+from datagen.workers.grasps.targets import JUDGED_GRASPS, Graspability, Targets, graspability
 from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
@@ -69,7 +69,7 @@ def print_table(models: list[ObjectModel], gripper: Gripper, params: GraspParams
         start = time.process_time()
         row: Graspability = graspability(model, gripper, params)
         spent_s = time.process_time() - start
-        trials += 3 * (row.n_scored + 1) // 2
+        trials += 3 * row.n_scored
         counts = f"{row.n_free} | {row.n_clear} | {row.n_scored} | {row.n_clear_held}"
         print(
             f"| {model.name} | {len(model.convex_parts_m)} | {model.mass_kg:.2f} | {counts} "
@@ -89,7 +89,7 @@ def print_stability(models: list[ObjectModel], gripper: Gripper) -> None:
         verdicts: list[float] = []
         trials, spent_s = 0, 0.0
         for model in models:
-            scored = scored_grasps(model, gripper, GraspParams())
+            scored = scored_grasps(model, gripper, JUDGED_GRASPS)
             # Not the best ones only: evenly over a list that is sorted by score.
             some = np.linspace(0, len(scored) - 1, min(_STABILITY_GRASPS, len(scored))).astype(int)
             if len(some) == 0:

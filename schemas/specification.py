@@ -122,6 +122,8 @@ class CandidateParams(_Frozen):
     camera_height_m: Range = Range(low=0.8, high=1.5)
     base_height_m: Range = Range(low=0.5, high=1.0)
     arm_reach_m: Range = Range(low=0.3, high=1.0)
+    # Reaches are drawn in whole steps, so that workers open few arms; 0, as in older runs: any reach.
+    arm_reach_step_m: float = Field(default=0.0, ge=0, le=0.1)
     base_radius_m: Metres = 0.25
     # Bases of arms shorter than the Panda are narrower in proportion; None, as in older runs: all alike.
     scaled_base: bool | None = None
@@ -139,10 +141,11 @@ class CandidateParams(_Frozen):
 
 
 class GraspParams(_Frozen):
-    """Grasps of the target: the number to search, and the number to keep per scene."""
+    """Grasps of the target: the number to search, and the number to look at for all candidates of a scene."""
 
-    per_object: int = Field(default=300, ge=1, le=10_000)
-    per_scene: int = Field(default=40, ge=1, le=1000)
+    per_object: int = Field(default=4000, ge=1, le=10_000)
+    # The others are looked at for candidates to which none of these leads.
+    per_scene: int = Field(default=400, ge=1, le=10_000)
     # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
 
@@ -150,7 +153,7 @@ class GraspParams(_Frozen):
 class MotionParams(_Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
-    ik_seeds: int = Field(default=3, ge=1, le=100)
+    ik_seeds: int = Field(default=2, ge=1, le=100)
     pregrasp_m: float = Field(default=0.08, ge=0, le=0.5)
     lift_m: float = Field(default=0.10, ge=0.01, le=0.5)
     # Largest joint motion between neighbouring points of a straight line.
@@ -158,7 +161,7 @@ class MotionParams(_Frozen):
     # Spacing of the configurations at which a path is checked for collisions.
     check_step_rad: float = Field(default=0.05, ge=0.001, le=1.0)
     # Counts, not times: labels must not depend on the speed of a machine. Both are per candidate.
-    max_grasps_tried: int = Field(default=24, ge=1, le=10_000)
+    max_grasps_tried: int = Field(default=150, ge=1, le=10_000)
     path_iterations: int = Field(default=200, ge=1, le=1_000_000)
     # Distance of the arm from all obstacles, and of the hand up to the pregrasp.
     margin_m: float = Field(default=0.005, ge=0, le=0.2)

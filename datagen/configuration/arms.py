@@ -21,6 +21,8 @@ ARM_PACKAGES: dict[str, tuple[str, ...]] = {
 _NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial", "disturbance"), "sim": ()}
 # Reaches are stated in whole millimetres.
 _STEP_M = 0.001
+# Of the reaches that are drawn: opening an arm costs as much as planning ten candidates.
+REACH_STEP_M = 0.01
 
 Fields = dict[str, Any]
 
@@ -96,6 +98,8 @@ def narrow_candidates(fields: Fields, robot: str) -> None:
     candidates = fields.setdefault("candidates", {})
     if not isinstance(candidates, dict):
         return
+    if limits.reach_m[0] < limits.reach_m[1]:
+        candidates.setdefault("arm_reach_step_m", REACH_STEP_M)
     candidates.setdefault("arm_reach_m", _narrowed(defaults.arm_reach_m, limits.reach_m))
     if limits.base_height_m is not None:
         candidates.setdefault("base_height_m", _narrowed(defaults.base_height_m, limits.base_height_m))

@@ -190,7 +190,8 @@ def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tu
     if trial.report is not None:
         planning = at.planning
         around = surroundings(planning, T_world_base)
-        T_base_tcp = np.matmul(inverse(T_world_base), planning.T_world_tcp)
+        kept = planning.around.kept
+        T_base_tcp = np.matmul(inverse(T_world_base), planning.around.T_world_tcp[kept])
         distance, seeds = planning.moving.table.nearest(T_base_tcp, planning.params.ik_seeds)
         for k in np.argsort(distance, kind="stable").tolist():
             found = (robot.ik(T_base_tcp[k], seed) for seed in seeds[k])
@@ -199,7 +200,7 @@ def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tu
                 continue
             blocked = around.is_base_stuck or around.first_arm_blocked(q[None], is_target_held=False) == 0
             q_rad.append(q)
-            opening_m.append(float(planning.opening_m[k]))
+            opening_m.append(float(planning.around.opening_m[kept[k]]))
             words.append("the arm collides here" if blocked else "the arm is free here")
             if len(words) > _TRIES:
                 break

@@ -130,7 +130,17 @@ def _draw_robots(params: CandidateParams, n: int, rng: np.random.Generator) -> _
     def draw(r: Range) -> F32:
         return rng.uniform(r.low, r.high, size=n).astype(np.float32)
 
-    return _SceneRobots(draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m))
+    robots = _SceneRobots(draw(params.camera_height_m), draw(params.base_height_m), draw(params.arm_reach_m))
+    return replace(robots, arm_reach_m=_stepped(robots.arm_reach_m, params))
+
+
+def _stepped(reach_m: F32, params: CandidateParams) -> F32:
+    """Reaches (R,) at the nearest whole step within the range."""
+    step_m, limits = params.arm_reach_step_m, params.arm_reach_m
+    if step_m == 0:
+        return reach_m
+    whole = np.round(reach_m.astype(np.float64) / step_m) * step_m
+    return np.clip(whole, limits.low, limits.high).astype(np.float32)
 
 
 def _stand(

@@ -4,82 +4,204 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from datagen.schemas.identity import digest_of
 from datagen.schemas.specification import GraspParams
 from datagen.workers.content_cache import Arrays, CacheFolder
+from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.grasps.grasp import GraspSet
-from datagen.workers.grasps.search import VERSION, ScoredGrasps, search_grasps
+from datagen.workers.grasps.search import BLOCK, VERSION, HandPoses, hand_poses_of, score_block
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper, Parts
 
-_KEPT_IN_MEMORY = 512
-_CACHE = CacheFolder(
-    "grasps",
+Bools = npt.NDArray[np.bool_]
+
+_NO_SCORE = np.zeros(0, np.float32)
+_KEPT_IN_MEMORY = 128
+_POSES = CacheFolder(
+    "hand-poses",
     {
         "T_object_tcp": (np.float64, ("n", 4, 4)),
-        "opening_m": (np.float32, ("n",)),
-        "score": (np.float32, ("n",)),
+        "opening_m": (np.float64, ("n",)),
         "is_clear": (np.bool_, ("n",)),
-        "counts": (np.int64, (3,)),
+        "n_tried": (np.int64, ()),
         "reason": (np.str_, ()),
     },
-    most_files=2048,  # of some 30 KB each
+    most_files=1024,  # of some 250 KB each
     most_bytes=20_000_000,
 )
+_SCORES = CacheFolder("grasps", {"score": (np.float32, ("n",))}, most_files=65_536, most_bytes=10_000)
+# Grasps of an object that are scored before any arm asks for one.
+SCORED_FIRST = 128
+# Searches of one object, one after the other until there are poses enough.
+_MOST_SEARCHES = 16
 # What moves a bit of the result beside our own code.
 _ENGINES = ("sapien", "coal", "scipy", "numpy")
 
-_kept: OrderedDict[str, ScoredGrasps] = OrderedDict()
+
+@dataclass(frozen=True, eq=False)
+class ScoredGrasps:
+    """The first G poses of one object's order, with their scores. None where `reason` says why."""
+
+    T_object_tcp: F64  # (G, 4, 4)
+    opening_m: F32  # (G,)
+    score: F32  # (G,), share of floating-hand pulls that held
+    is_clear: Bools  # (G,), the hand stays above the plane that the upright object stands on
+    n_tried: int  # poses of the first search that were checked against the object
+    n_free: int  # those in which the hand touches nothing of it
+    n_clear: int  # and stays above that plane
+    reason: str
+
+    def __len__(self) -> int:
+        return len(self.score)
 
 
-def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams) -> GraspSet:
-    """The grasps worth offering to an arm: those with at least `min_score`, best first.
+@dataclass(eq=False)
+class _Known:
+    """What this process knows of the grasps of one object by one hand."""
+
+    searches: list[HandPoses] = field(default_factory=list)
+    scores: dict[tuple[int, int], F32] = field(default_factory=dict)  # by search and block
+    sets: dict[tuple[int, float], GraspSet] = field(default_factory=dict)  # by number and least score
+
+
+_kept: OrderedDict[str, _Known] = OrderedDict()
+
+
+def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0) -> GraspSet:
+    """The grasps worth offering to an arm: of the first `per_object` those with `min_score`.
+
+    The first `SCORED_FIRST` are scored now, and the good ones of them come best first. The others follow in
+    the object's order, and are scored when an arm has a plan to one: most scenes need none of them.
 
     A pure function of the object's collision parts and mass, the gripper and the parameters: equal
-    content gives equal bits in every process and order. None where the object cannot be grasped.
+    content gives equal bits in every process and order. None where the object cannot be grasped. `draw` is
+    another draw of all that is random.
     """
-    scored = scored_grasps(model, gripper, params)
-    good = scored.score >= params.min_score
-    return GraspSet(scored.T_object_tcp[good], scored.opening_m[good], scored.score[good])
+    digest = content_digest(model, gripper, draw)
+    known, key = _known(digest), (params.per_object, params.min_score)
+    if key in known.sets:
+        return known.sets[key]
+    first = scored_grasps(model, gripper, min(params.per_object, SCORED_FIRST), draw)
+    order = np.argsort(-first.score, kind="stable")
+    rows = order[first.score[order] >= params.min_score]
+    T, openings = [first.T_object_tcp[rows]], [first.opening_m[rows]]
+    later: list[tuple[int, int]] = []  # search and row of each
+    left = params.per_object if len(rows) else 0
+    skip = len(first)
+    for search in range(_MOST_SEARCHES if left else 0):
+        poses = _poses(known, digest, model, gripper, search)
+        some = min(left, len(poses))
+        begin = min(skip, some)
+        T.append(poses.T_object_tcp[begin:some])
+        openings.append(poses.opening_m[begin:some].astype(np.float32))
+        later += [(search, row) for row in range(begin, some)]
+        left, skip = left - some, skip - begin
+        if left == 0 or len(poses) == 0:
+            break
 
+    def later_score(k: int) -> float:
+        search, row = later[k]
+        return float(_score(known, digest, model, gripper, search, row // BLOCK)[row % BLOCK])
 
-def scored_grasps(model: ObjectModel, gripper: Gripper, params: GraspParams) -> ScoredGrasps:
-    """All scored grasps, from memory, from the cache folder, or computed and then cached.
-
-    A cache that is broken or cannot be written costs seconds, never a result.
-    """
-    digest = content_digest(model, gripper, params)
-    if digest in _kept:
-        _kept.move_to_end(digest)
-        return _kept[digest]
-    key = _file_digest(digest)
-    stored = _CACHE.load(key)
-    found = None if stored is None else _restored(stored)
-    if found is None:
-        rng = np.random.Generator(np.random.PCG64(int(digest, 16)))
-        found = search_grasps(model, gripper, params.per_object, rng)
-        _CACHE.store(key, _stored(found))
-    _kept[digest] = found
-    if len(_kept) > _KEPT_IN_MEMORY:
-        _kept.popitem(last=False)
+    found = GraspSet(
+        np.concatenate(T), np.concatenate(openings), first.score[rows], params.min_score, later_score
+    )
+    known.sets[key] = found
     return found
 
 
-def content_digest(model: ObjectModel, gripper: Gripper, params: GraspParams) -> str:
-    """sha256 over all that decides the grasps: it seeds their draws and names their file."""
+def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -> ScoredGrasps:
+    """The first `n` grasps of an object, or all that `_MOST_SEARCHES` searches find.
+
+    The first of more grasps are those of fewer. Poses and scores come from memory, from the cache folder, or
+    are computed and then cached. A cache that is broken or cannot be written costs seconds, never a result.
+    """
+    digest = content_digest(model, gripper, draw)
+    known = _known(digest)
+    T, openings, clear, scores = [np.zeros((0, 4, 4))], [np.zeros(0)], [np.zeros(0, bool)], [_NO_SCORE]
+    left = n
+    for search in range(_MOST_SEARCHES):
+        poses = _poses(known, digest, model, gripper, search)
+        some = min(left, len(poses))
+        for block in range(-(-some // BLOCK)):
+            rows = min(BLOCK, some - block * BLOCK)
+            scores.append(_score(known, digest, model, gripper, search, block)[:rows])
+        T.append(poses.T_object_tcp[:some])
+        openings.append(poses.opening_m[:some])
+        clear.append(poses.is_clear[:some])
+        left -= some
+        if left == 0 or len(poses) == 0:
+            break
+    first, score = known.searches[0], np.concatenate(scores)
+    reason = first.reason or ("" if score.any() else "no grasp holds the object")
+    return ScoredGrasps(
+        np.concatenate(T),
+        np.concatenate(openings).astype(np.float32),
+        score,
+        np.concatenate(clear),
+        first.n_tried,
+        len(first),
+        int(first.is_clear.sum()),
+        reason,
+    )
+
+
+def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
+    """sha256 over all that decides the grasps: it seeds their draws and names their files."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)
+    other = {"draw": draw} if draw else {}
     return digest_of(
         {
             "version": VERSION,
-            "per_object": params.per_object,
             "object": [_parts_digest(model.convex_parts_m), model.mass_kg, model.size_m[2]],
             "gripper": [*hand, *map(_parts_digest, (gripper.palm_parts_m, *gripper.finger_parts_m))],
+            **other,
         }
     )
+
+
+def _known(digest: str) -> _Known:
+    known = _kept.setdefault(digest, _Known())
+    _kept.move_to_end(digest)
+    if len(_kept) > _KEPT_IN_MEMORY:
+        _kept.popitem(last=False)
+    return known
+
+
+def _poses(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int) -> HandPoses:
+    if search == len(known.searches):
+        key = _file_digest([digest, search])
+        stored = _POSES.load(key)
+        found = None if stored is None else _restored(stored)
+        if found is None:
+            found = hand_poses_of(model, gripper, _generator([digest, search]))
+            _POSES.store(key, _stored(found))
+        known.searches.append(found)
+    return known.searches[search]
+
+
+def _score(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, search: int, block: int) -> F32:
+    if (search, block) not in known.scores:
+        poses = known.searches[search]
+        key = _file_digest([digest, search, block])
+        stored = _SCORES.load(key)
+        score = None if stored is None else stored["score"]
+        if score is None or not _are_scores(score, min(BLOCK, len(poses) - block * BLOCK)):
+            score = score_block(model, gripper, poses, block, _generator([digest, search, block]))
+            _SCORES.store(key, {"score": score})
+        known.scores[search, block] = score
+    return known.scores[search, block]
+
+
+def _generator(of: list[Any]) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(int(digest_of(of), 16)))
 
 
 def _parts_digest(parts_m: Parts) -> str:
@@ -90,9 +212,9 @@ def _parts_digest(parts_m: Parts) -> str:
     return hasher.hexdigest()
 
 
-def _file_digest(digest: str) -> str:
+def _file_digest(of: list[Any]) -> str:
     """Names a file also by the engines, so that a newer one does not answer with what an older one found."""
-    return digest_of([digest, *map(_version_of, _ENGINES)])
+    return digest_of([*of, *map(_version_of, _ENGINES)])
 
 
 def _version_of(package: str) -> str:
@@ -102,34 +224,29 @@ def _version_of(package: str) -> str:
         return ""
 
 
-def _stored(found: ScoredGrasps) -> Arrays:
+def _stored(found: HandPoses) -> Arrays:
     return {
         "T_object_tcp": found.T_object_tcp,
         "opening_m": found.opening_m,
-        "score": found.score,
         "is_clear": found.is_clear,
-        "counts": np.array([found.n_tried, found.n_free, found.n_clear], np.int64),
+        "n_tried": np.array(found.n_tried, np.int64),
         "reason": np.array(found.reason),
     }
 
 
-def _restored(stored: Arrays) -> ScoredGrasps | None:
-    n_tried, n_free, n_clear = (int(n) for n in stored["counts"])
-    found = ScoredGrasps(
+def _restored(stored: Arrays) -> HandPoses | None:
+    found = HandPoses(
         stored["T_object_tcp"],
         stored["opening_m"],
-        stored["score"],
         stored["is_clear"],
-        n_tried,
-        n_free,
-        n_clear,
+        int(stored["n_tried"]),
         str(stored["reason"]),
     )
-    return found if _is_sound(found) else None
-
-
-def _is_sound(found: ScoredGrasps) -> bool:
     R = found.T_object_tcp[:, :3, :3]
     turned_right = np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     finite = np.isfinite(found.T_object_tcp).all() and np.isfinite(found.opening_m).all()
-    return bool(turned_right and finite and ((found.score >= 0) & (found.score <= 1)).all())
+    return found if turned_right and finite else None
+
+
+def _are_scores(score: F32, n: int) -> bool:
+    return len(score) == n and bool(((score >= 0) & (score <= 1)).all())

@@ -57,13 +57,6 @@ def hand_poses(contacts: Contacts, pad_length_m: float, rng: np.random.Generator
     return T, contacts.width_m[row]
 
 
-def flipped(T_object_tcp: F64) -> F64:
-    """The same grasps (N, 4, 4) with the hand turned by half a turn about its approach."""
-    out = T_object_tcp.copy()
-    out[:, :3, :2] *= -1
-    return out
-
-
 def varied(T_object_tcp: F64, n: int) -> npt.NDArray[np.int64]:
     """Rows of at most n poses, each as far as can be from those before it; the first pose comes first.
 

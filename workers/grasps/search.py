@@ -1,4 +1,4 @@
-"""Search grasps of one object by one gripper: collision-free poses, of which a varied set is scored."""
+"""Search grasps of one object by one gripper: collision-free poses, in a varied order, and their scores."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.grasps.contacts import cone_directions, contact_pairs, solid_of, surface_points
 from datagen.workers.grasps.floating_hand import HandTest, held_trials
 from datagen.workers.grasps.hand_clearance import HandClearance, lowest_m
-from datagen.workers.grasps.hand_poses import flipped, hand_poses, varied
+from datagen.workers.grasps.hand_poses import hand_poses, varied
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper
 
 Bools = npt.NDArray[np.bool_]
 
 # Part of every cache key and seed: raise it when the same object and hand get other grasps.
-VERSION = 2
+VERSION = 3
+# Poses that are scored together: a score depends on the poses of its block, which are always the same.
+BLOCK = 32
 # Room between the open fingers and the object, both sides together: the first that lets the hand in.
 AIR_M = (0.02, 0.006)
 _LEAST_AIR_M = 0.004
@@ -29,35 +31,30 @@ _ROUNDS, _POINTS = 3, 800  # and points drawn on the surface in each
 _MORE_ROUNDS, _FEW_CLEAR = 10, 60  # where hardly a pose keeps above the table
 _CLEAR_POSES, _OTHER_POSES = 1500, 1000  # checked against the object in each round
 _ENOUGH_FREE, _ENOUGH_CLEAR = 800, 300
-# Physics takes longest with many parts. With its flip every scored grasp counts twice.
-_SCORED, _SCORED_OF_MANY_PARTS, _MANY_PARTS = 64, 40, 16
-_SHARE_CLEAR = 0.75  # of what is scored, where there are enough
+_CLEAR_IN_FOUR = 3  # of four poses in a row, where there are enough of both kinds
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredGrasps:
-    """G grasps of one object, best first. None where `reason` says why."""
+class HandPoses:
+    """N poses in which the hand touches nothing of one object. Any first n of them are spread over it.
 
-    T_object_tcp: F64  # (G, 4, 4)
-    opening_m: F32  # (G,)
-    score: F32  # (G,), share of floating-hand trials that held
-    is_clear: Bools  # (G,), the hand stays above the plane that the upright object stands on
+    None where `reason` says why.
+    """
+
+    T_object_tcp: F64  # (N, 4, 4)
+    opening_m: F64  # (N,)
+    is_clear: Bools  # (N,), the hand stays above the plane that the upright object stands on
     n_tried: int  # poses checked against the object
-    n_free: int  # those in which the hand touches nothing of it
-    n_clear: int  # and stays above that plane
     reason: str
 
     def __len__(self) -> int:
-        return len(self.score)
+        return len(self.opening_m)
 
 
-def search_grasps(
-    model: ObjectModel, gripper: Gripper, per_object: int, rng: np.random.Generator
-) -> ScoredGrasps:
-    """At most `per_object` grasps, spread over the object, with their scores.
+def hand_poses_of(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> HandPoses:
+    """Poses of the hand around an object, all that one search finds: some hundred to two thousand.
 
-    An object that cannot be grasped gives none and a reason, and so does one whose parts have no
-    volume.
+    An object that cannot be grasped gives none and a reason, and so does one whose parts have no volume.
     """
     if not model.convex_parts_m or not all(np.isfinite(part).all() for part in model.convex_parts_m):
         return _none(0, "no collision parts, or a corner that is not finite")
@@ -70,29 +67,18 @@ def search_grasps(
     if len(T) == 0:
         return _none(n_tried, "the hand touches the object in every pose")
     is_clear = _is_clear(model, gripper, T, opening_m)
-    n_free, n_clear = len(T), int(is_clear.sum())
-    chosen = _choose(T, is_clear, _n_scored(model, per_object))
-    T, opening_m, is_clear = T[chosen], opening_m[chosen], is_clear[chosen]
+    order = _spread(T, is_clear)
+    return HandPoses(T[order], opening_m[order], is_clear[order], n_tried, "")
+
+
+def score_block(
+    model: ObjectModel, gripper: Gripper, poses: HandPoses, block: int, rng: np.random.Generator
+) -> F32:
+    """Shares (n,) of the pulls that the poses of one block hold, n <= `BLOCK`."""
+    rows = slice(block * BLOCK, (block + 1) * BLOCK)
+    T, opening_m = poses.T_object_tcp[rows], poses.opening_m[rows]
     held = held_trials(model.convex_parts_m, model.mass_kg, gripper, T, opening_m, rng, HandTest())
-    score = held.mean(axis=1)
-    # The flip presses the same pads on the same places: its score is the same.
-    turned = flipped(T)
-    fits = HandClearance(model.convex_parts_m, gripper).free(turned, opening_m)
-    row = np.concatenate([np.arange(len(T)), np.flatnonzero(fits)])
-    poses = np.concatenate([T, turned[fits]])
-    order = np.lexsort((np.arange(len(row)) >= len(T), row, -score[row]))[:per_object]
-    row = row[order]
-    reason = "" if score.any() else "no grasp holds the object"
-    return ScoredGrasps(
-        poses[order],
-        opening_m[row].astype(np.float32),
-        score[row].astype(np.float32),
-        is_clear[row],
-        n_tried,
-        n_free,
-        n_clear,
-        reason,
-    )
+    return held.mean(axis=1).astype(np.float32)
 
 
 def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> tuple[F64, F64, int]:
@@ -131,29 +117,17 @@ def _is_clear(model: ObjectModel, gripper: Gripper, T_object_tcp: F64, opening_m
     return lowest_m(gripper, T_object_tcp, opening_m) > TABLE_GAP_M - model.size_m[2] / 2
 
 
-def _n_scored(model: ObjectModel, per_object: int) -> int:
-    few = len(model.convex_parts_m) <= _MANY_PARTS
-    return min((per_object + 1) // 2, _SCORED if few else _SCORED_OF_MANY_PARTS)
-
-
-def _choose(T_object_tcp: F64, is_clear: Bools, n: int) -> npt.NDArray[np.int64]:
-    """Rows of at most n varied poses, most of them clear of the table where there are such."""
+def _spread(T_object_tcp: F64, is_clear: Bools) -> npt.NDArray[np.int64]:
+    """An order of all poses (N,) such that any first n are varied, most of them clear of the table."""
     clear, other = np.flatnonzero(is_clear), np.flatnonzero(~is_clear)
-    n_clear = min(len(clear), max(round(n * _SHARE_CLEAR), n - len(other)))
-    n_other = min(len(other), n - n_clear)
-    return np.concatenate(
-        [clear[varied(T_object_tcp[clear], n_clear)], other[varied(T_object_tcp[other], n_other)]]
+    clear = clear[varied(T_object_tcp[clear], len(clear))]
+    other = other[varied(T_object_tcp[other], len(other))]
+    # The k-th of each kind has its place among both; what is left of one kind comes last.
+    rank = np.concatenate(
+        [np.arange(len(clear)) / _CLEAR_IN_FOUR, np.arange(len(other)) / (4 - _CLEAR_IN_FOUR) + 0.5]
     )
+    return np.concatenate([clear, other])[np.argsort(rank, kind="stable")]
 
 
-def _none(n_tried: int, reason: str) -> ScoredGrasps:
-    return ScoredGrasps(
-        np.zeros((0, 4, 4)),
-        np.zeros(0, np.float32),
-        np.zeros(0, np.float32),
-        np.zeros(0, bool),
-        n_tried,
-        0,
-        0,
-        reason,
-    )
+def _none(n_tried: int, reason: str) -> HandPoses:
+    return HandPoses(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, bool), n_tried, reason)

@@ -15,6 +15,8 @@ from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper
 
+# The first of an object's grasps decide whether it is a target, however many arms are offered.
+JUDGED_GRASPS = 64
 MIN_CLEAR_GRASPS = 20
 MIN_HELD_SHARE = 0.25
 PER_FAMILY = 2
@@ -30,7 +32,7 @@ class Graspability:
     n_tried: int  # poses of the hand checked against the object
     n_free: int  # those that touch nothing of it
     n_clear: int  # and also keep above what it stands on, upright
-    n_scored: int  # varied ones of them, with their flips, tried in physics
+    n_scored: int  # varied ones of them, tried in physics
     n_clear_held: int  # of these, clear of the table and with `min_score` or more
     held_share: float  # of those scored and clear of the table
     reason: str
@@ -42,7 +44,7 @@ class Graspability:
 
 def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> Graspability:
     """What the grasps of one object come to. Never raises for what an object is."""
-    scored = scored_grasps(model, gripper, params)
+    scored = scored_grasps(model, gripper, min(params.per_object, JUDGED_GRASPS))
     good = scored.score >= params.min_score
     n_clear_held = int((good & scored.is_clear).sum())
     share = n_clear_held / max(int(scored.is_clear.sum()), 1)

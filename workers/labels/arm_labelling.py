@@ -61,6 +61,7 @@ class ArmInScene:
     arm: ArmParams
     base_radius_m: float
     clock: StageClock = field(default_factory=StageClock)
+    draw: int = 0  # of all that is drawn for labels; benchmarks.repeatability compares others with 0
 
     @cached_property
     def planning(self) -> PlanningScene:
@@ -72,6 +73,7 @@ class ArmInScene:
                 self.arm.motion,
                 self.arm.grasps.per_scene,
                 self.base_radius_m,
+                self.draw,
             )
 
     @cached_property
@@ -99,16 +101,21 @@ class ArmInScene:
 
 
 def arm_in_scene(
-    scene: SettledScene, candidates: SceneCandidates, row: int, spec: Specification, clock: StageClock
+    scene: SettledScene,
+    candidates: SceneCandidates,
+    row: int,
+    spec: Specification,
+    clock: StageClock,
+    draw: int = 0,
 ) -> ArmInScene:
     """The robot of candidate `row` in a scene. Raises InputError for an unknown robot or a wrong reach."""
     arm = arm_of(spec)
     with clock.stage("grasps"):
         reach_m, height_m = float(candidates.arm_reach_m[row]), float(candidates.base_height_m[row])
         robot = open_robot(arm.robot, reach_m, height_m)
-        grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps)
+        grasps = grasps_of(scene.models[0], robot.gripper, arm.grasps, draw)
     base_radius_m = float(spec.candidates.radius_of_base_m(candidates.arm_reach_m[row]))
-    return ArmInScene(scene, robot, grasps, arm, base_radius_m, clock)
+    return ArmInScene(scene, robot, grasps, arm, base_radius_m, clock, draw)
 
 
 def arm_of(spec: Specification) -> ArmParams:
@@ -133,7 +140,8 @@ def try_candidate(
     T_world_base = at.base_pose(candidates, row)
     if not at.is_within_reach(T_world_base):
         return CandidateTrial("out_of_reach")
-    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, row)
+    other = (at.draw,) if at.draw else ()
+    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, row, *other)
     planning, clock = at.planning, at.clock
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, joined, place, smallest_gap_m
+from datagen.workers.motion.collision import Bools, Hulls, Ints, Placed, hits, joined, place, smallest_gap_m
 from datagen.workers.motion.planning_scene import ROOM_AROUND_M, PlanningScene
 
 _FAR_M = 1.0  # clearances are not looked for beyond this
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Surroundings:
     """One base pose of a planning scene. Links that no joint moves are not in `arm`."""
 
@@ -25,7 +26,6 @@ class Surroundings:
     arm_may_touch: Bools  # (arm's parts, near parts)
     hand_may_touch: Bools  # (hand's parts, near parts)
     is_base_stuck: bool  # a link that no joint moves cuts something
-    _homes: dict[float, Bools] = field(default_factory=dict)
 
     def first_blocked(self, q_rad: F64, opening_m: float) -> int:
         """The first of M joint vectors (M, A) at which the arm or the hand collides, or M."""
@@ -37,6 +37,18 @@ class Surroundings:
         end = _first(hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch, True))
         return self._first_folded(q_rad[:end])
 
+    def blocked(self, q_rad: F64, opening_m: F64 | None) -> Bools:
+        """At which of M joint vectors (M, A) the arm collides; with openings (M,) also the hand."""
+        T, margin_m = self._frames(q_rad), self.scene.params.margin_m
+        found = hits(self.arm, T, self.near, margin_m, self.arm_may_touch)
+        if opening_m is not None:
+            hand, left = self.scene.moving.hand, np.flatnonzero(~found)
+            T_hand = hand.poses(T[left, -1], opening_m[left])
+            found[left] = hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch)
+        for k in np.flatnonzero(~found):
+            found[k] = self.scene.robot.collides_itself(q_rad[k])
+        return found
+
     def first_arm_blocked(self, q_rad: F64, is_target_held: bool) -> int:
         """The same for the arm without the hand, on lines that the hand alone was seen to be free on."""
         may_touch = self.arm_may_touch | self.is_target if is_target_held else self.arm_may_touch
@@ -44,16 +56,15 @@ class Surroundings:
         end = _first(hits(self.arm, T, self.near, self.scene.params.margin_m, may_touch, True))
         return self._first_folded(q_rad[:end])
 
-    def free_homes(self, opening_m: float) -> Bools:
-        """Which of the robot's tucked poses (H,) are free here."""
-        if opening_m not in self._homes:
-            homes = self.scene.robot.homes_rad
-            T, hand, margin_m = self._frames(homes), self.scene.moving.hand, self.scene.params.margin_m
-            T_hand = hand.poses(T[:, -1], np.full(len(T), opening_m))
-            blocked = hits(self.arm, T, self.near, margin_m, self.arm_may_touch)
-            blocked |= hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch)
-            self._homes[opening_m] = ~blocked
-        return self._homes[opening_m]
+    @cached_property
+    def free_homes(self) -> Ints:
+        """Which of the robot's tucked poses are free here, with the hand open."""
+        homes = self.scene.robot.homes_rad
+        T, hand, margin_m = self._frames(homes), self.scene.moving.hand, self.scene.params.margin_m
+        T_hand = hand.poses(T[:, -1], np.full(len(T), self.scene.robot.gripper.max_opening_m))
+        blocked = hits(self.arm, T, self.near, margin_m, self.arm_may_touch)
+        blocked |= hits(hand.hulls, T_hand, self.near, margin_m, self.hand_may_touch)
+        return np.flatnonzero(~blocked)
 
     def clearance_m(self, q_rad: F64, opening_m: float) -> float:
         """The smallest distance of arm and hand to anything, over joint vectors (M, A); at most 1 m."""
@@ -80,28 +91,26 @@ def surroundings(scene: PlanningScene, T_world_base: F64) -> Surroundings:
     reach_m = robot.reach_m + ROOM_AROUND_M
     center_m = T_world_base[:3, :3] @ robot.shoulder_m + T_world_base[:3, 3]
     low_m, high_m = center_m - reach_m, center_m + reach_m
-    static = scene.static.within(low_m, high_m)
-    objects = scene.objects.within(low_m, high_m)
-    groups = [scene.static.rows(static), scene.objects.rows(objects)]
-    floor = np.concatenate([scene.floor[static], np.zeros(len(objects), np.bool_)])
-    is_target = np.concatenate([np.zeros(len(static), np.bool_), objects < scene.target_parts])
-    depth = moving.kinematics.depth[moving.arm.owner]
-    immobile = moving.arm.rows(np.flatnonzero(depth == 0))
-    arm = moving.arm.rows(np.flatnonzero(depth > 0))
+    around = scene.around
+    static = around.static.within(low_m, high_m)
+    objects = around.objects.within(low_m, high_m)
+    groups = [around.static.rows(static), around.objects.rows(objects)]
+    floor = np.concatenate([around.floor[static], np.zeros(len(objects), np.bool_)])
+    is_target = np.concatenate([np.zeros(len(static), np.bool_), objects < around.target_parts])
     T_base = np.matmul(T_world_base, moving.kinematics.T_base_frame)[None]
     standing = joined(groups)
-    may_stand = np.broadcast_to(floor, (len(immobile), len(floor)))
-    is_base_stuck = bool(hits(immobile, T_base, standing, 0.0, may_stand).any())
-    arm_may_touch = np.zeros((len(arm), len(standing)), np.bool_)
+    may_stand = np.broadcast_to(floor, (len(moving.standing), len(floor)))
+    is_base_stuck = bool(hits(moving.standing, T_base, standing, 0.0, may_stand).any())
+    arm_may_touch = np.zeros((len(moving.arm), len(standing)), np.bool_)
     if scene.pedestal_m is not None:
         pedestal = place([scene.pedestal_m @ T_world_base[:3, :3].T + T_world_base[:3, 3]])
         standing = joined([standing, pedestal])
         is_target = np.append(is_target, False)
         # What the first joint alone moves turns on the pedestal.
-        arm_may_touch = np.column_stack([arm_may_touch, depth[depth > 0] == 1])
+        arm_may_touch = np.column_stack([arm_may_touch, moving.arm_depth == 1])
     hand_may_touch = np.zeros((len(moving.hand.hulls), len(standing)), np.bool_)
     return Surroundings(
-        scene, T_world_base, standing, is_target, arm, arm_may_touch, hand_may_touch, is_base_stuck
+        scene, T_world_base, standing, is_target, moving.arm, arm_may_touch, hand_may_touch, is_base_stuck
     )
 
 

@@ -26,11 +26,25 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 
+class Shape:
+    """A convex part as coal's polyhedron, built when it is first asked for: most parts never are."""
+
+    __slots__ = ("_built", "_corners_m")
+
+    def __init__(self, corners_m: F32 | F64) -> None:
+        self._corners_m, self._built = corners_m, None
+
+    def __call__(self) -> Any:
+        if self._built is None:
+            self._built = polyhedron(self._corners_m)
+        return self._built
+
+
 @dataclass(frozen=True, eq=False)
 class Hulls:
     """P convex parts that move with O owners; boxes are in the owners' frames."""
 
-    shapes: tuple[Any, ...]  # coal's convex polyhedra
+    shapes: tuple[Shape, ...]
     owner: Ints  # (P,)
     center_m: F64  # (P, 3), of the part's box
     half_m: F64  # (P, 3)
@@ -48,7 +62,7 @@ class Hulls:
 class Placed:
     """F convex parts that stand still, with their boxes along the world's axes."""
 
-    shapes: tuple[Any, ...]
+    shapes: tuple[Shape, ...]
     poses: tuple[Any, ...]  # coal's transforms
     low_m: F64  # (F, 3)
     high_m: F64  # (F, 3)
@@ -76,7 +90,7 @@ def hulls_of(parts_by_owner: Sequence[Sequence[F32]]) -> Hulls:
     owner = [k for k, parts in enumerate(parts_by_owner) for _ in parts]
     low = np.array([p.min(axis=0) for p in parts], np.float64).reshape(-1, 3)
     high = np.array([p.max(axis=0) for p in parts], np.float64).reshape(-1, 3)
-    shapes = tuple(polyhedron(p) for p in parts)
+    shapes = tuple(map(Shape, parts))
     return Hulls(shapes, np.array(owner, np.int64), (low + high) / 2, (high - low) / 2)
 
 
@@ -85,7 +99,7 @@ def place(parts_m: Sequence[F32 | F64]) -> Placed:
     low = np.array([p.min(axis=0) for p in parts_m], np.float64).reshape(-1, 3)
     high = np.array([p.max(axis=0) for p in parts_m], np.float64).reshape(-1, 3)
     here = coal.Transform3s(np.eye(3), np.zeros(3))
-    return Placed(tuple(polyhedron(p) for p in parts_m), (here,) * len(parts_m), low, high)
+    return Placed(tuple(map(Shape, parts_m)), (here,) * len(parts_m), low, high)
 
 
 _objects: WeakKeyDictionary[ObjectModel, Hulls] = WeakKeyDictionary()
@@ -166,7 +180,7 @@ def hits(
         if at != (i, j):
             pose, at = _transform(T_world_owner[i, moving.owner[j]]), (i, j)
         result.clear()
-        if coal.collide(moving.shapes[j], pose, still.shapes[k], still.poses[k], request, result):
+        if coal.collide(moving.shapes[j](), pose, still.shapes[k](), still.poses[k], request, result):
             found[i], touched = True, i
             if first_only:
                 break
@@ -184,7 +198,7 @@ def smallest_gap_m(moving: Hulls, T_world_owner: F64, still: Placed, far_m: floa
             break
         result.clear()
         pose = _transform(T_world_owner[i, moving.owner[j]])
-        gap = coal.distance(moving.shapes[j], pose, still.shapes[k], still.poses[k], request, result)
+        gap = coal.distance(moving.shapes[j](), pose, still.shapes[k](), still.poses[k], request, result)
         best = min(best, max(gap, 0.0))
     return best
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from datagen.schemas.specification import MotionParams
-from datagen.workers.geometry.mesh import F32, F64
-from datagen.workers.motion.collision import Bools, Hulls, Ints, Placed, hits, hulls_of
+from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, hulls_of
 from datagen.workers.robots.gripper import Gripper
 
 # Poses found by inverse kinematics are this near to the asked ones: 0.5 mm, and 0.5 degrees at the palm.
@@ -20,8 +20,6 @@ TOUCH_M = 0.002
 LINE_STEP_M = 0.02
 # The target leaves what it stands on within this rise; only beyond it are contacts counted.
 LIFT_OFF_M = 0.01
-# Grasps whose features are nearer than this are one grasp: a hundredth of a millimetre, or of a degree.
-_SAME = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +27,7 @@ class Hand:
     """A gripper's parts: owners 0, 1 and 2 are the palm, the finger towards +y and the one towards -y."""
 
     hulls: Hulls
+    digest: str  # of the gripper
 
     def poses(self, T_tcp: F64, opening_m: F64) -> F64:
         """Poses (M, 3, 4, 4) of the owners, in the frame of the TCP's poses (M, 4, 4); openings (M,)."""
@@ -39,9 +38,15 @@ class Hand:
         return T
 
 
+_hands: dict[str, Hand] = {}
+
+
 def hand_of(gripper: Gripper) -> Hand:
-    """The gripper's parts, ready for contacts."""
-    return Hand(hulls_of([gripper.palm_parts_m, *gripper.finger_parts_m]))
+    """The gripper's parts, ready for contacts; built once."""
+    if gripper.digest not in _hands:
+        hulls = hulls_of([gripper.palm_parts_m, *gripper.finger_parts_m])
+        _hands[gripper.digest] = Hand(hulls, gripper.digest)
+    return _hands[gripper.digest]
 
 
 def line_offsets_m(length_m: float) -> F64:
@@ -98,33 +103,3 @@ def can_be_lifted(target: Hulls, T_world_target: F64, static: Placed, lift_m: fl
     T = np.repeat(T_world_target[None, None], len(rises), axis=0)
     T[:, 0, 2, 3] += rises
     return not hits(target, T[rises > LIFT_OFF_M], static, -TOUCH_M, first_only=True).any()
-
-
-def best_different(T_tcp: F64, score: F32, count: int) -> Ints:
-    """Rows of at most `count` grasps, best first, that differ from each other.
-
-    In turns of a finer and finer distance: the best grasp left is taken unless it lies near one already
-    taken. A turn by half about the direction of approach, which changes nothing, is no difference: of two
-    grasps that differ in nothing else the better one alone is ever taken.
-    """
-    order = np.argsort(-score, kind="stable")
-    features = np.concatenate(
-        [
-            T_tcp[:, :3, 3] / 0.02,
-            T_tcp[:, :3, 2] / 0.35,
-            # The closing axis as a line: its outer product is the same for both of its directions.
-            (T_tcp[:, :3, 1, None] * T_tcp[:, None, :3, 1]).reshape(-1, 9) / 0.7,
-        ],
-        axis=1,
-    )
-    taken: list[int] = []
-    left = [int(k) for k in order]
-    for apart in (2.0, 1.0, 0.5, _SAME):
-        rest: list[int] = []
-        for k in left:
-            if len(taken) == count:
-                break
-            near = taken and np.linalg.norm(features[taken] - features[k], axis=1).min() < apart
-            (rest if near else taken).append(k)
-        left = rest
-    return np.array(taken, np.int64)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -11,11 +12,10 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.motion.arm_collision import Surroundings, surroundings
 from datagen.workers.motion.cartesian_path import follow_line
-from datagen.workers.motion.collision import Ints
+from datagen.workers.motion.collision import Bools, Ints
 from datagen.workers.motion.grasp_filter import backed, line_offsets_m, raised
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
 from datagen.workers.motion.planning_scene import PlanningScene
-from datagen.workers.motion.reach_table import order_by_distance
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
 # The order of checks of a grasp, cheap ones first: a path is searched only for grasps with approach and
@@ -25,6 +25,10 @@ _STARTS = 3  # tucked poses from which a straight line is tried
 _SEARCHES = 4  # grasps for which a path is searched where none is straight
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
+_FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
+# Poses sorted by distance together; each portion has as many as all before, and these.
+_FIRST_PORTION = 24
+_FILTERED_AT_ONCE = 200
 _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
 
 
@@ -32,9 +36,41 @@ _SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take 
 class _Search:
     """What the grasps of one candidate share."""
 
-    at: Surroundings
+    scene: PlanningScene
+    T_world_base: F64
     T_base_world: F64
-    far: list[_Reachable]  # to which no straight path leads
+    far: list[_Reachable] = field(default_factory=list)  # to which no straight path leads
+    furthest: str = "no_ik"
+
+    @cached_property
+    def at(self) -> Surroundings:
+        return surroundings(self.scene, self.T_world_base)
+
+    def reached(self, stage: str) -> None:
+        """Note how far a try came."""
+        self.furthest = max(self.furthest, stage, key=STAGES.index)
+
+    def holds(self, k: int) -> bool:
+        """Whether the hand holds the object in kept grasp `k`; physics where no arm has asked before."""
+        return self.scene.around.holds(int(self.scene.around.grasp[k]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Goal:
+    """A kept grasp, seen from the base."""
+
+    k: int
+    T_base_tcp: F64  # (4, 4)
+    seeds_rad: F64  # (S, A)
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Joints at a grasp and at its pregrasp."""
+
+    goal: _Goal
+    q_grasp: F64  # (A,)
+    q_pregrasp: F64  # (A,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,93 +91,159 @@ def plan_candidate(
     `skip` are rows of the GraspSet. Depends on the arguments alone: neither on candidates before nor on
     time. `rng` is drawn from only where no grasp has a straight path.
     """
-    rows = np.flatnonzero(~np.isin(prepared.grasp, sorted(skip)))
-    if len(rows) == 0:
-        return PlanReport("no_grasp", None, prepared.grasps_free, 0)
-    T_base_world = inverse(T_world_base)
-    T_base_tcp = np.matmul(T_base_world, prepared.T_world_tcp[rows])
-    distance, seeds = prepared.moving.table.nearest(T_base_tcp, prepared.params.ik_seeds)
-    order = order_by_distance(distance)[: prepared.params.max_grasps_tried]
-    if len(order) == 0:
-        return PlanReport("no_ik", None, prepared.grasps_free, 0)
-    at = surroundings(prepared, T_world_base)
-    search = _Search(at, T_base_world, [])
-    tried: set[int] = set()
-    furthest = 0
-    for k in order.tolist():
-        tried.add(int(prepared.grasp[rows[k]]))
-        outcome, plan = _try_grasp(search, int(rows[k]), T_base_tcp[k], seeds[k])
-        furthest = max(furthest, STAGES.index(outcome))
-        if plan is not None or outcome == "no_start":
-            return PlanReport(outcome, plan, prepared.grasps_free, len(tried))
-    plan = _search_paths(search, rng)
-    if plan is not None:
-        return PlanReport("success", plan, prepared.grasps_free, len(tried))
-    return PlanReport(STAGES[furthest], None, prepared.grasps_free, len(tried))
+    around = prepared.around
+    kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
+    if around.grasps_free == 0 or len(kept) + len(rest) == 0:
+        return PlanReport("no_grasp", None, around.grasps_free, 0)
+    search = _Search(prepared, T_world_base, inverse(T_world_base))
+    plan, tried = None, set[int]()
+    for goals in _goals(prepared, search.T_base_world, kept, rest):
+        tried.update(int(around.grasp[goal.k]) for goal in goals)
+        plan = _try_goals(search, goals)
+        if plan is not None or search.furthest == "no_start":
+            break
+    if plan is None and search.furthest != "no_start":
+        plan = _search_paths(search, rng)
+    outcome = search.furthest if plan is None else "success"
+    return PlanReport(outcome, plan, around.grasps_free, len(tried))
 
 
-def _try_grasp(search: _Search, k: int, T_base_tcp: F64, seeds_rad: F64) -> tuple[str, MotionPlan | None]:
-    """The arm's ways to take one grasp, one a seed, until one leads to a whole plan."""
-    scene, furthest = search.at.scene, "no_ik"
-    params = scene.params
-    T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
-    T_up = np.stack(
-        [search.T_base_world @ raised(scene.T_world_tcp[k], float(r)) for r in line_offsets_m(params.lift_m)]
-    )
-    seen: list[F64] = []
-    for seed in seeds_rad:
-        q_grasp = scene.robot.ik(T_base_tcp, seed)
-        if q_grasp is None or any(np.abs(q_grasp - q).max() < _SAME_RAD for q in seen):
+def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -> Iterator[list[_Goal]]:
+    """At most `max_grasps_tried` of the free poses `kept` and `rest` with seeds near by, in growing batches.
+
+    `kept` come in their own order, best first and such that neighbours differ much; of each portion of them
+    those nearest to a seed come first. Of `rest` those nearest of all come first.
+    """
+    left, batch = prepared.params.max_grasps_tried, _FIRST_BATCH
+    for rows, portion in ((kept, _FIRST_PORTION), (rest, len(rest))):
+        if left == 0:
+            return
+        T_base_tcp = np.matmul(T_base_world, prepared.around.T_world_tcp[rows])
+        within = _is_within_reach(prepared, T_base_world, T_base_tcp)
+        rows, T_base_tcp = rows[within], T_base_tcp[within]
+        end = 0
+        while left > 0 and end < len(rows):
+            start, end = end, min(len(rows), 2 * end + portion)
+            some, near, seeds = slice(start, end), *_near_seeds(prepared, T_base_world, T_base_tcp[start:end])
+            while left > 0 and len(near):
+                # The hand's way is looked at for few at a time: most candidates need no more.
+                free = near[:_FILTERED_AT_ONCE]
+                free, near = free[prepared.around.is_free(rows[some][free])][:left], near[len(free) :]
+                left -= len(free)
+                goals = [_Goal(int(rows[some][g]), T_base_tcp[some][g], seeds[g]) for g in free.tolist()]
+                while goals:
+                    yield goals[:batch]
+                    goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
+
+
+def _near_seeds(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> tuple[Ints, F64]:
+    """Rows of the poses (G, 4, 4) that have seeds near by, nearest first, and seeds (G, S, A) of all.
+
+    Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts.
+    """
+    table, params = prepared.moving.table, prepared.params
+    distance, seeds = table.nearest(T_base_tcp, params.ik_seeds)
+    T_lifted = T_base_tcp.copy()
+    T_lifted[:, :3, 3] += params.lift_m * T_base_world[:3, 2]
+    for T in (backed(T_base_tcp, params.pregrasp_m), T_lifted):
+        some = np.flatnonzero(np.isfinite(distance))
+        distance[some] = np.maximum(distance[some], table.nearest(T[some], 1)[0])
+    return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())], seeds
+
+
+def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
+    """Where the TCP is within the reach: at the grasp, at the pregrasp and at the end of the lift."""
+    robot, params = prepared.robot, prepared.params
+    to_grasp = T_base_tcp[:, :3, 3] - robot.shoulder_m
+    ways = (0.0, -params.pregrasp_m * T_base_tcp[:, :3, 2], params.lift_m * T_base_world[:3, 2])
+    farthest_m = np.max([np.linalg.norm(to_grasp + way, axis=1) for way in ways], axis=0)
+    return farthest_m <= robot.reach_m
+
+
+def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
+    """Look for a plan to some grasps: collisions are checked together, all else one by one."""
+    ways = [way for goal in goals for way in _ways(search.scene, goal)]
+    if not ways:
+        return None
+    search.reached("arm_collision")
+    at = search.at
+    if at.is_base_stuck:
+        return None
+    openings_m = search.scene.around.opening_m[[way.goal.k for way in ways]]
+    free = np.flatnonzero(~at.blocked(np.array([way.q_pregrasp for way in ways]), openings_m))
+    free = free[~at.blocked(np.array([ways[k].q_grasp for k in free]), None)] if len(free) else free
+    for k in free.tolist():
+        if len(at.free_homes) == 0:
+            search.reached("no_start")
+            return None
+        plan = _try_way(search, ways[k])
+        if plan is not None:
+            return plan
+    return None
+
+
+def _ways(scene: PlanningScene, goal: _Goal) -> list[_Way]:
+    """Joints at a grasp and its pregrasp, at most one for each seed."""
+    robot = scene.robot
+    T_pregrasp = backed(goal.T_base_tcp, scene.params.pregrasp_m)
+    ways: list[_Way] = []
+    for seed in goal.seeds_rad:
+        q_grasp = robot.ik(goal.T_base_tcp, seed)
+        if q_grasp is None or any(np.abs(q_grasp - way.q_grasp).max() < _SAME_RAD for way in ways):
             continue
-        seen.append(q_grasp)
-        outcome, plan = _try_arm(search, k, q_grasp, T_back, T_up)
-        furthest = max(furthest, outcome, key=STAGES.index)
-        if plan is not None or outcome == "no_start":
-            return outcome, plan
-    return furthest, None
+        q_pregrasp = robot.ik(T_pregrasp, q_grasp)
+        if q_pregrasp is not None:
+            ways.append(_Way(goal, q_grasp, q_pregrasp))
+    return ways
 
 
-def _try_arm(search: _Search, k: int, q_grasp: F64, T_back: F64, T_up: F64) -> tuple[str, MotionPlan | None]:
-    """On from joints at grasp `k`; `T_back` and `T_up` (K, 4, 4) are the hand's lines away from it."""
-    at, scene = search.at, search.at.scene
-    q_pregrasp = scene.robot.ik(T_back[-1], q_grasp)
-    if q_pregrasp is None:
-        return "no_ik", None
-    opening_m = float(scene.opening_m[k])
-    if (
-        at.is_base_stuck
-        or at.first_arm_blocked(q_grasp[None], is_target_held=False) == 0
-        or at.first_blocked(q_pregrasp[None], opening_m) == 0
-    ):
-        return "arm_collision", None
-    homes = np.flatnonzero(at.free_homes(opening_m))
-    if len(homes) == 0:
-        return "no_start", None
-    back = follow_line(at, T_back, q_grasp, q_pregrasp, is_target_held=False)
+def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
+    """On from joints that are free at a grasp and its pregrasp: both lines and a straight path."""
+    at, scene = search.at, search.scene
+    params, robot = scene.params, scene.robot
+    k, T_base_tcp = way.goal.k, way.goal.T_base_tcp
+    T_up = np.stack(
+        [
+            search.T_base_world @ raised(scene.around.T_world_tcp[k], float(r))
+            for r in line_offsets_m(params.lift_m)
+        ]
+    )
+    search.reached("no_approach")
+    T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
+    # The end of the lift is asked for first: where the arm is too short for it, the lines cost most.
+    if robot.ik(T_up[-1], way.q_grasp) is None:
+        search.reached("no_lift")
+        return None
+    back = follow_line(at, T_back, way.q_grasp, way.q_pregrasp, is_target_held=False)
     if back is None:
-        return "no_approach", None
-    lift = follow_line(at, T_up, q_grasp, None, is_target_held=True)
+        return None
+    search.reached("no_lift")
+    lift = follow_line(at, T_up, way.q_grasp, None, is_target_held=True)
     if lift is None:
-        return "no_lift", None
-    gaps = np.linalg.norm(scene.robot.homes_rad[homes] - q_pregrasp, axis=1)
+        return None
+    search.reached("no_path")
+    homes, opening_m = at.free_homes, float(scene.around.opening_m[k])
+    gaps = np.linalg.norm(robot.homes_rad[homes] - way.q_pregrasp, axis=1)
     found = _Reachable(k, back[::-1], lift, homes[np.argsort(gaps, kind="stable")])
-    step_rad, first_blocked = scene.params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
+    step_rad, first_blocked = params.check_step_rad, partial(at.first_blocked, opening_m=opening_m)
     for home in found.homes[:_STARTS].tolist():
-        if is_line_free(scene.robot.homes_rad[home], q_pregrasp, first_blocked, step_rad):
-            path = straight(scene.robot.homes_rad[home], q_pregrasp, step_rad)
-            return "success", _plan(search, found, home, path)
+        if is_line_free(robot.homes_rad[home], way.q_pregrasp, first_blocked, step_rad):
+            if not search.holds(k):
+                return None
+            path = straight(robot.homes_rad[home], way.q_pregrasp, step_rad)
+            return _plan(search, found, home, path)
     search.far.append(found)
-    return "no_path", None
+    return None
 
 
 def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | None:
     """RRT-Connect to the first grasps that no straight path leads to; they share the iterations evenly."""
-    scene = search.at.scene
+    scene = search.scene
     robot, params = scene.robot, scene.params
     left, far = params.path_iterations, search.far[:_SEARCHES]
     for rank, found in enumerate(far):
         home = int(found.homes[0])
-        first_blocked = partial(search.at.first_blocked, opening_m=float(scene.opening_m[found.k]))
+        first_blocked = partial(search.at.first_blocked, opening_m=float(scene.around.opening_m[found.k]))
         corners, used = connect(
             robot.homes_rad[home],
             found.q_approach_rad[0],
@@ -153,7 +255,7 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
             rng,
         )
         left -= used
-        if corners is not None:
+        if corners is not None and search.holds(found.k):
             path = dense(corners, params.check_step_rad)
             path = shortened(path, first_blocked, params.check_step_rad, _SHORTCUTS, rng)
             return _plan(search, found, home, path)
@@ -161,13 +263,13 @@ def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | Non
 
 
 def _plan(search: _Search, found: _Reachable, home: int, q_reach: F64) -> MotionPlan:
-    scene = search.at.scene
-    opening_m = float(scene.opening_m[found.k])
+    scene = search.scene
+    opening_m = float(scene.around.opening_m[found.k])
     ways = (q_reach, found.q_approach_rad)
     length = sum(float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum()) for q in ways)
     some = np.linspace(0, len(q_reach) - 1, _CLEARANCE_POSES).round().astype(np.int64)
     clearance_m = search.at.clearance_m(q_reach[some], opening_m)
-    grasp = int(scene.grasp[found.k])
+    grasp = int(scene.around.grasp[found.k])
     return MotionPlan(
         grasp, home, q_reach, found.q_approach_rad, found.q_lift_rad, opening_m, length, clearance_m
     )

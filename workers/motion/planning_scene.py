@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -11,6 +14,7 @@ from datagen.workers.bases.clearance import STEP_M
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import yaw_pose
 from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.houses.house import House
 from datagen.workers.motion.collision import (
     Bools,
     Hulls,
@@ -24,8 +28,9 @@ from datagen.workers.motion.collision import (
     place_object,
 )
 from datagen.workers.motion.forward_kinematics import ForwardKinematics, forward_kinematics
-from datagen.workers.motion.grasp_filter import Hand, best_different, can_be_lifted, free_grasps, hand_of
+from datagen.workers.motion.grasp_filter import Hand, can_be_lifted, free_grasps, hand_of
 from datagen.workers.motion.reach_table import ReachTable, reach_table
+from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
 
@@ -35,38 +40,82 @@ ROOM_AROUND_M = 0.25  # how far elbows and the hand reach out beyond the TCP
 _SAME_PART_M = 1e-4
 # Deeper in another object than any settled one; settling allows 5 mm, by hulls of its own.
 _SUNK_M = 0.01
+# Half the side of the cube of static parts, for every arm that is no longer than 1.25 m.
+_AROUND_M = 3.0
+# How far from the target's middle a hand or a lifted target can be, beside the length of its way.
+_HAND_ROOM_M = 0.6
+_MOVINGS_KEPT = 128
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_NOTHING = place([])
 
 
 @dataclass(frozen=True, eq=False)
 class Moving:
     """A robot's shape for planning, built once a robot.
 
-    Owners of `arm` are the frames of `kinematics`. The hand is not in it: it comes as `hand`, with its
-    fingers as far apart as the grasp asks.
+    Owners of `arm` and `standing` are the frames of `kinematics`. The hand is in neither: it comes as `hand`,
+    with its fingers as far apart as the grasp asks.
     """
 
     kinematics: ForwardKinematics
-    arm: Hulls
+    standing: Hulls  # the links that no joint moves
+    arm: Hulls  # the others
+    arm_depth: Ints  # (P,), number of joints that move each part of `arm`
     hand: Hand
     table: ReachTable
 
 
-@dataclass(frozen=True, eq=False)
-class PlanningScene:
-    """A scene and a robot, ready for `plan_candidate`. Kept grasps come with both turns of the hand."""
+class FreePoses:
+    """Which of N poses are free; each is looked at when it is first asked for."""
 
-    robot: Robot
-    params: MotionParams
-    moving: Moving
+    def __init__(self, count: int, look: Callable[[Ints], Bools]) -> None:
+        self._state = np.zeros(count, np.int8)  # 1 free, -1 not, 0 not known
+        self._look = look
+
+    def __call__(self, rows: Ints) -> Bools:
+        """Whether the poses of some rows are free."""
+        new = rows[self._state[rows] == 0]
+        if len(new):
+            self._state[new] = np.where(self._look(new), 1, -1)
+        return self._state[rows] == 1
+
+
+@dataclass(frozen=True, eq=False)
+class HandScene:
+    """A scene and a hand: what stands around, and the target's grasps that the hand alone can take.
+
+    It depends on no arm, so that all robots with one hand share it. The K poses are those of the GraspSet,
+    each as it is and turned by half a turn about its approach.
+    """
+
     static: Placed  # convex parts of the house around
     floor: Bools  # of the static parts, which are low enough to stand on
     objects: Placed  # the target's parts, then those of the other objects
     target_parts: int
-    pedestal_m: F32 | None  # corners of its convex body in the base frame
-    grasps_free: int  # of the whole GraspSet
     grasp: Ints  # (K,), row of the GraspSet
     T_world_tcp: F64  # (K, 4, 4)
     opening_m: F64  # (K,)
+    is_free: FreePoses
+    kept: Ints  # rows of the poses that are free among the grasps that are looked at in every scene
+    rest: Ints  # rows of the poses of all other grasps, which may be free
+    grasps_free: int  # grasps of `kept`
+    holds: Callable[[int], bool]  # whether a row of the GraspSet holds the object
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningScene:
+    """A scene and a robot, ready for `plan_candidate`."""
+
+    robot: Robot
+    params: MotionParams
+    moving: Moving
+    around: HandScene
+    pedestal_m: F32 | None  # corners of its convex body in the base frame
+
+    @property
+    def grasps_free(self) -> int:
+        """Grasps of the target that the hand alone can take."""
+        return self.around.grasps_free
 
 
 def prepare(
@@ -74,55 +123,126 @@ def prepare(
     robot: Robot,
     grasps: GraspSet,
     params: MotionParams,
-    max_grasps: int,
+    per_scene: int,
     base_radius_m: float,
+    draw: int = 0,
 ) -> PlanningScene:
-    """Place the scene's parts, and keep at most `max_grasps` good and different grasps the hand can take.
+    """A robot among the scene's parts, with the grasps that its hand can take there.
 
+    The hand's way is looked at for the first `per_scene` grasps, and for others when a candidate needs them.
     `base_radius_m` is the radius of the pedestal of a robot that has no base of its own.
     """
-    moving = moving_of(robot)
+    around = _hand_scene(scene, robot, grasps, params, per_scene)
+    pedestal_m = _pedestal_m(robot, base_radius_m) if robot.base_radius_m is None else None
+    return PlanningScene(robot, params, moving_of(robot, draw), around, pedestal_m)
+
+
+# By scene, for as long as it lives; the key holds the GraspSet, so that its identity stays its own.
+_HandSceneKey = tuple[str, GraspSet, MotionParams, int, float]
+_hand_scenes: WeakKeyDictionary[SettledScene, dict[_HandSceneKey, HandScene]] = WeakKeyDictionary()
+
+
+def _hand_scene(
+    scene: SettledScene, robot: Robot, grasps: GraspSet, params: MotionParams, per_scene: int
+) -> HandScene:
+    around_m = max(_AROUND_M, 2 * (robot.reach_m + ROOM_AROUND_M))
+    known = _hand_scenes.setdefault(scene, {})
+    key = (robot.gripper.digest, grasps, params, per_scene, around_m)
+    if key not in known:
+        known[key] = hand_scene(scene, hand_of(robot.gripper), grasps, params, per_scene, around_m)
+    return known[key]
+
+
+def hand_scene(
+    scene: SettledScene, hand: Hand, grasps: GraspSet, params: MotionParams, per_scene: int, around_m: float
+) -> HandScene:
+    """Place the scene's parts up to `around_m` from the target, and look at the first `per_scene` grasps.
+
+    Where none of them is free, all are looked at.
+    """
     target, T_world_target = scene.models[0], scene.T_world_object[0]
-    around_m = 2 * (robot.reach_m + ROOM_AROUND_M)
     static, floor = _static_around(scene, around_m)
     placed_target = place_object(target, T_world_target)
     others = [place_object(m, T) for m, T in zip(scene.models[1:], scene.T_world_object[1:], strict=True)]
-    around = joined([static, *others])
-    T_world_tcp = np.matmul(T_world_target, grasps.T_object_tcp)
-    opening_m = grasps.opening_m.astype(np.float64)
-    free = np.zeros(len(grasps), np.bool_)
+    # The hand is never farther from the target than this: the other parts need not be looked at.
+    center, room_m = scene.target_center_m, _HAND_ROOM_M + max(params.pregrasp_m, params.lift_m)
+    near = static.rows(static.within(center - room_m, center + room_m))
+    around = joined([near, *others])
     hulls = object_hulls(target)
     # A target within another thing can be held by nothing, whatever the hand alone may do there.
     is_sunk = (
         bool(hits(hulls, T_world_target[None, None], joined(others), -_SUNK_M).any()) if others else False
     )
-    if not is_sunk and can_be_lifted(hulls, T_world_target, static, params.lift_m):
-        free = free_grasps(moving.hand, T_world_tcp, opening_m, around, placed_target, params)
-    rows = np.flatnonzero(free)
-    kept = rows[best_different(T_world_tcp[rows], grasps.score[rows], max_grasps)]
-    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    turned = np.matmul(T_world_tcp[kept], half_turn)
-    fits = free_grasps(moving.hand, turned, opening_m[kept], around, placed_target, params)
-    grasp = np.concatenate([kept, kept[fits]])
-    T = np.concatenate([T_world_tcp[kept], turned[fits]])
-    return PlanningScene(
-        robot,
-        params,
-        moving,
+    turned = _turned_grasps(hand, grasps, target, params)
+    T_world_tcp = np.matmul(T_world_target, turned.T_object_tcp)
+
+    def look(rows: Ints) -> Bools:
+        free = turned.is_free(rows)
+        some = rows[free]
+        free[free] = free_grasps(hand, T_world_tcp[some], turned.opening_m[some], around, _NOTHING, params)
+        return free
+
+    is_free = FreePoses(len(T_world_tcp), look)
+    every = np.arange(len(T_world_tcp))
+    if is_sunk or not can_be_lifted(hulls, T_world_target, near, params.lift_m):
+        every = every[:0]
+    first, rest = every[: 2 * per_scene], every[2 * per_scene :]
+    kept = first[is_free(first)]
+    if len(kept) == 0:
+        kept, rest = rest[is_free(rest)], rest[:0]
+    return HandScene(
         static,
         floor,
         joined([placed_target, *others]),
         len(placed_target),
-        _pedestal_m(robot, base_radius_m) if robot.base_radius_m is None else None,
-        len(rows),
-        grasp,
-        T,
-        opening_m[grasp],
+        turned.grasp,
+        T_world_tcp,
+        turned.opening_m,
+        is_free,
+        kept,
+        rest,
+        len(np.unique(turned.grasp[kept])),
+        grasps.holds,
     )
 
 
-def moving_of(robot: Robot) -> Moving:
-    """The robot's kinematics, shape and reach table."""
+@dataclass(frozen=True, eq=False)
+class _TurnedGrasps:
+    """Poses of a GraspSet, each as it is and turned by half a turn; free where the hand clears the target."""
+
+    grasp: Ints  # (K,)
+    T_object_tcp: F64  # (K, 4, 4)
+    opening_m: F64  # (K,)
+    is_free: FreePoses
+
+
+_turned: WeakKeyDictionary[GraspSet, dict[tuple[str, MotionParams], _TurnedGrasps]] = WeakKeyDictionary()
+
+
+def _turned_grasps(hand: Hand, grasps: GraspSet, target: ObjectModel, params: MotionParams) -> _TurnedGrasps:
+    """Built once an object: no scene changes them."""
+    known, key = _turned.setdefault(grasps, {}), (hand.digest, params)
+    if key not in known:
+        grasp = np.repeat(np.arange(len(grasps)), 2)
+        T = np.repeat(grasps.T_object_tcp, 2, axis=0)
+        T[1::2] = T[1::2] @ _HALF_TURN
+        opening_m = grasps.opening_m[grasp].astype(np.float64)
+        placed = place_object(target, np.eye(4))
+
+        def look(rows: Ints) -> Bools:
+            return free_grasps(hand, T[rows], opening_m[rows], _NOTHING, placed, params)
+
+        known[key] = _TurnedGrasps(grasp, T, opening_m, FreePoses(len(T), look))
+    return known[key]
+
+
+def moving_of(robot: Robot, draw: int = 0) -> Moving:
+    """The robot's kinematics, shape and reach table; built once for all mount heights of an arm."""
+    # Copies of an arm at other heights share their parts; the robot kept here keeps their identity.
+    key = (id(robot.link_parts_m), draw)
+    if key in _movings:
+        _movings.move_to_end(key)
+        return _movings[key][1]
     kinematics = forward_kinematics(robot)
     T_tcp = kinematics.T_base_frame[-1]
     hand = robot.gripper.parts_at(robot.gripper.max_opening_m)
@@ -130,7 +250,23 @@ def moving_of(robot: Robot) -> Moving:
         () if _is_of_hand(parts, T, T_tcp, hand) else parts
         for parts, T in zip(robot.link_parts_m, kinematics.T_base_frame, strict=False)
     ]
-    return Moving(kinematics, hulls_of(parts), hand_of(robot.gripper), reach_table(robot, kinematics))
+    hulls = hulls_of(parts)
+    depth = kinematics.depth[hulls.owner]
+    moving = Moving(
+        kinematics,
+        hulls.rows(np.flatnonzero(depth == 0)),
+        hulls.rows(np.flatnonzero(depth > 0)),
+        depth[depth > 0],
+        hand_of(robot.gripper),
+        reach_table(robot, kinematics, draw),
+    )
+    _movings[key] = (robot, moving)
+    if len(_movings) > _MOVINGS_KEPT:
+        _movings.popitem(last=False)
+    return moving
+
+
+_movings: OrderedDict[tuple[int, int], tuple[Robot, Moving]] = OrderedDict()
 
 
 def pose_of_base(base_xy_m: F64, base_height_m: float, target_center_m: F64) -> F64:
@@ -158,14 +294,25 @@ def _is_of_hand(parts: tuple[F32, ...], T_base_link: F64, T_base_tcp: F64, hand:
 def _static_around(scene: SettledScene, around_m: float) -> tuple[Placed, Bools]:
     """The house's parts within a cube around the target, and which of them a base stands on."""
     center = scene.target_center_m
-    parts = [
-        part
-        for body in scene.house.house.bodies
-        for part in body.convex_parts_m
-        if (part.min(axis=0) < center + around_m).all() and (part.max(axis=0) > center - around_m).all()
-    ]
+    parts, low_m, high_m = _house_parts(scene.house.house)
+    near = ((low_m < center + around_m) & (high_m > center - around_m)).all(axis=1)
+    parts = [parts[k] for k in np.flatnonzero(near).tolist()]
     static = place(parts)
     return static, static.high_m[:, 2] <= STEP_M
+
+
+_parts_of_houses: WeakKeyDictionary[House, tuple[list[F32], F32, F32]] = WeakKeyDictionary()
+
+
+def _house_parts(house: House) -> tuple[list[F32], F32, F32]:
+    """All convex parts of a house with their boxes, (P, 3) each."""
+    if house not in _parts_of_houses:
+        parts = [part for body in house.bodies for part in body.convex_parts_m]
+        corners = np.concatenate(parts)
+        first = np.cumsum([0, *map(len, parts[:-1])])
+        low, high = (f.reduceat(corners, first) for f in (np.minimum, np.maximum))
+        _parts_of_houses[house] = (parts, low, high)
+    return _parts_of_houses[house]
 
 
 def _pedestal_m(robot: Robot, radius_m: float) -> F32 | None:

@@ -3,85 +3,137 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.collision import Ints
 from datagen.workers.motion.forward_kinematics import ForwardKinematics
 from datagen.workers.robots.robot import Robot
 
-_SAMPLES = 16384
-_PROBES = 1024
+_SAMPLES = 65536
+_PROBES = 2048
 # Poses further from all samples than this share of reachable ones are not asked for.
 _QUANTILE = 0.97
-_METRES_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions
+_LENGTHS_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions, in arm lengths
+_NOT_NEAREST = 0.3  # by how much seeds may be farther than the nearest: halves the time to find them
+_DIGITS = 6  # of an arm's numbers, in its own length: arms that are scaled copies share them
 
 
 @dataclass(frozen=True, eq=False)
-class ReachTable:
-    """Samples by hand pose. Where the first joint turns about the mount's z axis, poses are compared after
-    turning the hand to the front, so that this joint need not be sampled.
+class _Samples:
+    """Joint vectors by pose of the wrist, with the arm's length as unit: all scales of an arm share them.
+
+    Where the first joint turns about the mount's z axis, poses are compared after turning the hand to the
+    front, so that this joint need not be sampled.
     """
 
     q_rad: F64  # (N, A)
     azimuth_rad: F64  # (N,), by which the hand was turned back to the front
     tree: Any
     turns: bool
-    limit_m: float  # reachable poses are nearly all nearer than this to a sample
+    limit: float  # reachable poses are nearly all nearer than this to a sample
+
+
+@dataclass(frozen=True, eq=False)
+class ReachTable:
+    """The samples for one arm. Its wrist is the frame of the last link that no finger moves."""
+
+    samples: _Samples
+    length_m: float  # from the mount to the wrist with all joints at zero
+    tcp_wrist_m: F64  # (3,), in the TCP frame
     lower_rad: F64  # (A,)
     upper_rad: F64  # (A,)
 
     def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
         """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
 
-        Beyond the limit distances are infinite and seeds are of no use.
+        Distances are in arm lengths. Beyond the limit they are infinite and seeds are of no use.
         """
-        features, azimuth = _features(T_base_tcp, self.turns)
+        found = self.samples
+        wrist = (T_base_tcp[:, :3, :3] @ self.tcp_wrist_m + T_base_tcp[:, :3, 3]) / self.length_m
+        features, azimuth = _features(wrist, T_base_tcp[:, :3, :3], found.turns)
         ranks = list(range(1, count + 1))
-        distance, row = self.tree.query(features, k=ranks, distance_upper_bound=self.limit_m)
-        row = np.where(np.isfinite(distance), row, row[:, :1]) % len(self.q_rad)
-        seeds = self.q_rad[row]
-        if self.turns:
-            seeds[:, :, 0] += azimuth[:, None] - self.azimuth_rad[row]
+        distance, row = found.tree.query(
+            features, k=ranks, eps=_NOT_NEAREST, distance_upper_bound=found.limit
+        )
+        row = np.where(np.isfinite(distance), row, row[:, :1]) % len(found.q_rad)
+        seeds = found.q_rad[row]
+        if found.turns:
+            seeds[:, :, 0] += azimuth[:, None] - found.azimuth_rad[row]
             seeds[:, :, 0] = (seeds[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
         return distance[:, 0], np.clip(seeds, self.lower_rad, self.upper_rad)
 
 
-def reach_table(robot: Robot, kinematics: ForwardKinematics) -> ReachTable:
-    """The table of a robot; equal robots have equal tables."""
-    rng = np.random.Generator(np.random.PCG64(0))
+def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:
+    """The table of a robot; equal robots have equal tables. `draw` is another draw of its samples."""
     lower = np.maximum(robot.q_lower_rad, -np.pi)
     upper = np.minimum(robot.q_upper_rad, np.pi)
-    q = rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
-    axis = kinematics.first[0, :3, :3]  # the cross product with the first joint's axis
-    turns = bool(
-        kinematics.turns[0] and abs(axis[1, 0] - 1) < 1e-6 and np.abs(kinematics.first[0, :2, 3]).max() < 1e-6
+    T_tcp = kinematics.T_base_frame[-1]
+    wrist_m = kinematics.T_base_frame[int(np.argmax(kinematics.depth == len(lower))), :3, 3]
+    length_m = float(np.linalg.norm(wrist_m))
+
+    def shared(T: F64) -> bytes:
+        return (np.round(_with_unit(T, length_m), _DIGITS) + 0.0).tobytes()  # no negative zero
+
+    T_wrist = T_tcp.copy()
+    T_wrist[:3, 3] = wrist_m
+    samples = _samples(
+        shared(kinematics.first),
+        shared(kinematics.second),
+        kinematics.turns,
+        shared(T_wrist),
+        lower.tobytes(),
+        upper.tobytes(),
+        draw,
     )
-    features, azimuth = _features(kinematics.tcp(q), turns)
+    return ReachTable(samples, length_m, T_tcp[:3, :3].T @ (wrist_m - T_tcp[:3, 3]), lower, upper)
+
+
+@lru_cache(maxsize=16)
+def _samples(
+    first: bytes,
+    second: bytes,
+    turns: tuple[bool, ...],
+    T_wrist: bytes,
+    lower_rad: bytes,
+    upper_rad: bytes,
+    draw: int,
+) -> _Samples:
+    """Made of the rounded numbers alone, so that it matters not which scale was asked for first."""
+    P, S, T = (np.frombuffer(m).reshape(-1, 4, 4) for m in (first, second, T_wrist))
+    kinematics = ForwardKinematics(P, S, turns, T, np.array([len(turns)]))
+    rng = np.random.Generator(np.random.PCG64(draw))
+    lower, upper = np.frombuffer(lower_rad), np.frombuffer(upper_rad)
+    q = rng.uniform(lower, upper, (_SAMPLES + _PROBES, len(lower)))
+    axis = P[0, :3, :3]  # the cross product with the first joint's axis
+    is_upright = bool(turns[0] and abs(axis[1, 0] - 1) < 1e-6 and np.abs(P[0, :2, 3]).max() < 1e-6)
+    poses = kinematics.tcp(q)
+    features, azimuth = _features(poses[:, :3, 3], poses[:, :3, :3], is_upright)
     tree = KDTree(features[:_SAMPLES])
     gaps, _ = tree.query(features[_SAMPLES:])
-    return ReachTable(
-        q[:_SAMPLES], azimuth[:_SAMPLES], tree, turns, float(np.quantile(gaps, _QUANTILE)), lower, upper
-    )
+    limit = float(np.quantile(gaps, _QUANTILE))
+    return _Samples(q[:_SAMPLES], azimuth[:_SAMPLES], tree, is_upright, limit)
 
 
-def _features(T_base_tcp: F64, turns: bool) -> tuple[F64, F64]:
+def _with_unit(T: F64, length_m: float) -> F64:
+    """Matrices (..., 4, 4) with their translations in another unit."""
+    out = T.copy()
+    out[..., :3, 3] /= length_m
+    return out
+
+
+def _features(p: F64, R: F64, turns: bool) -> tuple[F64, F64]:
     """Position, approach and closing axis as (G, 9), and the azimuth (G,) they were turned back by."""
-    p, R = T_base_tcp[:, :3, 3], T_base_tcp[:, :3, :3]
     azimuth = np.arctan2(p[:, 1], p[:, 0]) if turns else np.zeros(len(p))
     c, s = np.cos(azimuth), np.sin(azimuth)
-    vectors = np.stack([p, R[:, :, 2] * _METRES_PER_UNIT, R[:, :, 1] * _METRES_PER_UNIT], axis=1)  # (G, 3, 3)
+    vectors = np.stack(
+        [p, R[:, :, 2] * _LENGTHS_PER_UNIT, R[:, :, 1] * _LENGTHS_PER_UNIT], axis=1
+    )  # (G, 3, 3)
     x, y = vectors[..., 0], vectors[..., 1]
     turned = np.stack(
         [x * c[:, None] + y * s[:, None], y * c[:, None] - x * s[:, None], vectors[..., 2]], axis=2
     )
     return turned.reshape(len(p), 9), azimuth
-
-
-def order_by_distance(distance_m: F64) -> Ints:
-    """Rows at finite distances, nearest first."""
-    rows = np.argsort(distance_m, kind="stable")
-    return rows[np.isfinite(distance_m[rows])]

@@ -73,7 +73,8 @@ def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     return _built(name, reach_m, 0.0).at_height(base_height_m)
 
 
-@lru_cache(maxsize=64)
+# More than a scaled arm has reaches in whole centimetres.
+@lru_cache(maxsize=128)
 def _built(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     # Imported when asked for, so that limits can be read without a simulator.
     build = entry({name: "datagen.workers.robots.robot:Robot"}, name, "--robot")

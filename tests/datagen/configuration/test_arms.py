@@ -11,6 +11,7 @@ import pytest
 from datagen import cli
 from datagen.configuration import arms
 from datagen.configuration.arms import (
+    REACH_STEP_M,
     complete_arm,
     narrow_candidates,
     refuse_missing_packages,
@@ -110,7 +111,8 @@ def test_narrowed_candidates_suit_the_robot(robot: str) -> None:
 def test_the_scaled_family_leaves_the_papers_ranges_alone() -> None:
     fields: dict[str, Any] = {}
     narrow_candidates(fields, "panda-scaled")
-    assert Specification.model_validate(SOURCES | fields).candidates == CandidateParams()
+    narrowed = Specification.model_validate(SOURCES | fields).candidates
+    assert narrowed == CandidateParams(arm_reach_step_m=REACH_STEP_M)
 
 
 @pytest.mark.parametrize(

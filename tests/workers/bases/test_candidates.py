@@ -156,3 +156,17 @@ def test_cells_come_again_only_where_too_few_serve() -> None:
 def test_a_scene_without_such_a_place_has_no_candidates(params: dict[str, object]) -> None:
     chosen = CandidateParams.model_validate(params)
     assert draw_candidates(TARGET, OBSTACLES, chosen, np.random.default_rng(0)) is None
+
+
+@given(st.integers(0, 2**32), st.floats(0.3, 0.9), st.floats(0.01, 0.1))
+@settings(max_examples=50)
+def test_reaches_are_whole_steps_within_their_range(seed: int, low: float, width: float) -> None:
+    limits = {"low": low, "high": low + width}
+    drawn = draw(seed, per_scene=20, robot_per_candidate=True, arm_reach_m=limits)
+    stepped = draw(seed, per_scene=20, robot_per_candidate=True, arm_reach_m=limits, arm_reach_step_m=0.01)
+    np.testing.assert_array_equal(stepped.base_xy_m, drawn.base_xy_m)
+    reach_m = stepped.arm_reach_m.astype(np.float64)
+    assert np.abs(reach_m - drawn.arm_reach_m).max() <= 0.005 + 1e-6
+    assert (reach_m >= low - 1e-6).all() and (reach_m <= low + width + 1e-6).all()
+    inside = (reach_m > low + 1e-6) & (reach_m < low + width - 1e-6)
+    np.testing.assert_allclose(reach_m[inside] * 100, np.round(reach_m[inside] * 100), atol=1e-4)

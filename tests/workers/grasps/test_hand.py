@@ -15,7 +15,7 @@ from datagen.workers.geometry.transforms import pose
 from datagen.workers.grasps.contacts import Contacts
 from datagen.workers.grasps.floating_hand import PULLS, HandTest, held_trials
 from datagen.workers.grasps.hand_clearance import APPROACH_M, HandClearance, lowest_m
-from datagen.workers.grasps.hand_poses import flipped, hand_poses, varied
+from datagen.workers.grasps.hand_poses import hand_poses, varied
 from tests.workers.grasps.shapes import TIP_M, bowl_model, box_gripper
 from tests.workers.worlds import box_model, box_vertices
 
@@ -46,13 +46,6 @@ def test_frames_are_right_handed_and_put_the_contacts_on_the_pads() -> None:
         off = np.abs(ends[:, :, 0]).max(axis=0) + np.abs(np.abs(ends[:, :, 1]) - 0.015).max(axis=0)
         row = int(off.argmin())
         assert off[row] < 1e-9 and (np.abs(ends[:, row, 2]) <= TIP_M).all()
-
-
-def test_the_flip_swaps_the_fingers_and_keeps_the_approach() -> None:
-    T = poses_around(1, 10)
-    np.testing.assert_array_equal(flipped(T)[:, :3, 2:], T[:, :3, 2:])
-    np.testing.assert_array_equal(flipped(T)[:, :3, :2], -T[:, :3, :2])
-    np.testing.assert_array_equal(flipped(flipped(T)), T)
 
 
 def test_varied_poses_spread_before_they_crowd() -> None:
@@ -139,6 +132,18 @@ def test_friction_decides_where_coulomb_says() -> None:
 
 def test_physics_that_breaks_holds_nothing() -> None:
     assert not hold(pull_mps2=float("nan")).any()
+
+
+def test_a_score_depends_on_its_block_alone() -> None:
+    """The first of many hands end as they do among as many as are scored together."""
+    box = box_model("box", (0.06, 0.04, 0.08))
+    T, opening_m = np.tile(FROM_ABOVE, (100, 1, 1)), np.full(100, 0.06)
+    test = replace(HandTest(), hands_at_once=32, object_friction=0.2, finger_friction=0.5)
+    many, few = (
+        held_trials(box.convex_parts_m, 1.0, GRIPPER, T[:n], opening_m[:n], np.random.default_rng(0), test)
+        for n in (100, 64)
+    )
+    np.testing.assert_array_equal(many[:64], few)
 
 
 def test_trials_repeat_to_the_bit_and_none_make_none() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from datagen.workers.motion.forward_kinematics import forward_kinematics
 from datagen.workers.motion.planning_scene import moving_of
-from datagen.workers.motion.reach_table import order_by_distance, reach_table
+from datagen.workers.motion.reach_table import reach_table
 from datagen.workers.robots import ROBOTS, open_robot, robot_limits
 from datagen.workers.robots.robot import Robot
 from tests.workers.motion.tables import arm
@@ -48,7 +48,7 @@ def test_the_hand_is_taken_off_the_arm(robot: Robot) -> None:
     moving = moving_of(robot)
     parts = sum(len(p) for p in robot.link_parts_m)
     hand = len(robot.gripper.parts_at(robot.gripper.max_opening_m))
-    assert len(moving.arm) + len(moving.hand.hulls) == parts
+    assert len(moving.standing) + len(moving.arm) + len(moving.hand.hulls) == parts
     assert len(moving.hand.hulls) == hand
 
 
@@ -69,5 +69,23 @@ def test_the_table_refuses_what_is_far_out_of_reach() -> None:
     far = np.tile(np.eye(4), (2, 1, 1))
     far[:, 0, 3] = (1.5, -2.0)
     distance, _ = table.nearest(far, 1)
-    assert len(order_by_distance(distance)) == 0
-    np.testing.assert_array_equal(order_by_distance(np.array([0.3, 0.1, np.inf, 0.2])), [1, 3, 0])
+    assert not np.isfinite(distance).any()
+
+
+def test_arms_that_are_scaled_copies_share_one_table() -> None:
+    """Short arms too, which carry a tube between the flange and a hand that is not scaled."""
+    tables = [reach_table(r, forward_kinematics(r)) for r in (arm(0.45), arm(0.6), arm(0.95))]
+    assert len({id(table.samples) for table in tables}) == 1
+    assert tables[0].length_m < tables[1].length_m < tables[2].length_m
+    other = reach_table(arm(0.6), forward_kinematics(arm(0.6)), draw=1)
+    assert not np.array_equal(other.samples.q_rad, tables[1].samples.q_rad)
+
+
+@pytest.mark.parametrize("reach_m", [0.45, 0.7, 1.0])
+def test_seeds_of_a_shared_table_lead_to_the_poses_of_each_arm(reach_m: float) -> None:
+    robot = arm(reach_m)
+    kinematics = forward_kinematics(robot)
+    T = kinematics.tcp(joints(robot, 60))
+    distance, seeds = reach_table(robot, kinematics).nearest(T, 3)
+    near = np.flatnonzero(np.isfinite(distance))
+    assert np.mean([any(robot.ik(T[k], s) is not None for s in seeds[k]) for k in near]) > 0.9

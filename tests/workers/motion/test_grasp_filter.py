@@ -8,7 +8,6 @@ from datagen.schemas.specification import MotionParams
 from datagen.workers.geometry.transforms import translation
 from datagen.workers.motion.collision import object_hulls, place, place_object
 from datagen.workers.motion.grasp_filter import (
-    best_different,
     can_be_lifted,
     free_grasps,
     hand_of,
@@ -80,21 +79,3 @@ def test_line_offsets_span_the_line_in_small_steps() -> None:
         assert (offsets[0], offsets[-1]) == (0.0, length_m)
         assert 0 < np.diff(offsets).max() <= 0.02 + 1e-9
     np.testing.assert_array_equal(line_offsets_m(0.0), [0.0])
-
-
-def test_the_best_are_taken_and_what_differs_from_them() -> None:
-    T = np.tile(np.eye(4), (6, 1, 1))
-    T[:, 0, 3] = [0.0, 0.001, 0.002, 0.2, 0.201, 0.202]
-    score = np.array([0.9, 1.0, 0.8, 0.5, 0.6, 0.4], np.float32)
-    np.testing.assert_array_equal(best_different(T, score, 2), [1, 4])
-    np.testing.assert_array_equal(best_different(T, score, 6), [1, 4, 0, 2, 3, 5])
-    assert len(best_different(T[:0], score[:0], 4)) == 0
-
-
-def test_a_grasp_and_its_half_turn_are_one() -> None:
-    """Else each hand pose would be planned twice, and an attempt would repeat what has just failed."""
-    T = np.tile(np.eye(4), (4, 1, 1))
-    T[2:, 0, 3] = 0.2
-    T[[1, 3], :2, :2] *= -1
-    score = np.array([0.8, 0.9, 0.7, 0.7], np.float32)
-    np.testing.assert_array_equal(best_different(T, score, 4), [1, 2])
