@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.configuration.specify import layout_of, manifest_of, specify
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
 from datagen.jobs.job import JobPlan, JobRun, make_missing, open_recorder
 from datagen.jobs.options import JobOptions
 from datagen.schemas.errors import InputError

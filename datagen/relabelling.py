@@ -20,7 +20,7 @@ from datagen.cluster.retry_policy import RetryPolicy
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import AttemptResult
-from datagen.configuration.specify import manifest_of
+from datagen.configuration.manifest import manifest_of
 from datagen.configuration.stored_scenes import StoredScenes, specify_again
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError

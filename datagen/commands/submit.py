@@ -8,7 +8,8 @@ from typing import Annotated, Literal, Unpack
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
-from datagen.configuration.specify import layout_of, manifest_of, specify
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
 from datagen.configuration.stored_scenes import (
     layout_again,
     open_stored_scenes,

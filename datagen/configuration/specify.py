@@ -1,8 +1,7 @@
-"""From options and a TOML file to a specification, a layout and a manifest."""
+"""From options and a TOML file to a specification and a layout."""
 
 from __future__ import annotations
 
-import platform
 import tomllib
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -11,8 +10,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from datagen import __version__
-from datagen.cluster.preflight import versions_of
 from datagen.configuration.arms import (
     ARM_PACKAGES,
     arm_versions,
@@ -22,9 +19,7 @@ from datagen.configuration.arms import (
     robot_of,
 )
 from datagen.schemas.errors import InputError, choices
-from datagen.schemas.fields import SCHEMAS
-from datagen.schemas.record_files import utc_now
-from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.run_records import Layout
 from datagen.schemas.specification import Source, Specification
 from datagen.schemas.untrusted_files import read_regular
 from datagen.workers.houses.house import HouseSource
@@ -43,9 +38,6 @@ _MAX_DEPTH = 16
 _ENGINE_PACKAGES = {"sapien": "sapien", "pybullet": "pybullet", "embree": "embreex"}
 _SCENES_PER_SHARD = 32
 _SHARDS_AT_LEAST = 8
-
-
-_LIBRARIES = ("numpy", "scipy", "embreex", "sapien", "pybullet", "zarr", "obstore", "ray", "trimesh")
 
 
 def specify(
@@ -211,24 +203,3 @@ def put_field(fields: dict[str, Any], name: str, value: Any, config: Path | None
             raise InputError(config or "", parent, "is a value, not a section", f"Write [{parent}]")
         fields = below
     fields[leaf] = value
-
-
-def manifest_of(
-    spec: Specification, layout: Layout, sources: dict[str, str], schema_version: int | None = None
-) -> Manifest:
-    """The manifest of a new run; `schema_version` is that of the run whose scenes are labelled."""
-    source = load_label_source(spec.label_source)
-    newest = SCHEMAS[source.schema].version
-    return Manifest(
-        spec=spec,
-        spec_hash=spec.hash(),
-        schema_name=source.schema,
-        schema_version=newest if schema_version is None else min(schema_version, newest),
-        layout=layout,
-        code_version=__version__,
-        libraries={name: found for name, found in versions_of(_LIBRARIES).items() if found}
-        | arm_versions(spec.label_source),
-        platform=platform.platform(),
-        created=utc_now(),
-        sources=sources,
-    )

@@ -18,7 +18,8 @@ from datagen.configuration.arms import (
     refuse_unsuited,
     robot_of,
 )
-from datagen.configuration.specify import layout_of, manifest_of, specify
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of, specify
 from datagen.configuration.stored_scenes import open_stored_scenes, specify_again
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
