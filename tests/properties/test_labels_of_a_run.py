@@ -268,10 +268,10 @@ def test_no_base_in_a_wall_or_furniture_or_outside_is_called_clear(job: Job) -> 
         for k in range(PER_SCENE):
             xy = scene.samples("base_xy_m")[k].astype(np.float64)
             mount, top = float(scene.samples("base_height_m")[k]), float(scene.samples("camera_height_m")[k])
-            body = [
-                np.c_[xy + params.base_radius_m * disc, np.full(len(disc), z)]
-                for z in np.linspace(0.05, mount, 12)
-            ]
+            assert params.scaled_base
+            # 0.25 m at the Panda's own reach, and as much narrower as the arm is shorter.
+            radius_m = 0.25 * min(1.0, float(scene.samples("arm_reach_m")[k]) / 0.855)
+            body = [np.c_[xy + radius_m * disc, np.full(len(disc), z)] for z in np.linspace(0.05, mount, 12)]
             mast = [
                 np.c_[xy + params.mast_radius_m * disc, np.full(len(disc), z)]
                 for z in np.linspace(mount, top, 8)

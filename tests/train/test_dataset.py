@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from datagen import cli
 from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SCHEMA_VERSION
 from datagen.schemas.run import Run
 from datagen.schemas.sealing import seal
 from datagen.train.augment import Augmentation, ColourJitter, PointDropout, Rotation, SensorNoise
@@ -290,6 +291,6 @@ def test_runs_of_other_versions_and_parameters_are_refused_by_name(place: str, t
         SampleStream([place, tmp_path / "more"])
     store = Path(seal(make_stream_run(tmp_path / "older", 18, seed=9).storage))
     root = store / "zarr.json"
-    root.write_text(root.read_text().replace('"schema_version": 2', '"schema_version": 1'))
+    root.write_text(root.read_text().replace(f'"schema_version": {SCHEMA_VERSION}', '"schema_version": 1'))
     with pytest.raises(InputError, match=r"zarr\.json: schema_version: is 'heuristic' 1, but this program"):
         SampleStream([store])
