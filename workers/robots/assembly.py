@@ -45,6 +45,7 @@ class Assembly:
     T_root_mount: F64  # (4, 4)
     T_palm_tcp: F64
     reach_m: float
+    wrist_reach_m: float  # largest distance of the last joint from the first
     scale: float
 
 
@@ -104,6 +105,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         T_root_mount,
         description.hand.T_palm_tcp,
         largest_reach_m(chain),
+        largest_reach_m(replace(chain, tcp_m=np.zeros(3))),
         scale,
     )
 
