@@ -154,7 +154,7 @@ def _nearest_first(
     for start in range(0, len(order), _FILTERED_AT_ONCE):
         rows, later = np.split(order[start:], [_FILTERED_AT_ONCE])
         ends = np.concatenate(_line_ends(prepared, T_base_world, T_base_tcp[rows]))
-        at_ends = prepared.moving.table.nearest(ends, 1)[0].reshape(2, -1).max(axis=0)
+        at_ends = prepared.moving.table.distance(ends).reshape(2, -1).max(axis=0)
         farthest = np.maximum(distance[rows], at_ends)
         waiting = sorted([*waiting, *zip(farthest.tolist(), rows.tolist(), strict=True)])
         bound = float(distance[later[0]]) if len(later) else np.inf
