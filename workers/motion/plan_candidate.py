@@ -128,11 +128,13 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
         while left > 0 and end < len(rows):
             start, end = end, min(len(rows), 2 * end + portion)
             k, T = rows[start:end], T_base_tcp[start:end]
+            near = _is_wrist_within_reach(prepared, T_base_world, T, table.limit_m).all(axis=0)
+            k, T = k[near], T[near]
             distance, seeds = table.nearest(T, prepared.params.ik_seeds)
             nearest = _nearest_first(prepared, T_base_world, T, distance)
             # The hand's way is looked at for few at a time: most candidates need no more.
-            while left > 0 and (near := list(islice(nearest, _FILTERED_AT_ONCE))):
-                free = np.array(near)[prepared.around.is_free(k[near])][:left]
+            while left > 0 and (some := list(islice(nearest, _FILTERED_AT_ONCE))):
+                free = np.array(some)[prepared.around.is_free(k[some])][:left]
                 left -= len(free)
                 limits = _limits(prepared, T_base_world, T[free])
                 goals = list(map(_Goal, k[free].tolist(), T[free], seeds[free], limits))
@@ -172,10 +174,16 @@ def _line_ends(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> t
 
 def _limits(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> list[str]:
     """How far a try of each grasp (G, 4, 4) can come at most, by the length of the arm up to its wrist."""
-    at_end = map(prepared.robot.is_wrist_within_reach, _line_ends(prepared, T_base_world, T_base_tcp))
-    at_pregrasp, at_lifted = at_end
-    at_both = at_pregrasp & prepared.robot.is_wrist_within_reach(T_base_tcp)
-    return np.where(at_both, np.where(at_lifted, "success", "no_lift"), "no_ik").tolist()
+    grasp, pregrasp, lifted = _is_wrist_within_reach(prepared, T_base_world, T_base_tcp, 0.0)
+    return np.where(grasp & pregrasp, np.where(lifted, "success", "no_lift"), "no_ik").tolist()
+
+
+def _is_wrist_within_reach(
+    prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, beyond_m: float
+) -> Bools:
+    """Whether the wrist is in reach, or `beyond_m` beyond (3, G): at grasp, pregrasp and end of the lift."""
+    poses = (T_base_tcp, *_line_ends(prepared, T_base_world, T_base_tcp))
+    return np.array([prepared.robot.is_wrist_within_reach(T, beyond_m) for T in poses])
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:

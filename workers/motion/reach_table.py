@@ -48,6 +48,11 @@ class ReachTable:
     lower_rad: F64  # (A,)
     upper_rad: F64  # (A,)
 
+    @property
+    def limit_m(self) -> float:
+        """Wrists that are farther than this from all reachable ones are farther than the limit too."""
+        return self.samples.limit * self.length_m
+
     def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
         """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
 

@@ -121,10 +121,13 @@ class Robot:
         """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
         return solve(self._model, self._data, self._tcp, T_base_tcp, q_seed_rad)
 
-    def is_wrist_within_reach(self, T_base_tcp: F64) -> npt.NDArray[np.bool_]:
-        """Which TCP poses (N, 4, 4) leave the last joint within its reach; `ik` fails at all others."""
+    def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Which TCP poses (N, 4, 4) have the last joint at most `beyond_m` beyond its reach.
+
+        Where it is beyond by anything, `ik` fails.
+        """
         wrist_m = T_base_tcp[:, :3, :3] @ self._tcp_wrist_m + T_base_tcp[:, :3, 3]
-        return np.linalg.norm(wrist_m - self.shoulder_m, axis=1) <= self._wrist_reach_m
+        return np.linalg.norm(wrist_m - self.shoulder_m, axis=1) <= self._wrist_reach_m + beyond_m
 
     def collides_itself(self, q_rad: F64) -> bool:
         """Whether any of `self_pairs` touch at the joints (A,)."""
