@@ -56,7 +56,7 @@ class ReachTable:
     def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
         """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
 
-        Distances are in arm lengths. Beyond the limit they are infinite, and seeds zero.
+        Distances are in arm lengths. Beyond the limit they are infinite and seeds are of no use.
         """
         distance, row, azimuth = self._query(T_base_tcp, count)
         found, some = self.samples, np.flatnonzero(np.isfinite(distance[:, 0]))
@@ -65,7 +65,7 @@ class ReachTable:
         if found.turns:
             near[:, :, 0] += azimuth[some, None] - found.azimuth_rad[row]
             near[:, :, 0] = (near[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
-        seeds = np.zeros((len(T_base_tcp), count, len(self.lower_rad)))
+        seeds = np.tile(self.lower_rad, (len(T_base_tcp), count, 1))
         seeds[some] = np.clip(near, self.lower_rad, self.upper_rad)
         return distance[:, 0], seeds
 
