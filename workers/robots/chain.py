@@ -37,10 +37,9 @@ def largest_reach_m(chain: Chain) -> float:
 
 # Scaled arms ask for the same chains again: those that their scale is looked for between, and the one found.
 @lru_cache(maxsize=256)
-def _largest_reach_m(T_parent_joint: bytes, axis: bytes, lower: bytes, upper: bytes, tcp: bytes) -> float:
-    parts = map(np.frombuffer, (T_parent_joint, axis, lower, upper, tcp))
-    T, axes, *rest = parts
-    chain = Chain(T.reshape(-1, 4, 4), axes.reshape(-1, 3), *rest)
+def _largest_reach_m(*parts: bytes) -> float:
+    T, axes, lower_rad, upper_rad, tcp_m = map(np.frombuffer, parts)
+    chain = Chain(T.reshape(-1, 4, 4), axes.reshape(-1, 3), lower_rad, upper_rad, tcp_m)
     count = len(chain.axis)
     rng = np.random.Generator(np.random.PCG64(0))
     lower, upper = np.maximum(chain.lower_rad, -np.pi), np.minimum(chain.upper_rad, np.pi)
