@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -217,6 +218,7 @@ def _file_digest(of: list[Any]) -> str:
     return digest_of([*of, *map(_version_of, _ENGINES)])
 
 
+@cache
 def _version_of(package: str) -> str:
     try:
         return version(package)

@@ -161,7 +161,7 @@ def hits(
         overlap &= high[:, :, None, axis] >= near_low[:, axis]
     if allowed is not None:
         overlap &= ~allowed[:, rows]
-    m, p, f = np.nonzero(overlap)
+    m, p, f = np.unravel_index(np.flatnonzero(overlap), overlap.shape)  # twice as fast as nonzero
     if len(m) == 0:
         return found
     # The same boxes along the moving part's own axes: long parts held at a slant leave most pairs here.
@@ -174,11 +174,12 @@ def hits(
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     request.security_margin = margin_m
     at, touched, pose = (-1, -1), -1, None
-    for i, j, k in zip(m.tolist(), p.tolist(), f.tolist(), strict=True):
+    axes, at_m = axes[keep], T_world_owner[m, moving.owner[p], :3, 3]
+    for n, (i, j, k) in enumerate(zip(m.tolist(), p.tolist(), f.tolist(), strict=True)):
         if i == touched:
             continue
         if at != (i, j):
-            pose, at = _transform(T_world_owner[i, moving.owner[j]]), (i, j)
+            pose, at = coal.Transform3s(axes[n], at_m[n]), (i, j)
         result.clear()
         if coal.collide(moving.shapes[j](), pose, still.shapes[k](), still.poses[k], request, result):
             found[i], touched = True, i
@@ -208,14 +209,16 @@ def _nearest_boxes(
 ) -> Iterator[tuple[float, int, int, int]]:
     """Distance of the boxes, and pose, moving part and still part, nearest boxes first."""
     _, center, half = _boxes(moving, T_world_owner)
-    middle, extent = (still.low_m + still.high_m) / 2, (still.high_m - still.low_m) / 2
+    rows = still.within((center - half).min(axis=(0, 1)) - far_m, (center + half).max(axis=(0, 1)) + far_m)
+    low, high = still.low_m[rows], still.high_m[rows]
+    middle, extent = (low + high) / 2, (high - low) / 2
     apart = np.abs(center[:, :, None] - middle) - half[:, :, None] - extent
     bound = np.linalg.norm(np.maximum(apart, 0.0), axis=3)
-    bound[:, allowed] = np.inf
+    bound[:, allowed[:, rows]] = np.inf
     m, p, f = np.nonzero(bound < far_m)
     order = np.argsort(bound[m, p, f], kind="stable")
     for i, j, k in zip(m[order].tolist(), p[order].tolist(), f[order].tolist(), strict=True):
-        yield float(bound[i, j, k]), i, j, k
+        yield float(bound[i, j, k]), i, j, int(rows[k])
 
 
 def _boxes(moving: Hulls, T_world_owner: F64) -> tuple[F64, F64, F64]:

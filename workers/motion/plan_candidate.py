@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import islice
 
 import numpy as np
 
@@ -62,6 +64,7 @@ class _Goal:
     k: int
     T_base_tcp: F64  # (4, 4)
     seeds_rad: F64  # (S, A)
+    limit: str  # no try of it comes further
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
     `kept` come in their own order, best first and such that neighbours differ much; of each portion of them
     those nearest to a seed come first. Of `rest` those nearest of all come first.
     """
-    left, batch = prepared.params.max_grasps_tried, _FIRST_BATCH
+    table, left, batch = prepared.moving.table, prepared.params.max_grasps_tried, _FIRST_BATCH
     for rows, portion in ((kept, _FIRST_PORTION), (rest, len(rest))):
         if left == 0:
             return
@@ -124,31 +127,63 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
         end = 0
         while left > 0 and end < len(rows):
             start, end = end, min(len(rows), 2 * end + portion)
-            some, near, seeds = slice(start, end), *_near_seeds(prepared, T_base_world, T_base_tcp[start:end])
-            while left > 0 and len(near):
-                # The hand's way is looked at for few at a time: most candidates need no more.
-                free = near[:_FILTERED_AT_ONCE]
-                free, near = free[prepared.around.is_free(rows[some][free])][:left], near[len(free) :]
+            k, T = rows[start:end], T_base_tcp[start:end]
+            near = _is_wrist_within_reach(prepared, T_base_world, T, table.limit_m).all(axis=0)
+            k, T = k[near], T[near]
+            distance, seeds = table.nearest(T, prepared.params.ik_seeds)
+            nearest = _nearest_first(prepared, T_base_world, T, distance)
+            # The hand's way is looked at for few at a time: most candidates need no more.
+            while left > 0 and (some := list(islice(nearest, _FILTERED_AT_ONCE))):
+                free = np.array(some)[prepared.around.is_free(k[some])][:left]
                 left -= len(free)
-                goals = [_Goal(int(rows[some][g]), T_base_tcp[some][g], seeds[g]) for g in free.tolist()]
+                limits = _limits(prepared, T_base_world, T[free])
+                goals = list(map(_Goal, k[free].tolist(), T[free], seeds[free], limits))
                 while goals:
                     yield goals[:batch]
                     goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
 
 
-def _near_seeds(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> tuple[Ints, F64]:
-    """Rows of the poses (G, 4, 4) that have seeds near by, nearest first, and seeds (G, S, A) of all.
+def _nearest_first(
+    prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, distance: F64
+) -> Iterator[int]:
+    """Rows of the poses (G, 4, 4) with joints known near by, nearest first; `distance` (G,) is theirs.
 
-    Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts.
+    Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts. It
+    is found for few at a time, since no later pose can be nearer than the first of the three.
     """
-    table, params = prepared.moving.table, prepared.params
-    distance, seeds = table.nearest(T_base_tcp, params.ik_seeds)
+    order = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
+    waiting: list[tuple[float, int]] = []
+    for start in range(0, len(order), _FILTERED_AT_ONCE):
+        rows, later = np.split(order[start:], [_FILTERED_AT_ONCE])
+        ends = np.concatenate(_line_ends(prepared, T_base_world, T_base_tcp[rows]))
+        at_ends = prepared.moving.table.distance(ends).reshape(2, -1).max(axis=0)
+        farthest = np.maximum(distance[rows], at_ends)
+        waiting = sorted([*waiting, *zip(farthest.tolist(), rows.tolist(), strict=True)])
+        bound = float(distance[later[0]]) if len(later) else np.inf
+        ready = bisect_left(waiting, (bound, -1))
+        yield from (row for _, row in waiting[:ready])
+        waiting = waiting[ready:]
+
+
+def _line_ends(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> tuple[F64, F64]:
+    """The pregrasp and the end of the lift (G, 4, 4) of each grasp."""
     T_lifted = T_base_tcp.copy()
-    T_lifted[:, :3, 3] += params.lift_m * T_base_world[:3, 2]
-    for T in (backed(T_base_tcp, params.pregrasp_m), T_lifted):
-        some = np.flatnonzero(np.isfinite(distance))
-        distance[some] = np.maximum(distance[some], table.nearest(T[some], 1)[0])
-    return np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())], seeds
+    T_lifted[:, :3, 3] += prepared.params.lift_m * T_base_world[:3, 2]
+    return backed(T_base_tcp, prepared.params.pregrasp_m), T_lifted
+
+
+def _limits(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> list[str]:
+    """How far a try of each grasp (G, 4, 4) can come at most, by the length of the arm up to its wrist."""
+    grasp, pregrasp, lifted = _is_wrist_within_reach(prepared, T_base_world, T_base_tcp, 0.0)
+    return np.where(grasp & pregrasp, np.where(lifted, "success", "no_lift"), "no_ik").tolist()
+
+
+def _is_wrist_within_reach(
+    prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, beyond_m: float
+) -> Bools:
+    """Whether the wrist is in reach, or `beyond_m` beyond (3, G): at grasp, pregrasp and end of the lift."""
+    poses = (T_base_tcp, *_line_ends(prepared, T_base_world, T_base_tcp))
+    return np.array([prepared.robot.is_wrist_within_reach(T, beyond_m) for T in poses])
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
@@ -161,7 +196,12 @@ def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64
 
 
 def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
-    """Look for a plan to some grasps: collisions are checked together, all else one by one."""
+    """Look for a plan to some grasps: collisions are checked together, all else one by one.
+
+    Grasps that can come no further than those before are left out.
+    """
+    so_far = STAGES.index(search.furthest)
+    goals = [goal for goal in goals if STAGES.index(goal.limit) > so_far]
     ways = [way for goal in goals for way in _ways(search.scene, goal)]
     if not ways:
         return None
@@ -211,7 +251,7 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     search.reached("no_approach")
     T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
     # The end of the lift is asked for first: where the arm is too short for it, the lines cost most.
-    if robot.ik(T_up[-1], way.q_grasp) is None:
+    if way.goal.limit == "no_lift" or robot.ik(T_up[-1], way.q_grasp) is None:
         search.reached("no_lift")
         return None
     back = follow_line(at, T_back, way.q_grasp, way.q_pregrasp, is_target_held=False)

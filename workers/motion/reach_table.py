@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.motion.collision import Ints
 from datagen.workers.motion.forward_kinematics import ForwardKinematics
 from datagen.workers.robots.robot import Robot
 
@@ -47,11 +48,33 @@ class ReachTable:
     lower_rad: F64  # (A,)
     upper_rad: F64  # (A,)
 
+    @property
+    def limit_m(self) -> float:
+        """Wrists that are farther than this from all reachable ones are farther than the limit too."""
+        return self.samples.limit * self.length_m
+
     def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
         """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
 
         Distances are in arm lengths. Beyond the limit they are infinite and seeds are of no use.
         """
+        distance, row, azimuth = self._query(T_base_tcp, count)
+        found, some = self.samples, np.flatnonzero(np.isfinite(distance[:, 0]))
+        row = np.where(np.isfinite(distance[some]), row[some], row[some, :1])
+        near = found.q_rad[row]
+        if found.turns:
+            near[:, :, 0] += azimuth[some, None] - found.azimuth_rad[row]
+            near[:, :, 0] = (near[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
+        seeds = np.tile(self.lower_rad, (len(T_base_tcp), count, 1))
+        seeds[some] = np.clip(near, self.lower_rad, self.upper_rad)
+        return distance[:, 0], seeds
+
+    def distance(self, T_base_tcp: F64) -> F64:
+        """Distances (G,) of the nearest sample alone."""
+        return self._query(T_base_tcp, 1)[0][:, 0]
+
+    def _query(self, T_base_tcp: F64, count: int) -> tuple[F64, Ints, F64]:
+        """Distances and rows (G, count) of the nearest samples, and the azimuth (G,) of each pose."""
         found = self.samples
         wrist = (T_base_tcp[:, :3, :3] @ self.tcp_wrist_m + T_base_tcp[:, :3, 3]) / self.length_m
         features, azimuth = _features(wrist, T_base_tcp[:, :3, :3], found.turns)
@@ -59,12 +82,7 @@ class ReachTable:
         distance, row = found.tree.query(
             features, k=ranks, eps=_NOT_NEAREST, distance_upper_bound=found.limit
         )
-        row = np.where(np.isfinite(distance), row, row[:, :1]) % len(found.q_rad)
-        seeds = found.q_rad[row]
-        if found.turns:
-            seeds[:, :, 0] += azimuth[:, None] - found.azimuth_rad[row]
-            seeds[:, :, 0] = (seeds[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
-        return distance[:, 0], np.clip(seeds, self.lower_rad, self.upper_rad)
+        return distance, row, azimuth
 
 
 def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:

@@ -45,6 +45,7 @@ class Assembly:
     T_root_mount: F64  # (4, 4)
     T_palm_tcp: F64
     reach_m: float
+    wrist_reach_m: float  # largest distance of the last joint from the first
     scale: float
 
 
@@ -73,6 +74,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         extension_m = rule.longest_m * min(max(share, 0.0), 1.0)
         scale = _scale_for(description, tree, clusters, extension_m, reach_m)
     arm, palm, chain = _joints(description, tree, clusters, scale, extension_m)
+    unscaled = _joints(description, tree, clusters, 1.0, 0.0)[2]
     links = [
         _body(tree.path, head, cluster, scale, description.cuts_m)
         for head, cluster in zip(heads, clusters, strict=True)
@@ -104,6 +106,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
         T_root_mount,
         description.hand.T_palm_tcp,
         largest_reach_m(chain),
+        scale * largest_reach_m(replace(unscaled, tcp_m=np.zeros(3))),
         scale,
     )
 

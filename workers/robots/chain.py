@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -30,6 +31,15 @@ def largest_reach_m(chain: Chain) -> float:
     Coordinate ascent from 32 fixed starts. Turning one joint alone moves the TCP on a circle, and its
     squared distance to any fixed point is a + b cos(q - c), so each step is exact.
     """
+    parts = (chain.T_parent_joint, chain.axis, chain.lower_rad, chain.upper_rad, chain.tcp_m)
+    return _largest_reach_m(*(part.tobytes() for part in parts))
+
+
+# Scaled arms ask for the same chains again: those that their scale is looked for between, and the one found.
+@lru_cache(maxsize=256)
+def _largest_reach_m(*parts: bytes) -> float:
+    T, axes, lower_rad, upper_rad, tcp_m = map(np.frombuffer, parts)
+    chain = Chain(T.reshape(-1, 4, 4), axes.reshape(-1, 3), lower_rad, upper_rad, tcp_m)
     count = len(chain.axis)
     rng = np.random.Generator(np.random.PCG64(0))
     lower, upper = np.maximum(chain.lower_rad, -np.pi), np.minimum(chain.upper_rad, np.pi)

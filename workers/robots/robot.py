@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio
 
 from datagen.schemas.identity import digest_of
@@ -18,13 +19,14 @@ from datagen.workers.robots.assembly import Assembly, LinkBody, assemble
 from datagen.workers.robots.description import HandDescription, RobotDescription
 from datagen.workers.robots.gripper import Gripper, Parts
 from datagen.workers.robots.hulls import hull_faces
-from datagen.workers.robots.inverse_kinematics import solve
+from datagen.workers.robots.inverse_kinematics import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, solve
 from datagen.workers.robots.robot_files import RobotFiles, hull_of
 from datagen.workers.robots.self_collision import SelfCollision
 
 # Its binary modules have no types.
 pin: Any = pinocchio
 _GREY = 190
+_ROUNDING_M = 0.001  # far more than lengths and tolerances are off by
 _read_visual = lru_cache(maxsize=64)(read_glb)
 
 
@@ -47,6 +49,9 @@ class Robot:
         self.base_height_m = base_height_m
         self.base_radius_m = description.limits.base_radius_m  # None stands on a pedestal
         self.gripper = _gripper(description.hand, assembly)
+        self._tcp_wrist_m: F64 = inverse(assembly.palm.T_parent_child @ assembly.T_palm_tcp)[:3, 3]
+        slack_m = POSITION_TOLERANCE_M + ANGLE_TOLERANCE_RAD * float(np.linalg.norm(self._tcp_wrist_m))
+        self._wrist_reach_m = assembly.wrist_reach_m + slack_m + _ROUNDING_M
         self.T_base_root: F64 = inverse(assembly.T_root_mount)  # (4, 4), pose of the URDF's root link
         # (3,), base frame: the point that reach_m is measured from; no TCP is ever farther.
         self.shoulder_m: F64 = (self.T_base_root @ assembly.arm[0].T_parent_child)[:3, 3]
@@ -115,6 +120,14 @@ class Robot:
     def ik(self, T_base_tcp: F64, q_seed_rad: F64) -> F64 | None:
         """Joints (A,) within the limits that put the TCP at the pose (0.5 mm, 0.5 degrees), or None."""
         return solve(self._model, self._data, self._tcp, T_base_tcp, q_seed_rad)
+
+    def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Which TCP poses (N, 4, 4) have the last joint at most `beyond_m` beyond its reach.
+
+        Where it is beyond by anything, `ik` fails.
+        """
+        wrist_m = T_base_tcp[:, :3, :3] @ self._tcp_wrist_m + T_base_tcp[:, :3, 3]
+        return np.linalg.norm(wrist_m - self.shoulder_m, axis=1) <= self._wrist_reach_m + beyond_m
 
     def collides_itself(self, q_rad: F64) -> bool:
         """Whether any of `self_pairs` touch at the joints (A,)."""

@@ -51,8 +51,7 @@ class SelfCollision:
             if joint[a] != joint[b] and model.parents[joint[b]] != joint[a]
         }
         self._keep(free, body_of)
-        share = self._share_touching(body_of)
-        self.pairs = tuple(sorted(pair for pair in free if share.get(pair, 0.0) <= _MOST))
+        self.pairs = tuple(sorted(free - self._touching_often(body_of)))
         self._keep(set(self.pairs), body_of)
         self._results = self._geometry.createData()
 
@@ -63,18 +62,24 @@ class SelfCollision:
                 if (body_of[i], body_of[j]) in pairs:
                     self._geometry.addCollisionPair(pin.CollisionPair(i, j))
 
-    def _share_touching(self, body_of: list[int]) -> dict[tuple[int, int], float]:
+    def _touching_often(self, body_of: list[int]) -> set[tuple[int, int]]:
         results = self._geometry.createData()
         rng = np.random.Generator(np.random.PCG64(0))
         low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
         pairs = [(body_of[p.first], body_of[p.second]) for p in self._geometry.collisionPairs]
         touched: dict[tuple[int, int], int] = {}
-        for q in rng.uniform(low, high, (_SAMPLES, len(low))):
+        for left, q in zip(
+            reversed(range(_SAMPLES)), rng.uniform(low, high, (_SAMPLES, len(low))), strict=True
+        ):
             pin.computeCollisions(self._model, self._data, self._geometry, results, q, False)
-            hits = {pair for k, pair in enumerate(pairs) if results.collisionResults[k].isCollision()}
-            for pair in hits:
+            found = zip(pairs, results.collisionResults, strict=True)
+            for pair in {pair for pair, result in found if result.isCollision()}:
                 touched[pair] = touched.get(pair, 0) + 1
-        return {pair: count / _SAMPLES for pair, count in touched.items()}
+            # No pair can come to most of the samples any more, or has already.
+            most = _MOST * _SAMPLES
+            if left <= most and all(not most - left < count <= most for count in touched.values()):
+                break
+        return {pair for pair, count in touched.items() if count > _MOST * _SAMPLES}
 
     def touches(self, q_rad: F64) -> bool:
         """Whether any of `pairs` touch at the joints (A,)."""

@@ -9,13 +9,15 @@ import pytest
 
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.geometry.transforms import yaw_pose
+from datagen.workers.geometry.transforms import inverse, yaw_pose
 from datagen.workers.grasps.grasp import GraspSet
 from datagen.workers.houses.house import House, StaticBody
 from datagen.workers.motion.arm_collision import surroundings
+from datagen.workers.motion.grasp_filter import backed, raised
 from datagen.workers.motion.motion_plan import MotionPlan, PlanReport
-from datagen.workers.motion.plan_candidate import STAGES, plan_candidate
+from datagen.workers.motion.plan_candidate import STAGES, _nearest_first, plan_candidate
 from datagen.workers.motion.planning_scene import prepare
+from datagen.workers.robots.robot import Robot
 from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
@@ -184,6 +186,34 @@ def test_too_far_or_too_near_has_no_joint_configuration() -> None:
     scene = table_scene()
     assert plan_at(scene, front_base(scene, away_m=0.84)).outcome == "no_ik"
     assert plan_at(scene, front_base(scene, away_m=2.0)).outcome == "no_ik"
+
+
+def test_grasps_left_out_for_the_reach_of_the_wrist_change_no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = table_scene(clutter=CLUTTER)
+    ready = prepared(scene, params=PARAMS.model_copy(update={"lift_m": 0.2}))
+    bases = [front_base(scene, dx_m=dx, away_m=d) for dx in (0.0, 0.3) for d in np.arange(0.4, 0.95, 0.05)]
+    fast = [plan_candidate(ready, base, rng()) for base in bases]
+    every = lambda robot, T, beyond_m=0.0: np.ones(len(T), np.bool_)  # noqa: E731
+    monkeypatch.setattr(Robot, "is_wrist_within_reach", every)
+    assert all(
+        same(plan_candidate(ready, base, rng()), report) for base, report in zip(bases, fast, strict=True)
+    )
+    assert {report.outcome for report in fast} >= {"success", "no_lift", "no_ik"}
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 1000])
+def test_grasps_come_nearest_first_however_many_are_looked_at_together(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = table_scene()
+    ready, T_base_world = prepared(scene), inverse(front_base(scene, away_m=0.65))
+    table, T = ready.moving.table, T_base_world @ ready.around.T_world_tcp
+    ends = [T, backed(T, PARAMS.pregrasp_m), T_base_world @ raised(ready.around.T_world_tcp, PARAMS.lift_m)]
+    farthest = np.max([table.distance(end) for end in ends], axis=0)
+    monkeypatch.setattr("datagen.workers.motion.plan_candidate._FILTERED_AT_ONCE", at_once)
+    found = list(_nearest_first(ready, T_base_world, T, table.distance(T)))
+    assert 1 < len(found) == np.isfinite(farthest).sum() < len(T)
+    assert (np.diff(farthest[found]) >= -1e-9).all()
 
 
 def test_the_pedestal_is_an_obstacle_for_all_but_the_first_links() -> None:
