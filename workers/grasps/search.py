@@ -19,7 +19,7 @@ from datagen.workers.robots.gripper import Gripper
 Bools = npt.NDArray[np.bool_]
 
 # Part of every cache key and seed: raise it when the same object and hand get other grasps.
-VERSION = 3
+VERSION = 4
 # Poses that are scored together: a score depends on the poses of its block, which are always the same.
 BLOCK = 32
 # Room between the open fingers and the object, both sides together: the first that lets the hand in.

@@ -40,7 +40,7 @@ _LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
 # An object whose energy would carry it this much higher than the hand rises has been thrown by the solver.
 _THROWN_M = 0.15
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
-# Held for good: so little motion of the target in the hand in each of so many control periods of holding.
+# Held for good: the target moves in the hand by less in each of _STILL_PERIODS control periods of holding.
 _STILL_M, _STILL_RAD, _STILL_PERIODS = 0.0005, 0.01, 2
 _SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0
