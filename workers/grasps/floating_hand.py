@@ -49,9 +49,8 @@ class HandTest:
     position_error_m: float = 0.002
     turn_error_rad: float = 0.035
     timestep_s: float = 1 / 240
-    position_iterations: int = (
-        20  # with 10 half of the grasps of a flat can are lost that hold with 40 at 480 Hz
-    )
+    # With 10 flat cans slip from grasps that hold with more: the test of real flat things fails.
+    position_iterations: int = 20
     velocity_iterations: int = 2
     contact_offset_m: float = 0.002
     hands_at_once: int = 32
