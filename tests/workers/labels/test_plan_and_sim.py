@@ -135,7 +135,9 @@ def test_the_first_grasp_decides_and_later_ones_are_stored() -> None:
     tried = [trial for trial in trials if trial.results]
     assert len(tried) == 3
     for trial in tried:
-        assert len({(r.outcome, r.lift_m, r.slip_m) for r in trial.results}) == 3 == len(trial.results)
+        assert len(trial.results) == 3
+        # Two grasps may both miss by nothing at all, all three do not end alike.
+        assert len({(r.outcome, r.lift_m, r.slip_m) for r in trial.results}) > 1
         assert (trial.outcome, trial.retry_outcome) == (trial.results[0].outcome, trial.results[-1].outcome)
     columns = load_label_source("sim").label(at, candidates(at), spec, StageClock())
     np.testing.assert_array_equal(columns["attempts"], [3, 3, 3, 0, 0, 0])

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from datagen.workers.geometry.transforms import inverse
 from datagen.workers.grasps.grasp import GraspSet
+from datagen.workers.grasps.hand_clearance import HandClearance
+from datagen.workers.motion.grasp_filter import hand_of
 from datagen.workers.motion.motion_plan import PlanReport
 from datagen.workers.motion.plan_candidate import plan_candidate
-from datagen.workers.motion.planning_scene import PlanningScene, prepare
+from datagen.workers.motion.planning_scene import PlanningScene, hand_scene, prepare
 from datagen.workers.scenes.scene import SettledScene
 from tests.workers.motion.tables import (
     BOX_M,
@@ -19,6 +24,7 @@ from tests.workers.motion.tables import (
     over_target,
     table_scene,
 )
+from tests.workers.worlds import box_vertices
 
 
 def some_grasps(rows: np.ndarray) -> GraspSet:
@@ -97,3 +103,19 @@ def test_what_the_hand_does_not_hold_is_no_plan() -> None:
 
 def plan_at(ready: PlanningScene, scene: SettledScene) -> PlanReport:
     return plan_candidate(ready, front_base(scene), np.random.default_rng(0))
+
+
+def test_a_turn_in_which_the_hand_would_cut_the_target_is_left_out() -> None:
+    """A lug on one side of the palm: over the box's end it passes beside the box, turned it cuts the box."""
+    scene, robot = table_scene(), arm()
+    lug = box_vertices((0.02, 0.02, 0.08), (0.03, 0.0, -0.01))
+    gripper = replace(robot.gripper, digest="lug", palm_parts_m=(*robot.gripper.palm_parts_m, lug))
+    T = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (2, 1, 1))
+    T[:, 0, 3], T[:, 2, 3] = (-0.02, 0.02), BOX_M[2] / 2 - 0.01
+    grasps = GraspSet(T, np.full(2, 0.064, np.float32), np.ones(2, np.float32))
+    around = hand_scene(scene, hand_of(gripper), grasps, PARAMS, 40, 2.0)
+    fits = HandClearance(scene.models[0].convex_parts_m, gripper).free(
+        np.matmul(inverse(scene.T_world_object[0]), around.T_world_tcp), around.opening_m
+    )
+    assert fits.tolist() == [False, True, True, False]
+    np.testing.assert_array_equal(around.kept, np.flatnonzero(fits))
