@@ -1,10 +1,10 @@
 """Pictures of trials that failed: one sheet an outcome, one row a trial, four near views from grasp to end.
 
-    python -m benchmarks.failures OUT [--houses procthor:DIR] [--objects ycb:DIR] [--scenes 300] [--most 20]
-                                  [--outcomes slipped dropped missed] [--only SCENE:ROW ...]
+    python -m benchmarks.failures RUN OUT [--houses procthor:DIR] [--objects ycb:DIR] [--most 20]
+                                  [--outcomes slipped dropped missed]
 
-Candidates in range are sampled as a run samples them. Those whose first try fails become OUT/OUTCOME.png.
-`--only` tries these candidates alone. Prints one line a trial.
+RUN is a run of `sim`. Its first failures of each outcome are executed again and become OUT/OUTCOME.png.
+Prints one line a trial, with "differs" where it ends otherwise than stored.
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ from typing import Any, cast
 import numpy as np
 from PIL import Image, ImageDraw
 
-from benchmarks.options import scene_options
-from datagen.configuration.specify import specify
+from benchmarks.repeatability import stored_scenes
 from datagen.drawing.film import Film, Lens, told_moments
 from datagen.drawing.posed_robot import robot_bodies
 from datagen.schemas.cost import StageClock
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run import Run
 from datagen.schemas.specification import Specification
-from datagen.workers.houses import open_houses
 from datagen.workers.labels.arm_labelling import ArmInScene, CandidateTrial, arm_in_scene, try_candidate
-from datagen.workers.objects import open_objects
-from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
 from datagen.workers.scenes.scene import SettledScene
-from datagen.workers.world import World, assemble_world
+from datagen.workers.world import open_world
 
 _VIEW_PX, _TEXT_PX, _COLOURS = (120, 90), 12, 48
 _COLUMNS = 2  # of trials
@@ -36,47 +35,45 @@ _COLUMNS = 2  # of trials
 
 def main() -> None:
     """Write the sheets."""
-    parser = scene_options(__doc__)
-    parser.add_argument("out", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", metavar="RUN")
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("--houses", default="builtin")
+    parser.add_argument("--objects", default="builtin")
     parser.add_argument("--most", type=int, default=20, help="trials of an outcome")
     parser.add_argument("--outcomes", nargs="+", default=["slipped", "dropped", "missed"])
-    parser.add_argument("--only", nargs="+", default=[], metavar="SCENE:ROW")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    spec, world = in_range_world(options)
-    rows: dict[int, list[int]] = defaultdict(list)
-    for given in options.only:
-        index, row = map(int, given.split(":"))
-        rows[index].append(row)
+    run = Run.open(options.run)
+    spec = run.manifest.spec
+    world = open_world(spec, options.houses, options.objects)
+    names = list(OUTCOMES)
     strips: dict[str, list[Image.Image]] = defaultdict(list)
-    for index in sorted(rows) or range(options.scenes):
-        scene, candidates = generate_scene(world, index, StageClock())
-        at = arm_in_scene(scene, candidates, 0, spec, StageClock())
-        for row in rows.get(index) or range(len(candidates)):
-            trial = try_candidate(at, candidates, row, spec, record=True)
-            outcome = trial.outcome
-            if outcome not in options.outcomes or len(strips[outcome]) == options.most:
+    for number, stored in stored_scenes(run, run.layout.scenes_per_shard * len(run.committed())):
+        wanted = [o for o in options.outcomes if len(strips[o]) < options.most]
+        stored_outcome = [names[code] for code in stored.samples["outcome"]]
+        rows = [row for row, outcome in enumerate(stored_outcome) if outcome in wanted]
+        if not wanted:
+            break
+        if not rows:
+            continue
+        scene = reconstruct_scene(world, stored.record)
+        candidates = reconstruct_candidates(stored.samples, scene)
+        for row in rows:
+            outcome = stored_outcome[row]
+            if len(strips[outcome]) == options.most:
                 continue
+            at = arm_in_scene(scene, candidates, row, spec, StageClock())
+            trial = try_candidate(at, candidates, row, spec, record=True)
             result = trial.results[0]
-            words = f"{index}:{row} {scene.models[0].name}"
+            words = f"{number}:{row} {scene.models[0].name}"
             lift_cm, slip_mm = 100 * result.lift_m, 1000 * result.slip_m
-            print(f"{outcome:8} {words:32} lift {lift_cm:5.1f} cm, slip {slip_mm:3.0f} mm")
+            same = "" if trial.outcome == outcome else f", differs: {trial.outcome}"
+            print(f"{outcome:8} {words:32} lift {lift_cm:5.1f} cm, slip {slip_mm:3.0f} mm{same}", flush=True)
             strips[outcome].append(strip(scene, at, trial, spec, words))
     for outcome, found in strips.items():
-        sheet(found).save(options.out / f"{outcome}.png", optimize=True)
-
-
-def in_range_world(options: argparse.Namespace) -> tuple[Specification, World]:
-    """What a run of 15 candidates in range of one robot a scene is made from."""
-    houses, objects = open_houses(options.houses), open_objects(options.objects)
-    fields = {
-        "seed": options.seed,
-        "candidates.per_scene": 15,
-        "candidates.robots_per_scene": 1,
-        "candidates.within": "in-range",
-    }
-    spec = specify("sim", houses, objects, fields, None)
-    return spec, assemble_world(spec, houses, objects, options.houses, options.objects)
+        if found:
+            sheet(found).save(options.out / f"{outcome}.png", optimize=True)
 
 
 def strip(
