@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import date as Day
+from math import floor, log10
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,8 +56,9 @@ class Prices(_Section):
         return money / self.core_hour.price * _HOUR_S if self.core_hour.price else float("inf")
 
     def format(self, money: float) -> str:
-        """An amount with its currency: 12.30 USD, 0.0042 USD."""
-        return f"{money:,.2f} {self.currency}" if money >= 1 or not money else f"{money:.2g} {self.currency}"
+        """An amount with its currency: 12.30 USD; below 0.1 with two significant digits: 0.0042 USD."""
+        digits = 2 if money >= 0.1 or money <= 0 else 1 - floor(log10(money))
+        return f"{money:,.{digits}f} {self.currency}"
 
     def record(self) -> dict[str, Any]:
         """Plain values for JSON; dates as YYYY-MM-DD."""

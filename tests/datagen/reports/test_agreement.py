@@ -38,6 +38,8 @@ def labelled(label: list[int], **columns: Any) -> Labelled:
         "label": np.array(label, np.bool_),
         "is_clear": np.ones(n, np.bool_),
         "target": np.array(["mug"] * n, object),
+        "furniture": np.array(["Desk"] * n, object),
+        "edge_xy_m": np.tile([0.0, -0.5], (n, 1)),
         "outcome": None,
     }
     for name, value in (("distance_m", 0.5), ("mount_distance_m", 0.6), ("visibility", 1.0)):
@@ -126,10 +128,9 @@ def test_groups_have_their_own_counts() -> None:
         ("bowl", 1, 0.0), ("mug", 3, 1.0)
     ]  # fmt: skip
     assert compared["by_outcome"] == [
-        {"outcome": "success", "count": 1, "said_positive": 1},
-        {"outcome": "no_ik", "count": 2, "said_positive": 1},
-        {"outcome": "dropped", "count": 1, "said_positive": 0},
-    ]
+        {"outcome": name, "count": count, "said_positive": said, "scenes": 1, "accuracy": share, "accuracy_interval": None}
+        for name, count, said, share in (("success", 1, 1, 1.0), ("no_ik", 2, 1, 0.5), ("dropped", 1, 0, 1.0))
+    ]  # fmt: skip
     assert compare(true, said)["by_outcome"] == []  # labels without a cause
 
 
