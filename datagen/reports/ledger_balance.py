@@ -81,11 +81,12 @@ def _findings(committed: dict[str, CommitSummary], ends: dict[str, EndSummary]) 
             yield Finding(key, "account", f"{other[0]}: is not that of {ours}", REPAIR, commit.shard)
         if odd := odd_cost(commit.cost):
             yield Finding(ours, "account", odd, ODD_COST_FIX, commit.shard)
+    decided = {commit.shard for commit in committed.values()}
     for attempt, end in sorted(ends.items()):
         if attempt in committed:
             continue
-        if end.outcome == "committed":
-            problem = f"outcome: is committed, but {commit_key(end.shard)} is not of this attempt"
+        if end.outcome == "committed" and end.shard not in decided:  # else the shard was made again: waste
+            problem = f"outcome: is committed, but {commit_key(end.shard)} is missing"
             yield Finding(end_key(attempt), "account", problem, REPAIR, end.shard)
         if odd := odd_cost(end.cost):
             yield Finding(end_key(attempt), "account", odd, ODD_COST_FIX, end.shard)

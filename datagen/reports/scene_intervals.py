@@ -61,12 +61,13 @@ def estimates_by_group(
 
 def _resampled(per_scene: F64) -> F64:
     """Confusions (B, G, 4) of RESAMPLES draws of scenes, from those of each scene (S, G, 4)."""
-    n_scenes, flat = len(per_scene), per_scene.reshape(len(per_scene), -1)
+    n_scenes, n_groups, _ = per_scene.shape
+    flat = per_scene.reshape(n_scenes, n_groups * 4)
     if not n_scenes:
-        return np.zeros((0, *per_scene.shape[1:]))
+        return np.zeros((0, n_groups, 4))
     rng = np.random.default_rng([0, n_scenes])  # as evaluations draw them: the same for the same scenes
     blocks = [summed(resample_weights(n_scenes, _BLOCK, rng), flat) for _ in range(RESAMPLES // _BLOCK)]
-    return np.concatenate(blocks).reshape(RESAMPLES, *per_scene.shape[1:])
+    return np.concatenate(blocks).reshape(RESAMPLES, n_groups, 4)
 
 
 def _estimates(whole: F64, resampled: F64, scenes: int) -> dict[str, Any]:
