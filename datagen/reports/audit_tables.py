@@ -98,7 +98,7 @@ def _print_money(sources: Sequence[dict[str, Any]], heads: Sequence[str], prices
         return (words, *("-" if one is None else prices.format(1000 * one["money"]) for one in each))
 
     rows = [
-        row("spent", "total"),
+        row("spent by these runs", "own"),
         *([row("  of it waste", "waste")] if any(s["waste"] for s in sources) else []),
         per("1,000 labels", "label"),
         per("1,000 labels within reach", "label_within_reach"),

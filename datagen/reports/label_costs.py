@@ -59,8 +59,13 @@ class RunCost:
     scenes: Spent | None
 
     @property
+    def own(self) -> Spent:
+        """What this run itself has spent."""
+        return self.committed + self.waste
+
+    @property
     def total(self) -> Spent:
-        """All of it; without borrowed scenes where their cost is unknown."""
+        """What its labels take from nothing on; without borrowed scenes where their cost is unknown."""
         return self.committed + self.waste + self.relabelled + (self.scenes or Spent())
 
 
@@ -144,6 +149,7 @@ def source_costs(
         "waste": sum((cost.waste for cost in each), Spent()),
         "relabelled": sum((cost.relabelled for cost in each), Spent()),
         "scenes_of_other_runs": sum((cost.scenes or Spent() for cost in each), Spent()),
+        "own": sum((cost.own for cost in each), Spent()),
         "total": total,
     }
     return {

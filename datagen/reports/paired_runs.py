@@ -84,10 +84,12 @@ def correct_labels(runs: Sequence[AuditedRun], prices: Prices) -> list[dict[str,
     """
     found: list[dict[str, Any]] = []
     for run in runs:
-        rivals = [other for other in runs if _labels_same(run.run, other.run) and other.labelled is not None]
-        if run.labelled is None or not rivals:
+        same = [one for one in runs if one is run or _labels_same(run.run, one.run)]
+        labelled = [one for one in same if one.labelled is not None]
+        if run.labelled is None or len(labelled) < 2:
             continue
-        truth = max([run, *rivals], key=lambda one: fidelity(one.run.manifest.spec))
+        # Of several runs of the same fidelity the last, as in `pairs`.
+        truth = max(reversed(labelled), key=lambda one: fidelity(one.run.manifest.spec))
         assert truth.labelled is not None
         said, true = common_candidates(run.labelled, truth.labelled)
         found.append(
