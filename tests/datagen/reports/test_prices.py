@@ -10,6 +10,7 @@ import pytest
 
 from datagen.reports.prices import DEFAULT_PRICES, read_prices
 from datagen.schemas.errors import InputError
+from tests.conftest import REPOSITORY
 
 MINE = """
 currency = "EUR"
@@ -83,3 +84,9 @@ def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "none.toml", Path("/dev/zero"), written(tmp_path, "#" * 2_000_000)):
         with pytest.raises(InputError):
             read_prices(place)
+
+
+def test_the_guides_own_file_can_be_used(tmp_path: Path) -> None:
+    guide = (REPOSITORY / "docs/guides/costs.md").read_text()
+    (example,) = re.findall(r"```toml\n(.*?)```", guide, re.DOTALL)
+    assert read_prices(written(tmp_path, example)).months_kept == 6
