@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from datagen.reports.error_map import error_map
+from datagen.reports.scene_intervals import codes_of, estimates_by_group
+from datagen.reports.target_frame import SIDES, in_edge_frame, side_of, towards_nearest_edge
 from datagen.schemas.outcomes import OUTCOMES
 from datagen.schemas.run import Run
 from datagen.schemas.shard_reading import Array, read_committed
@@ -27,7 +30,8 @@ Rows = npt.NDArray[np.intp]
 
 REACH_EDGES_M: Edges = (0.0, *TENTHS[3:], None)
 HEIGHT_EDGES_M: Edges = (0.0, *TENTHS[5:], None)
-
+# Edges of the distance from the arm's mount to the target, in reaches of the arm.
+OVER_REACH_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 _COLUMNS = {
     "sample_scene_index": "scene",
@@ -40,6 +44,7 @@ _COLUMNS = {
     "arm_reach_m": "reach_m",
     "base_height_m": "height_m",
 }
+_SCENE_COLUMNS = ("object_name", "support_type", "T_world_support", "support_size_m", "target_center_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +60,9 @@ class Labelled:
     visibility: Floats
     reach_m: Floats
     height_m: Floats
+    edge_xy_m: npt.NDArray[np.float64]  # (N, 2), base position in the frame of `target_frame.in_edge_frame`
     target: npt.NDArray[Any]  # the object's name
+    furniture: npt.NDArray[Any]  # the type of the furniture that carries the target
     outcome: npt.NDArray[np.uint8] | None  # code of OUTCOMES; None where the label has no cause
 
     def __len__(self) -> int:
@@ -112,37 +119,64 @@ def agreement(said: Bools, true: Bools) -> dict[str, Any]:
 
 
 def compare(said: Labelled, true: Labelled) -> dict[str, Any]:
-    """Compare the labels of `said` with those of `true`, for the same candidates in the same order."""
+    """Compare the labels of `said` with those of `true`, for the same candidates in the same order.
 
-    def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
+    Intervals of 95% are by scene (`scene_intervals`). Groups are by quantities of `true`.
+    """
+
+    def by_code(group: npt.NDArray[np.integer[Any]], heads: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        estimates = estimates_by_group(said.label, true.label, true.scene, group, len(heads))
+        each = (group == g for g in range(len(heads)))
         return [
-            {"low": low, "high": high, **agreement(said.label[rows], true.label[rows])}
-            for low, high, rows in bands(values, edges)
+            head | agreement(said.label[rows], true.label[rows]) | estimate
+            for head, rows, estimate in zip(heads, each, estimates, strict=True)
         ]
 
-    names = sorted({str(name) for name in true.target})
-    objects = [(name, true.target == name) for name in names]
+    def by_band(values: Floats, edges: Edges) -> list[dict[str, Any]]:
+        group, heads = np.zeros(len(true), np.int64), list[dict[str, Any]]()
+        for low, high, rows in bands(values, edges):
+            group[rows] = len(heads)
+            heads.append({"low": low, "high": high})
+        return by_code(group, heads)
+
+    def by_name(key: str, values: npt.NDArray[Any]) -> list[dict[str, Any]]:
+        names, codes = codes_of(values)
+        return by_code(codes, [{key: name} for name in names])
+
+    over_reach = true.mount_distance_m / true.reach_m
+    sides = np.array(SIDES)[side_of(true.edge_xy_m)]
+    (whole,) = by_code(np.zeros(len(true), np.int64), [{}])
     return {
-        **agreement(said.label, true.label),
+        **whole,
         "confusion": confusion(said.label, true.label),
         "by_distance": by_band(true.distance_m, DISTANCE_EDGES_M),
+        "by_distance_over_reach": by_band(over_reach, OVER_REACH_EDGES),
         "by_visibility": by_band(true.visibility, VISIBILITY_EDGES),
         "by_reach": by_band(true.reach_m, REACH_EDGES_M),
-        "by_object": [
-            {"object": name, **agreement(said.label[rows], true.label[rows])} for name, rows in objects
-        ],
+        "by_height": by_band(true.height_m, HEIGHT_EDGES_M),
+        "by_object": by_name("object", true.target),
+        "by_furniture": by_name("furniture", true.furniture),
+        "by_side": by_name("side", sides),
         "by_outcome": _by_outcome(said, true),
+        "error_map": error_map(said.label, true.label, true.edge_xy_m),
     }
 
 
 def _by_outcome(said: Labelled, true: Labelled) -> list[dict[str, Any]]:
-    """For each outcome of `true`, its count and the number of predicted positives."""
+    """For each outcome of `true`, its count, the predicted positives, and the accuracy with its interval."""
     if true.outcome is None:
         return []
+    codes, group = np.unique(true.outcome, return_inverse=True)
+    estimates = estimates_by_group(said.label, true.label, true.scene, group, len(codes))
+    names = tuple(OUTCOMES)
     return [
-        {"outcome": name, "count": int(rows.sum()), "said_positive": int(said.label[rows].sum())}
-        for code, name in enumerate(OUTCOMES)
-        if (rows := true.outcome == code).any()
+        {
+            "outcome": names[code],
+            "count": estimate["count"],
+            "said_positive": int(said.label[group == g].sum()),
+            **{key: estimate[key] for key in ("scenes", "accuracy", "accuracy_interval")},
+        }
+        for g, (code, estimate) in enumerate(zip(codes.tolist(), estimates, strict=True))
     ]
 
 
@@ -185,7 +219,7 @@ def outcome_report(labelled: Labelled) -> dict[str, Any]:
 def read_labelled(run: Run) -> Labelled | None:
     """All committed candidates of a run, also beyond n; None without any. InputError for a damaged file."""
     has_outcome = any(f.name == "outcome" for f in run.schema.sample_fields)
-    names = [*_COLUMNS, "object_name", *(["outcome"] if has_outcome else [])]
+    names = [*_COLUMNS, *_SCENE_COLUMNS, "base_xy_m", *(["outcome"] if has_outcome else [])]
     shards = [read_committed(run.storage, run.commit_of(shard), names) for shard in sorted(run.committed())]
     if not shards:
         return None
@@ -198,9 +232,18 @@ def read_labelled(run: Run) -> Labelled | None:
     columns["label"] = columns["label"].astype(np.bool_)
     return Labelled(
         **columns,
+        edge_xy_m=joined(_edge_xy_m(shard, per_scene) for shard in shards),
         target=joined(np.repeat(shard["object_name"][:, 0], per_scene) for shard in shards),
+        furniture=joined(np.repeat(shard["support_type"], per_scene) for shard in shards),
         outcome=joined(shard["outcome"] for shard in shards) if has_outcome else None,
     )
+
+
+def _edge_xy_m(shard: dict[str, Array], per_scene: int) -> Array:
+    center_m = shard["target_center_m"]
+    towards = towards_nearest_edge(shard["T_world_support"], shard["support_size_m"], center_m)
+    each = (np.repeat(values, per_scene, axis=0) for values in (center_m[:, :2], towards))
+    return in_edge_frame(shard["base_xy_m"], *each)
 
 
 def join_labelled(parts: list[Labelled]) -> Labelled:

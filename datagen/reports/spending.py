@@ -11,6 +11,8 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import Cost
 from datagen.schemas.summaries import Summaries
 
+QUARANTINED = "quarantined"
+
 
 @dataclass
 class Account:
@@ -20,6 +22,8 @@ class Account:
     without_account: int = 0  # attempts without a recorded cost
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    unmeasured_cpu_s: float = 0.0  # wall seconds of killed attempts, whose CPU time was lost with the process
+    gpu_s: float | None = None  # None where no record has GPU seconds
     stage_wall_s: Counter[str] = field(default_factory=Counter)
     stage_cpu_s: Counter[str] = field(default_factory=Counter)
     source_s: Counter[str] = field(default_factory=Counter)  # "wall" and "cpu": cost of relabelled files
@@ -34,6 +38,10 @@ class Account:
             return
         self.wall_s += cost.wall_s
         self.cpu_s += cost.cpu_s
+        if not cost.cpu_s:
+            self.unmeasured_cpu_s += cost.wall_s
+        if cost.stage_gpu_s:
+            self.gpu_s = (self.gpu_s or 0.0) + fsum(cost.stage_gpu_s.values())
         self.stage_wall_s.update(cost.stage_wall_s)
         self.stage_cpu_s.update(cost.stage_cpu_s)
         self.source_s.update(cost.source_s)
@@ -45,6 +53,16 @@ class Account:
         """Wall seconds that no stage claimed."""
         return max(0.0, self.wall_s - fsum(self.stage_wall_s.values()))
 
+    @property
+    def unnamed_cpu_s(self) -> float:
+        """CPU seconds that no stage claimed."""
+        return max(0.0, self.cpu_s - fsum(self.stage_cpu_s.values()))
+
+    @property
+    def core_s(self) -> float:
+        """Seconds of a core to pay for: CPU seconds, and wall seconds of killed attempts."""
+        return self.cpu_s + self.unmeasured_cpu_s
+
 
 @dataclass
 class Spending:
@@ -55,7 +73,9 @@ class Spending:
     scenes: int = 0
     redraws: Counter[str] = field(default_factory=Counter)
     useful: Account = field(default_factory=Account)
-    waste: dict[str, Account] = field(default_factory=dict)  # by outcome
+    # By outcome; attempts at shards that are quarantined now are under QUARANTINED, whatever their outcome.
+    waste: dict[str, Account] = field(default_factory=dict)
+    causes: dict[tuple[str, str], Account] = field(default_factory=dict)  # waste by (outcome, cause)
     running: int = 0  # attempts that began and have not ended
     machines: Counter[str] = field(default_factory=Counter)  # attempts by processor
 
@@ -78,7 +98,7 @@ def account_for(runs: Iterable[Run]) -> Spending:
     """
     spending = Spending()
     for run in runs:
-        summaries, committed = Summaries(run), set[str]()
+        summaries, committed, quarantined = Summaries(run), set[str](), run.quarantined()
         for commit in summaries.commits():
             committed.add(commit.attempt)
             spending.labels += commit.samples
@@ -89,6 +109,8 @@ def account_for(runs: Iterable[Run]) -> Spending:
             spending.machines[f"{commit.host.cpu}, {commit.host.cores} cores"] += 1
         for entry in summaries.ends():
             if entry.attempt not in committed:
-                spending.waste.setdefault(entry.outcome, Account()).add(entry.cost)
+                kind = QUARANTINED if entry.shard in quarantined else entry.outcome
+                spending.waste.setdefault(kind, Account()).add(entry.cost)
+                spending.causes.setdefault((entry.outcome, entry.cause), Account()).add(entry.cost)
         spending.running += sum(start.attempt not in committed for start in summaries.unfinished())
     return spending

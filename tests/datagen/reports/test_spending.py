@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datagen.commands.audit import audit_report
+from datagen.reports.label_costs import audit_report
 from datagen.reports.run_status import status_report
 from datagen.reports.spending import account_for
 from datagen.schemas.run import Run
