@@ -68,7 +68,7 @@ def advise(
     curve: LearningCurve, sources: Sequence[str], now: F64, costs: Mapping[str, LabelCost], cpu_h: float
 ) -> Advice:
     """Compare spending `cpu_h` core-hours of labels on each source, from labels `now` (K,) on."""
-    before, before_all = curve.accuracy(now)
+    before, before_all = _with_or_without_cheap(curve, now)
     alone = {
         name: _purchase(curve, sources, now, costs, cpu_h, np.eye(len(sources))[k])
         for k, name in enumerate(sources)
@@ -114,6 +114,15 @@ def _purchase(
     more = np.array(
         [share * cpu_h * 3600 / costs[name].cpu_s for name, share in zip(sources, split, strict=True)]
     )
-    accuracy, resamples = curve.accuracy(now + more)
+    accuracy, resamples = _with_or_without_cheap(curve, now + more)
     bought = {name: round(n) for name, n in zip(sources, more.tolist(), strict=True) if n >= 1}
     return Purchase(bought, cpu_h, float(accuracy), resamples)
+
+
+def _with_or_without_cheap(curve: LearningCurve, labels: F64) -> tuple[float, F64]:
+    """Predicted accuracy, and (B,) of the resamples; cheap labels that harm are left out."""
+    accuracy, resamples = curve.accuracy(labels)
+    if not curve.form.cheap:
+        return float(accuracy), resamples
+    without, resamples_without = curve.accuracy(np.concatenate([[0.0], labels[1:]]))
+    return float(max(accuracy, without)), np.maximum(resamples, resamples_without)

@@ -98,8 +98,11 @@ def _start(form: CurveForm, b: float) -> F64:
     return np.array([0.05, 0.1, np.log(b), *[0.0] * (form.dear - 1), *[0.1, 0.5] * form.cheap])
 
 
-def _bounds(form: CurveForm) -> tuple[F64, F64]:
-    low = [0.0, 0.0, np.log(0.02), *[np.log(0.01)] * (form.dear - 1), *[0.0, 0.05] * form.cheap]
+def _bounds(form: CurveForm, labels: F64) -> tuple[F64, F64]:
+    """Of the parameters. Cheap labels may cost some of the fewest dear ones: a bad start takes undoing."""
+    least = labels[:, 1:].sum(axis=1)[labels[:, 0] > 0].min(initial=form.unit) if form.cheap else 0.0
+    worst = -0.9 * least / form.unit
+    low = [0.0, 0.0, np.log(0.02), *[np.log(0.01)] * (form.dear - 1), *[worst, 0.05] * form.cheap]
     high = [0.6, 1.0, np.log(3.0), *[np.log(100.0)] * (form.dear - 1), *[100.0, 1.0] * form.cheap]
     return np.array(low), np.array(high)
 
@@ -110,7 +113,7 @@ def _fit(form: CurveForm, labels: F64, error: F64, start: F64) -> tuple[F64, flo
         priors += [_off(theta[-1], _PRIOR_G)] * form.cheap
         return np.concatenate([(form.error(theta, labels) - error) / _SPREAD, priors])
 
-    low, high = _bounds(form)
+    low, high = _bounds(form, labels)
     inside = np.clip(start, low + 1e-9, high - 1e-9)
     fit = least_squares(residuals, inside, bounds=(low, high), x_scale=_scales(form), max_nfev=200)
     return fit.x, float(fit.cost)

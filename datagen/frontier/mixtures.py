@@ -11,10 +11,11 @@ from datagen.train.training.options import STAGES, Options
 # In ascending fidelity, the order in which a model is trained on them.
 FIDELITY = ("heuristic", "plan", "sim")
 CHEAP = "heuristic"
-# Small and fast: half the width of `datagen train`'s default, with the same inputs.
-MODEL_CONFIG = {"width": 32, "embedding": 64}
-# A larger set needs fewer passes: so many labels are shown in all, in at least so many epochs.
-_LABELS_SHOWN, _LEAST_EPOCHS = 300_000, 8
+# Small and fast: half the width of `datagen train`'s default, and half the tokens.
+MODEL_CONFIG = {"width": 32, "embedding": 64, "tokens": (8, 16, 16)}
+# Epochs show so many labels in all, within bounds: small sets need many passes, or the curve would measure
+# the number of steps, and large sets few.
+_LABELS_SHOWN, _LEAST_EPOCHS, _MOST_EPOCHS = 200_000, 3, 40
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def mixtures_of(sources: Sequence[str], shares: Sequence[float]) -> list[Mixture
 
 
 def options_of(mixture: Mixture, n_labels: int, seed: int, batch_scenes: int) -> Options:
-    """How `datagen train` would train the last stage, with fewer epochs where there are many labels."""
+    """How `datagen train` would train the last stage, with epochs by the number of labels."""
     if mixture.stages[-1].source == CHEAP:
         name = "stage1"
     else:
@@ -71,7 +72,7 @@ def options_of(mixture: Mixture, n_labels: int, seed: int, batch_scenes: int) ->
         stage=name,
         model="shared",
         model_config=MODEL_CONFIG,
-        epochs=min(stage.epochs, max(_LEAST_EPOCHS, -(-_LABELS_SHOWN // n_labels))),
+        epochs=min(_MOST_EPOCHS, max(_LEAST_EPOCHS, -(-_LABELS_SHOWN // n_labels))),
         batch_scenes=batch_scenes,
         lr=stage.lr,
         weight_decay=stage.weight_decay,

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 # Raise it when the same inputs would give another model, also where a constant of mixtures.py changes.
 _VERSION = 1
-_BATCH_SCENES = 16
+_BATCH_SCENES = 8
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
