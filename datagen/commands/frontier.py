@@ -84,7 +84,11 @@ def frontier(
         _refuse_not_dear(places, option)
     sources = [name for name in FIDELITY if name in by_source]
     costs = label_costs({name: by_source[name] for name in sources}, priced)
-    encoded = _encoded({**by_source, "val": list(val), "test": list(test)}, out, allow_incomplete, json)
+    try:
+        encoded = _encoded({**by_source, "val": list(val), "test": list(test)}, out, allow_incomplete, json)
+    except KeyboardInterrupt:
+        say_interrupted("; finished encodings are kept", sys.argv[1:])
+        return 130
     folders = {name: str(out / "encodings" / data.key) for name, data in encoded.items()}
     mixtures = mixtures_of(sources, sorted(shares))
     tasks = [TrainingTask(m, k, folders, str(out)) for k in range(seeds) for m in mixtures]

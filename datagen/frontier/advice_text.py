@@ -36,8 +36,8 @@ def target_text(target: Target, curve: LearningCurve) -> str:
     if target.reached_by_half is None:
         most = float(np.median(1 - curve.resamples[:, 0]))
         return (
-            f"{target.accuracy:.1%} is not reached in half of the resamples with 10,000 core-hours; the median "
-            f"of the curve's limits is {most:.1%}."
+            f"{target.accuracy:.1%} is not reached in half of the resamples with 10,000 core-hours; "
+            f"the median of the curve's limits is {most:.1%}."
         )
     text = f"{target.accuracy:.1%} is reached in half of the resamples with {_bought(target.reached_by_half)}"
     if target.reached_by_most is None:
