@@ -72,7 +72,7 @@ def frontier(
     """
     _refuse_odd_options(runs, val, test, target_accuracy, budget, shares, seeds, workers)
     refuse_odd_draws(bootstrap, seed)
-    from datagen.frontier.label_costs import label_costs
+    from datagen.frontier.cost_per_label import label_costs
     from datagen.frontier.mixtures import FIDELITY, mixtures_of
     from datagen.frontier.trainings import TrainingTask, make_trainings
     from datagen.reports.prices import read_prices

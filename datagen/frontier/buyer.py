@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datagen.frontier.label_costs import LabelCost
+from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.learning_curves import LearningCurve
 from datagen.train.inputs import F64
 

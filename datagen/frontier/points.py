@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datagen.frontier.label_costs import LabelCost
+from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.mixtures import Mixture
 from datagen.frontier.trainings import TrainingResult
 from datagen.train.evaluation.bootstrap import Estimate, resample_weights, resampled_area_under_roc, summed

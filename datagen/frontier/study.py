@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from datagen.frontier.buyer import Advice, Target, advise, cheapest
-from datagen.frontier.label_costs import LabelCost
+from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.learning_curves import CurveForm, LearningCurve, fit_curve
 from datagen.frontier.mixtures import CHEAP, Mixture
 from datagen.frontier.points import METRICS, Point

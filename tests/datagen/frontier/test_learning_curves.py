@@ -7,7 +7,7 @@ import pytest
 
 from datagen.frontier.advice_text import advice_text, target_text
 from datagen.frontier.buyer import advise, cheapest
-from datagen.frontier.label_costs import LabelCost
+from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.learning_curves import CurveForm, LearningCurve, fit_curve
 
 N0, H0 = 10_000.0, 60_000.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.frontier.label_costs import LabelCost
+from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.mixtures import Mixture, Stage, mixtures_of, options_of
 from datagen.frontier.points import TestSet, efficient, points_of
 from datagen.frontier.study import study
