@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
 from datagen.train.models.crop import Crop, crop_clouds
+from datagen.train.models.encoded_clouds import EncodedClouds, unpack
 from datagen.train.models.frames import (
     N_PAIR_FEATURES,
     N_SCALARS,
@@ -140,7 +141,12 @@ class SharedModel(Model):
         return self.score_tokens(self.encode(clouds, robots), clouds, candidates, robots)
 
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
-        """The clouds' tokens, the same for all candidates; without parameters, so they can be cached."""
+        """The clouds' tokens, the same for all candidates; without parameters, so they can be cached.
+
+        Those that `EncodedClouds` bring are not made again.
+        """
+        if isinstance(clouds, EncodedClouds):
+            return unpack(clouds, token_sizes(len(self.sizes.scales_m)))
         with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
             return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)

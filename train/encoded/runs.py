@@ -1,0 +1,192 @@
+"""Tokens of all robots of runs in one memory-mapped file, with the columns that training needs.
+
+A folder `<key>` holds `tokens.f16` (R, J, F) and `columns.npz`. The key is the digest of what decides its
+content: ids and labels of the samples, and the sizes of the tokens. Tokens have no parameters and clouds are
+not augmented, as in `datagen train` without --augment, so a training from them has the same inputs up to
+half precision.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import digest_of
+from datagen.train.dataset import SampleStream
+from datagen.train.inputs import F32, I64, U8, Array, Batch, Bools, CandidateInputs, RobotInputs
+from datagen.train.models.encoded_clouds import EncodedClouds, pack, packed_width
+from datagen.train.models.shared import SharedModel
+from datagen.train.models.tokens import token_sizes
+from datagen.train.tensors import to_torch
+from datagen.workers.bases.candidate_sets import in_set
+
+# Raise it when the same run would give other tokens or columns.
+_VERSION = 1
+EXTRA = ("house_id", "base_is_clear", "mount_distance_m")
+# Fields of a model's configuration that decide its tokens.
+_DECISIVE = ("n_points", "tokens", "near_m", "scales_m")
+_TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedRuns:
+    """S scenes, R robots and N candidates; robots lie by scene, candidates by robot."""
+
+    key: str
+    tokens: np.memmap[Any, Any]  # (R, J, F) float16
+    columns: Mapping[str, Array]
+
+    @cached_property
+    def houses(self) -> Array:
+        """House (S,) of each scene, as text."""
+        return self.columns["house"]
+
+    @cached_property
+    def robot_bounds(self) -> I64:
+        """Bounds (S + 1,) of each scene's robots."""
+        return np.searchsorted(self.columns["scene_of_robot"], np.arange(len(self.houses) + 1))
+
+    @cached_property
+    def candidate_bounds(self) -> I64:
+        """Bounds (R + 1,) of each robot's candidates."""
+        robots = len(self.columns["scene_of_robot"])
+        return np.searchsorted(self.columns["robot_of_candidate"], np.arange(robots + 1))
+
+    @cached_property
+    def scene_of_candidate(self) -> I64:
+        """Scene (N,) of each candidate."""
+        return self.columns["scene_of_robot"][self.columns["robot_of_candidate"]]
+
+    @property
+    def label(self) -> Array:
+        """Labels (N,), 0 or 1."""
+        return self.columns["label"]
+
+    @property
+    def in_range(self) -> Bools:
+        """Where (N,) the base is clear and the target within reach."""
+        return self.columns["in_range"]
+
+    def batch(self, scenes: I64) -> Batch[Array]:
+        """A batch of these scenes, in their order."""
+        robots, cloud_row = _ranges(self.robot_bounds, scenes)
+        rows, robot_row = _ranges(self.candidate_bounds, robots)
+        c, n = self.columns, len(scenes)
+        return Batch(
+            clouds=EncodedClouds(
+                points_m=np.zeros((n, 0, 3), np.float32),
+                rgb=np.zeros((n, 0, 3), np.uint8),
+                target_mask=np.zeros((n, 0), np.bool_),
+                n_points=np.zeros(n, np.int64),
+                target_height_m=c["target_height_m"][scenes],
+                target_radius_m=c["target_radius_m"][scenes],
+                tokens=np.asarray(self.tokens[robots]),
+                targets=c["targets"][robots],
+            ),
+            robots=RobotInputs(
+                cloud_row, c["camera_height_m"][robots], c["base_height_m"][robots], c["arm_reach_m"][robots]
+            ),
+            candidates=CandidateInputs(robot_row, c["base_xy_m"][rows]),
+            label=c["label"][rows].astype(np.int64),
+            sample_id=c["sample_id"][rows],
+        )
+
+
+def _ranges(bounds: I64, rows: I64) -> tuple[I64, I64]:
+    """All of bounds[r] .. bounds[r + 1] for each of the rows, and the row's number in `rows` of each."""
+    counts = bounds[rows + 1] - bounds[rows]
+    owner = np.repeat(np.arange(len(rows)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return bounds[rows][owner] + within, owner
+
+
+def encode_runs(
+    stream: SampleStream, model: SharedModel, folder: Path, seen: Callable[[int, int], None]
+) -> EncodedRuns:
+    """The scenes of a stream, read from `folder` or encoded into it.
+
+    The stream is unshuffled, has all candidates, and reads `EXTRA`. `seen(done, of)` is called while scenes
+    are encoded.
+    """
+    decisive = {name: model.config[name] for name in _DECISIVE}
+    samples = [summary.samples_sha256 for summary in stream.parts]
+    key = digest_of({"version": _VERSION, "tokens": decisive, "samples": samples})
+    place = folder / key
+    if not place.exists():
+        draft = folder / f".{key}.{os.getpid()}"
+        draft.mkdir(parents=True)
+        try:
+            _write(stream, model, draft, seen)
+            os.replace(draft, place)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    return open_encoded(place)
+
+
+def open_encoded(place: Path) -> EncodedRuns:
+    """The encoded runs in a folder of `encode_runs`. InputError where a file is damaged."""
+    try:
+        with np.load(place / _COLUMNS, allow_pickle=False) as file:
+            columns = {name: file[name] for name in file.files}
+        shape = tuple(int(n) for n in columns.pop("shape"))
+        tokens = np.memmap(place / _TOKENS, np.float16, mode="r", shape=shape)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as e:
+        raise InputError(place, "", f"is damaged ({e!s:.200})", "Remove this folder; it is made again") from e
+    return EncodedRuns(place.name, tokens, columns)
+
+
+def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable[[int, int], None]) -> None:
+    parts: list[dict[str, Array]] = []
+    scenes = robots = 0
+    with open(place / _TOKENS, "wb") as file:
+        for batch in stream.epoch(0):
+            given = to_torch(batch, "cpu")
+            with torch.inference_mode():
+                tokens, targets = pack(model.encode(given.clouds, given.robots))
+            file.write(tokens.numpy().tobytes())
+            parts.append(_columns(batch, targets.numpy(), scenes, robots))
+            scenes, robots = scenes + len(batch.clouds), robots + len(batch.robots)
+            seen(scenes, stream.n_scenes)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    sizes = model.sizes
+    shape = np.array([robots, sum(sizes.tokens), packed_width(token_sizes(len(sizes.scales_m)))])
+    columns["shape"] = shape
+    np.savez(place / _COLUMNS, **cast(Any, columns))
+
+
+def _columns(batch: Batch[Array], targets: F32, scenes: int, robots: int) -> dict[str, Array]:
+    owner = batch.candidates.robot_row
+    reach_m: F32 = batch.robots.arm_reach_m[owner]
+    clear: U8 = batch.extra["base_is_clear"]
+    return {
+        "house": batch.extra["house_id"].astype(str),
+        "target_height_m": batch.clouds.target_height_m,
+        "target_radius_m": batch.clouds.target_radius_m,
+        "scene_of_robot": scenes + batch.robots.cloud_row,
+        "camera_height_m": batch.robots.camera_height_m,
+        "base_height_m": batch.robots.base_height_m,
+        "arm_reach_m": batch.robots.arm_reach_m,
+        "targets": targets,
+        "robot_of_candidate": robots + owner,
+        "base_xy_m": batch.candidates.base_xy_m,
+        "label": batch.label.astype(np.uint8),
+        "sample_id": batch.sample_id,
+        "in_range": in_set("in-range", clear.astype(np.bool_), batch.extra["mount_distance_m"], reach_m),
+    }
+
+
+def encoded_stream(places: Sequence[str], allow_incomplete: bool) -> SampleStream:
+    """The stream of these runs that `encode_runs` reads."""
+    return SampleStream(
+        places, scenes_per_batch=16, shuffle=False, extra=EXTRA, allow_incomplete=allow_incomplete
+    )
