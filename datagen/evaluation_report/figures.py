@@ -85,7 +85,7 @@ def draw_intervals(report: Report, told: Report) -> Figure:
         ax.set_axisbelow(True)
         for side in ("top", "right", "left"):
             ax.spines[side].set_visible(False)
-    panels[0].set_yticks(range(len(records)), [r["name"] for r in records])
+    panels[0].set_yticks(range(len(records)), [plain(r["name"]) for r in records])
     panels[0].invert_yaxis()
     return figure
 
@@ -111,9 +111,9 @@ def draw_curves(report: Report, told: Report) -> Figure:
         spread = look | {"markevery": (0.02 + 0.14 * (k % 8) / 8, 0.14)}
         curves, methods = told["curves"][name], told["methods"][name]
         area = methods["area_under_roc"]["value"]
-        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=f"{name} ({area:.2f})")
+        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=plain(f"{name} ({area:.2f})"))
         precision = curves["precision_recall"]
-        words = f"{name} ({curves['average_precision']:.2f})"
+        words = plain(f"{name} ({curves['average_precision']:.2f})")
         pr.step(precision["x"], precision["y"], where="pre", **spread, label=words)
         if methods["reliability"]:
             said, true = ([bin_[key] for bin_ in methods["reliability"]] for key in ("said", "true"))
@@ -121,7 +121,7 @@ def draw_curves(report: Report, told: Report) -> Figure:
             reliability.plot(said, true, **look | {"marker": ""})
             area_pt2 = [14 + 160 * n / max(sizes) for n in sizes]
             reliability.scatter(said, true, s=area_pt2, color=look["color"], marker=look["marker"], alpha=0.7)
-            reliability.plot([], [], **look, label=f"{name} ({methods['brier']:.3f})")
+            reliability.plot([], [], **look, label=plain(f"{name} ({methods['brier']:.3f})"))
     share = told["positives"] / told["count"]
     pr.axhline(share, color="#999999", lw=0.8, ls=":")
     for ax in (roc, reliability):
@@ -135,6 +135,11 @@ def draw_curves(report: Report, told: Report) -> Figure:
         if ax.get_legend_handles_labels()[0]:
             ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2)
     return figure
+
+
+def plain(text: str) -> str:
+    """The text as matplotlib shows it without reading formulas in it."""
+    return text.replace("$", r"\$")
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

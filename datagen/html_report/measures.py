@@ -1,0 +1,89 @@
+"""The quantities by which shards and scenes are compared: what is odd in one of them is worth a look."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datagen.html_report.outliers import F64, Measure, arcsine, log
+from datagen.html_report.part_columns import PartColumns
+from datagen.html_report.report_paths import ReportedPart
+
+POSITIVE, TIME, REJECTED, SETTLING, VISIBLE = (
+    "positive rate",
+    "wall time per label",
+    "rejected tries per scene",
+    "settling steps",
+    "visible share of the target",
+)
+
+
+def shard_measures(part: ReportedPart, columns: PartColumns | None) -> list[Measure]:
+    """Measures of the part's shards, in the order of `part.shards`.
+
+    The first three are from commits and cover all shards; the others are means over the scenes of the shards
+    that were read. A sealed store has no commits: its positive rate is of the shards that were read.
+    """
+    rows = {shard: row for row, shard in enumerate(part.shards)}
+    unknown = np.full(len(rows), np.nan)
+    positive, time_ms, rejected, steps, visible = (unknown.copy() for _ in range(5))
+    for shard, commit in part.commits.items():
+        if (row := rows.get(shard)) is not None and commit.samples and commit.scenes:
+            positive[row] = commit.positives / commit.samples
+            time_ms[row] = 1000 * commit.cost.all_s["wall"] / commit.samples
+            rejected[row] = sum(commit.redraws.values()) / commit.scenes
+    if columns is not None:
+        for shard in columns.chosen:
+            scenes = columns.shard == shard
+            steps[rows[shard]] = columns.scenes["settle_steps"][scenes].mean()
+            visible[rows[shard]] = columns.scenes["target_visible_fraction"][scenes].mean()
+            if part.run is None:
+                positive[rows[shard]] = columns.samples["label"][scenes[columns.scene]].mean()
+    return [
+        Measure(POSITIVE, positive, arcsine, _percent),
+        Measure(TIME, time_ms, log, lambda ms: f"{ms:.3g} ms"),
+        Measure(REJECTED, rejected, np.sqrt, lambda n: f"{n:.3g}"),
+        Measure(SETTLING, steps, log, lambda n: f"{n:,.0f}"),
+        Measure(VISIBLE, visible, arcsine, _percent),
+    ]
+
+
+def scene_measures(columns: PartColumns) -> list[Measure]:
+    """Measures of the scenes of `columns`, in their order."""
+    samples, scenes = columns.samples, columns.scenes
+    ones = np.ones(len(columns))
+    near, label = columns.is_in_range, samples["label"].astype(np.float64)
+    return [
+        Measure(
+            "positive rate within reach", _ratio(columns, label * near, near.astype(float)), arcsine, _percent
+        ),
+        Measure(
+            "share of free base poses", _ratio(columns, samples["base_is_clear"], ones), arcsine, _percent
+        ),
+        Measure(SETTLING, scenes["settle_steps"].astype(np.float64), log, lambda n: f"{n:,.0f}"),
+        Measure(
+            "speed at the end of settling",
+            1000 * scenes["residual_speed_mps"].astype(np.float64),
+            np.sqrt,
+            lambda v: f"{v:.2g} mm/s",
+        ),
+        Measure(
+            "deepest contact",
+            1000 * scenes["penetration_m"].astype(np.float64),
+            np.sqrt,
+            lambda v: f"{v:.2g} mm",
+        ),
+        Measure(VISIBLE, scenes["target_visible_fraction"].astype(np.float64), arcsine, _percent),
+        Measure(
+            "rejected tries", scenes["redraws"].sum(axis=1).astype(np.float64), np.sqrt, lambda n: f"{n:.0f}"
+        ),
+    ]
+
+
+def _ratio(columns: PartColumns, part: F64, whole: F64) -> F64:
+    """Sums (S,) of `part` (N,) over those of `whole` (N,); nan where the latter are 0."""
+    count = columns.per_scene(whole)
+    return np.where(count > 0, columns.per_scene(part) / np.maximum(count, 1), np.nan)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}%"
