@@ -58,10 +58,8 @@ def report(
     page = report_page(opened, _costs(runs), _agreement(runs), scenes, seed, given).encode()
     with whole_file(out, alone=True) as file:
         file.write(page)
-    named = (
-        (len(opened.runs), "run"), (len(opened.checkpoints), "checkpoint"), (len(opened.evaluations), "evaluation")
-    )  # fmt: skip
-    about = ", ".join(counted(n, what) for n, what in named if n)
+    named = {"run": opened.runs, "checkpoint": opened.checkpoints, "evaluation": opened.evaluations}
+    about = ", ".join(counted(len(found), what) for what, found in named.items() if found)
     print_rows("report", [("about", about), ("page", f"{out} ({size(len(page))})")])
     return 0
 
@@ -79,7 +77,10 @@ def _agreement(runs: Sequence[Run]) -> list[Mapping[str, Any]]:
     from datagen.commands.audit import pairs
 
     ordered = sorted(runs, key=lambda run: _ORDER.get(run.manifest.spec.label_source, 0))
-    return [pair for candidates in ("grid", "in-range") for pair in pairs(ordered, candidates)]
+    everywhere = pairs(ordered, "grid")
+    near = pairs(ordered, "in-range") if everywhere else []
+    # Of runs whose candidates all lie within reach, the two are the same.
+    return [*everywhere, *(b for a, b in zip(everywhere, near, strict=True) if a["count"] != b["count"])]
 
 
 # In ascending fidelity: the later of two is the reference for the earlier.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from datagen.console.printing import seconds
+from datagen.console.printing import counted, seconds
 from datagen.evaluation_report.figures import new_figure, svg_of
 from datagen.schemas.styles import MODEL_COLOURS
 from datagen.train.html_page import html_facts, html_figure, html_table
@@ -43,9 +43,10 @@ def checkpoint_section(path: Path, head: CheckpointHead, name: str) -> list[str]
         ("options", ", ".join(f"{k} {v}" for k, v in sorted(head.options.items()))),
     ]
     data = [
-        (use, f"{origin['n_samples']:,}", f"{origin['n_scenes']:,}", origin["schema"], ", ".join(origin["spec_hashes"]))
+        (use, f"{origin['n_samples']:,}", f"{origin['n_scenes']:,}", origin["schema"], hashes)
         for use, origins in (("training", head.data), ("validation", head.val_data))
         for origin in origins
+        for hashes in [", ".join(origin["spec_hashes"])]
     ]  # fmt: skip
     body = [html_facts((k, v) for k, v in facts if v)]
     if data:
@@ -61,19 +62,26 @@ def checkpoint_section(path: Path, head: CheckpointHead, name: str) -> list[str]
 def state_words(head: CheckpointHead) -> str:
     """Epochs, the best of them, and whether training is finished."""
     best = f", the best is epoch {head.best_epoch}" if head.best_epoch is not None else ""
-    return f"{head.epoch} epochs{best}{'' if head.finished else ', not finished'}"
+    return f"{counted(head.epoch, 'epoch')}{best}{'' if head.finished else ', not finished'}"
 
 
 def _draw_history(head: CheckpointHead) -> Figure:
-    """Draw the training loss and the validation accuracy of each epoch."""
+    """Draw loss and accuracy of training and validation by epoch."""
     figure = new_figure(12, 3.4)
     epochs = [record["epoch"] for record in head.history]
-    for ax, key, title in zip(
-        figure.subplots(1, 2), ("loss", "accuracy"), ("training loss", "accuracy"), strict=True
+    for ax, keys, title in zip(
+        figure.subplots(1, 2),
+        (("loss", "val_loss"), ("accuracy", "val_accuracy")),
+        ("loss", "accuracy"),
+        strict=True,
     ):
-        ax.plot(epochs, [record[key] for record in head.history], "o-", ms=4, color=MODEL_COLOURS[1])
+        for key, words, colour, line in zip(
+            keys, ("training", "validation"), MODEL_COLOURS, ("o--", "s-"), strict=False
+        ):
+            ax.plot(epochs, [record[key] for record in head.history], line, ms=4, color=colour, label=words)
         if head.best_epoch is not None:
             ax.axvline(head.best_epoch, color="#999999", lw=0.8, ls=":")
         ax.set(title=title, xlabel="epoch; the dotted line is the best")
         ax.grid(color="#e4e4e4", lw=0.7)
+        ax.legend(frameon=False, fontsize=9)
     return figure

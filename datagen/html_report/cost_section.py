@@ -1,4 +1,4 @@
-"""Cost and waste of a run, and agreement of runs, as tables of a page, from the numbers of `datagen audit`."""
+"""Cost and waste of a run, and agreement of runs, as tables of a page: the numbers of `datagen audit`."""
 
 from __future__ import annotations
 
@@ -84,7 +84,10 @@ def _groups(pair: Numbers) -> list[str]:
     tables = [
         (
             key,
-            [(name(g), f"{g['count']:,}", _percent(g["accuracy"]), _percent(g["balanced_accuracy"])) for g in pair[field]],
+            [
+                (name(g), f"{g['count']:,}", _percent(g["accuracy"]), _percent(g["balanced_accuracy"]))
+                for g in pair[field]
+            ],
         )
         for key, field, name in (
             ("distance (m)", "by_distance", _band),

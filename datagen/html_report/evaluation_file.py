@@ -29,8 +29,10 @@ class _Estimate(TypedDict):
     high: Share | None
 
 
-class _KnownEstimate(_Estimate):
+class _KnownEstimate(TypedDict):
     value: Share
+    low: Share | None
+    high: Share | None
 
 
 class _Metres(TypedDict):

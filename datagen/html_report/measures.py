@@ -61,12 +61,6 @@ def scene_measures(columns: PartColumns) -> list[Measure]:
         ),
         Measure(SETTLING, scenes["settle_steps"].astype(np.float64), log, lambda n: f"{n:,.0f}"),
         Measure(
-            "speed at the end of settling",
-            1000 * scenes["residual_speed_mps"].astype(np.float64),
-            np.sqrt,
-            lambda v: f"{v:.2g} mm/s",
-        ),
-        Measure(
             "deepest contact",
             1000 * scenes["penetration_m"].astype(np.float64),
             np.sqrt,

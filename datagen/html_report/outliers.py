@@ -33,6 +33,11 @@ class Measure:
         return float(np.median(known)) if len(known) else float("nan")
 
     @property
+    def varies(self) -> bool:
+        """Whether two known values differ."""
+        return len(np.unique(self.values[np.isfinite(self.values)])) > 1
+
+    @property
     def scores(self) -> F64:
         """Robust z-scores (K,)."""
         return robust_z(self.scale(self.values))

@@ -22,13 +22,15 @@ from datagen.html_report.report_paths import ReportPaths
 from datagen.html_report.run_section import PartReport, run_section, state_words
 from datagen.html_report.scene_view import SCRIPT, STYLE
 from datagen.schemas.progress import steps
-from datagen.train.html_page import escape, html_page, html_table
+from datagen.train.html_page import escape, html_page
 
 _MOST_FINDINGS = 12
 _STYLE = f"""{STYLE}
-pre {{ overflow-x: auto; max-width: 100%; font-size: .82rem; background: var(--band); padding: .5rem; border-radius: 5px; }}
-nav ul {{ padding-left: 1.2rem; }}
-nav li, li {{ overflow-wrap: anywhere; }}
+pre {{ overflow-x: auto; max-width: 100%; font-size: .82rem; background: var(--band); padding: .5rem;
+  border-radius: 5px; }}
+li {{ overflow-wrap: anywhere; }}
+table.overview td {{ white-space: normal; overflow-wrap: anywhere; }}
+table.overview td:first-child {{ min-width: 9rem; }}
 a {{ color: var(--accent); }}
 h4 {{ margin: .8rem 0 .2rem; overflow-wrap: anywhere; }}
 h2, h3 {{ scroll-margin-top: .5rem; }}
@@ -37,11 +39,11 @@ h2, h3 {{ scroll-margin-top: .5rem; }}
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """One section of the page: its id, heading, row of the overview, findings and HTML."""
+    """One section of the page: its id, heading, row of the overview, what is worth a look, and HTML."""
 
     id: str
     heading: str
-    row: tuple[str, str, str, str, str]  # what, holds, positive or accuracy, state, cost
+    row: tuple[str, str, str, str]  # of the overview: what it holds, positive or accuracy, state, cost
     findings: Sequence[str]
     body: Sequence[str]
 
@@ -62,36 +64,43 @@ def report_page(
     sections = [*_runs(paths, costs, scenes, seed, given)]
     sections += [_checkpoint(k, path) for k, path in enumerate(paths.checkpoints)]
     sections += [_evaluation(k, path) for k, path in enumerate(paths.evaluations)]
-    body = _overview(sections, bool(pairs))
+    body = _overview(sections)
     if agreement := agreement_section(pairs):
-        body += ['<h2 id="agreement">Agreement</h2>', *agreement]
+        body += ["<h2>Agreement</h2>", *agreement]
     for section in sections:
         body += [f'<h2 id="{section.id}">{escape(section.heading)}</h2>', *section.body]
     body.append(f"<p class=note>datagen {escape(__version__)}</p>")
     return html_page("Report of labels and models", body, _STYLE, SCRIPT)
 
 
-def _overview(sections: Sequence[_Section], has_pairs: bool) -> list[str]:
-    heads = ("", "holds", "positive, or accuracy", "state", "cost")
-    body = [html_table(heads, [(s.heading, *s.row[1:]) for s in sections], "text")]
+def _overview(sections: Sequence[_Section]) -> list[str]:
+    heads = "".join(f"<th>{head}</th>" for head in ("", "holds", "positive, or accuracy", "state", "cost"))
+    rows = "".join(
+        f'<tr><td><a href="#{s.id}">{escape(s.heading)}</a></td>'
+        + "".join(f"<td>{escape(cell)}</td>" for cell in s.row)
+        + "</tr>"
+        for s in sections
+    )
+    body = [
+        f'<div class="scroll" tabindex="0"><table class="text overview"><tr>{heads}</tr>{rows}</table></div>'
+    ]
     findings = [(s, text) for s in sections for text in s.findings]
     body.append("<h2>Worth a look</h2>")
-    if findings:
-        items = (
-            f'<li><a href="#{s.id}">{escape(s.heading)}</a>: {escape(text)}</li>'
-            for s, text in findings[:_MOST_FINDINGS]
-        )
-        body.append(f"<ul>{''.join(items)}</ul>")
-        if len(findings) > _MOST_FINDINGS:
-            body.append(f"<p>And {len(findings) - _MOST_FINDINGS} more, in the sections.</p>")
-    else:
-        body.append(
-            "<p>Nothing stands out: no quarantine, no failed attempt, no shard unlike the others.</p>"
-        )
-    links = [("agreement", "Agreement")] if has_pairs else []
-    links += [(s.id, s.heading) for s in sections]
-    items = "".join(f'<li><a href="#{name}">{escape(text)}</a></li>' for name, text in links)
-    return [*body, f'<nav aria-label="Sections"><ul>{items}</ul></nav>']
+    if not findings:
+        return [
+            *body,
+            "<p>Nothing stands out: no quarantine, no failed attempt, no shard unlike the others.</p>",
+        ]
+    items = (
+        f'<li><a href="#{s.id}">{escape(s.heading)}</a>: {escape(text)}</li>'
+        for s, text in findings[:_MOST_FINDINGS]
+    )
+    more = len(findings) - _MOST_FINDINGS
+    return [
+        *body,
+        f"<ul>{''.join(items)}</ul>",
+        f"<p>And {more} more, in the sections.</p>" if more > 0 else "",
+    ]
 
 
 def _runs(
@@ -123,7 +132,7 @@ def _run(
     return _Section(
         report.name,
         f"Run {part.place}",
-        ("run", f"{counted(part.labels, 'label')} by {source}", report.positive, state_words(report), spent),
+        (f"{counted(part.labels, 'label')} by {source}", report.positive, state_words(report), spent),
         _findings(report),
         run_section(report, cost_section(cost) if cost is not None else [], scenes, given, step),
     )
@@ -159,7 +168,7 @@ def _checkpoint(k: int, path: Path) -> _Section:
     return _Section(
         name,
         f"Checkpoint {path}",
-        ("checkpoint", f"{head.model}, {head.stage}", accuracy, checkpoint_words(head), spent),
+        (f"{head.model}, {head.stage}", accuracy, checkpoint_words(head), spent),
         [] if head.finished else ["training is not finished"],
         checkpoint_section(path, head, name),
     )
@@ -176,7 +185,7 @@ def _evaluation(k: int, path: Path) -> _Section:
     return _Section(
         name,
         f"Evaluation {path}",
-        ("evaluation", counted(len(report["methods"]), "method"), best, "", "-"),
+        (counted(len(report["methods"]), "method"), best, "", "-"),
         [],
         [about(report), *tables_of(report, f"{name}-", level=3), *sources_of(report, level=3)],
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,17 +21,17 @@ from datagen.schemas.styles import LABEL_STYLES, SCORE_COLOURS
 Bools = npt.NDArray[np.bool_]
 
 BALANCE_CAPTION = (
-    "Share of positive labels by distance from the target and by the direction that the base stands in: 0 degrees "
-    "is the side of the observation camera, counter-clockwise is positive. Bands are 95% intervals by scene, bars "
-    "the share of candidates. The map joins the two; cells of fewer than 20 candidates are left out."
+    "Share of positive labels by distance from the target and by the direction that the base stands in: 0 "
+    "degrees is the side of the observation camera, counter-clockwise is positive. Bands are 95% intervals "
+    "by scene, bars the share of candidates. The map joins the two, without cells of fewer than 20 candidates."
 )
 SHARDS_CAPTION = (
-    "One dot a shard, in the order of the run. The line is the median. Orange triangles, with their numbers, have a "
-    f"robust z-score beyond {THRESHOLD:g}; the band holds the others."
+    "One dot a shard, in the order of the run. The line is the median. Orange triangles, with their numbers, "
+    f"have a robust z-score beyond {THRESHOLD:g}; the band holds the others."
 )
 _GOOD, _ODD = LABEL_STYLES[1].colour, LABEL_STYLES[0].colour
 _FEWEST = 20
-_Z95 = 1.96
+_ALPHA, _Z95 = 0.05, 1.96
 _MOST_NAMED = 6
 _MOST_DOTS = 2000
 
@@ -54,7 +56,9 @@ def draw_balance(columns: PartColumns) -> Figure:
         ax.set(xlabel=words, ylim=(0, 1), xlim=(edges[0], edges[-1]))
     middle.set_xticks(range(-180, 181, 60))
     left.set_ylabel("positive")
-    left.legend(fontsize=9, loc="upper center", bbox_to_anchor=(1.1, -0.16), frameon=False, ncols=3)
+    figure.legend(
+        *left.get_legend_handles_labels(), fontsize=9, loc="outside lower left", frameon=False, ncols=3
+    )
     _draw_map(figure, columns, sets[-1], rings_m, sectors_deg, distance_m, angle_deg)
     return figure
 
@@ -69,22 +73,27 @@ def angles_deg(columns: PartColumns) -> F64:
     return (angle + 180) % 360 - 180
 
 
-def rate_by_scene(columns: PartColumns, rows: Bools) -> tuple[float, float]:
-    """Positive rate of some candidates and half its 95% interval, with scenes as units.
+def rate_by_scene(columns: PartColumns, rows: Bools) -> tuple[float, float, float]:
+    """Positive rate of some candidates with its 95% interval, scenes as units; nan where undefined.
 
-    The variance is that of a ratio of two sums over scenes: sum (y - p n)^2 / (sum n)^2 times S / (S - 1)
-    (Cochran, Sampling Techniques, 1977, section 6.4). nan where it is not defined.
+    The variance is that of a ratio of two sums over S scenes, sum (y - p n)^2 / (sum n)^2 times S / (S - 1)
+    (Cochran, Sampling Techniques, 1977, section 6.4). Of a rate of 0 or 1: the exact interval of as many
+    trials as scenes (Clopper and Pearson 1934).
     """
     count = columns.per_scene(rows)
-    count, good = count[count > 0], columns.per_scene(rows & (columns.samples["label"] == 1))[count > 0]
+    good = columns.per_scene(rows & (columns.samples["label"] == 1))[count > 0]
+    count = count[count > 0]
     n, scenes = count.sum(), len(count)
     if not n:
-        return float("nan"), float("nan")
-    rate = good.sum() / n
+        return float("nan"), float("nan"), float("nan")
+    rate = float(good.sum() / n)
+    if rate in (0.0, 1.0):
+        open_end = 1 - (_ALPHA / 2) ** (1 / scenes)
+        return (rate, 0.0, open_end) if rate == 0 else (rate, 1 - open_end, 1.0)
     if scenes < 2:
-        return float(rate), float("nan")
-    variance = ((good - rate * count) ** 2).sum() / n**2 * scenes / (scenes - 1)
-    return float(rate), _Z95 * float(np.sqrt(variance))
+        return rate, 0.0, 1.0
+    half = _Z95 * float(np.sqrt(((good - rate * count) ** 2).sum() / n**2 * scenes / (scenes - 1)))
+    return rate, max(0.0, rate - half), min(1.0, rate + half)
 
 
 def _draw_rates(
@@ -96,11 +105,10 @@ def _draw_rates(
     for (name, rows), colour, line in zip(sets, (_GOOD, _ODD), ("-", "--"), strict=False):
         found = [
             rate_by_scene(columns, rows & (values >= low) & (values < high))
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
+            for low, high in pairwise(edges.tolist())
         ]
-        rate, half = np.array(found).T
+        rate, low, high = np.array(found).T
         ax.plot(middles, rate, line, color=colour, marker="o", ms=4, label=f"positive, {name}")
-        low, high = np.clip(rate - half, 0, 1), np.clip(rate + half, 0, 1)
         ax.fill_between(middles, low, high, color=colour, alpha=0.18, lw=0)
     ax.grid(axis="y", color="#e4e4e4", lw=0.7)
     ax.set_axisbelow(True)
@@ -110,7 +118,7 @@ def _draw_map(
     figure: Figure, columns: PartColumns, shown: tuple[str, Bools],
     rings_m: Array, sectors_deg: Array, distance_m: F64, angle_deg: F64,
 ) -> None:  # fmt: skip
-    ax = figure.add_subplot(1, 3, 3, projection="polar")
+    ax: Any = figure.add_subplot(1, 3, 3, projection="polar")
     name, rows = shown
     where = (angle_deg[rows], distance_m[rows])
     count = np.histogram2d(*where, (sectors_deg, rings_m))[0]
@@ -122,6 +130,11 @@ def _draw_map(
     )
     ax.set_title(name, fontsize=10)
     ax.tick_params(labelsize=8)
+    ax.set_thetagrids(
+        range(0, 360, 45), [f"{a}°" if a else "camera" for a in (0, 45, 90, 135, 180, -135, -90, -45)]
+    )
+    ax.set_rlabel_position(22.5)
+    ax.set_rticks(rings_m[2 :: 4 if len(rings_m) > 8 else 2])
     ax.grid(color="#bbbbbb", lw=0.4)
     figure.colorbar(ScalarMappable(scale, SCORE_COLOURS), ax=ax, shrink=0.75, pad=0.12, label="positive")
 

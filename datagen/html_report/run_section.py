@@ -92,8 +92,8 @@ def run_section(
 
 
 def _facts(report: PartReport) -> list[tuple[str, str]]:
-    part, status = report.part, report.status
-    facts = [("path", part.place), ("labels", _labels(report)), ("positive", report.positive)]
+    status = report.status
+    facts = [("labels", _labels(report)), ("positive", report.positive)]
     if status:
         shards = status["shards"]
         facts += [
@@ -196,18 +196,19 @@ def _shards(report: PartReport) -> list[str]:
         return [f"<p>{counted(len(part.shards), 'shard')}: too few to tell which stand out.</p>"]
     rows = [
         (
-            str(part.shards[o.row]), o.measure, measures[o.measure].text(o.value),
-            measures[o.measure].text(measures[o.measure].median), f"{o.score:+.1f}", _machine(part, part.shards[o.row]),
+            str(part.shards[o.row]), o.measure, m.text(o.value), m.text(m.median), f"{o.score:+.1f}",
+            _machine(part, part.shards[o.row]),
         )
         for o in report.outliers[:_MOST_OUTLIERS]
+        for m in [measures[o.measure]]
     ]  # fmt: skip
-    found = len(report.outliers)
+    found, some = len(report.outliers), f", the {_MOST_OUTLIERS} largest listed"
     text = (
-        f"{counted(found, 'value')} of {counted(len(part.shards), 'shard')} with a robust z-score beyond {THRESHOLD:g}"
-        f"{f', the {_MOST_OUTLIERS} largest listed' if found > _MOST_OUTLIERS else ''}."
+        f"{counted(found, 'value')} of {counted(len(part.shards), 'shard')} with a robust z-score beyond "
+        f"{THRESHOLD:g}{some if found > _MOST_OUTLIERS else ''}."
     )
     table = html_table(("shard", "measure", "value", "median", "z", "machine"), rows) if rows else ""
-    figure = draw_shards(part.shards, report.measures)
+    figure = draw_shards(part.shards, [m for m in report.measures if m.varies])
     return [f"<p>{text}</p>", table, html_figure(svg_of(figure, f"{report.name}-shards"), SHARDS_CAPTION)]
 
 

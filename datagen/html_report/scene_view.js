@@ -25,7 +25,7 @@
       const cy = Math.cos(camera.yaw), sy = Math.sin(camera.yaw);
       const cp = Math.cos(camera.pitch), sp = Math.sin(camera.pitch);
       const scale = (camera.zoom * Math.min(width, height)) / (2.1 * scene.radius);
-      const middle = scene.floor / 2;
+      const middle = scene.middle;
       return (x, y, z) => {
         const right = cy * x + sy * y, away = cy * y - sy * x, up = z - middle;
         return [width / 2 + scale * right, height / 2 - scale * (cp * up + sp * away), cp * away - sp * up, scale];
@@ -80,7 +80,7 @@
         items.push([depth, x, y, k]);
       }
       // Base poses lie on the floor: furniture in front of one hides it, but marks stay readable.
-      const dot = Math.max(1.5, 0.011 * place(0, 0, 0)[3]), mark = Math.max(3 * ratio, 0.022 * place(0, 0, 0)[3]);
+      const dot = Math.max(1.5, 0.013 * place(0, 0, 0)[3]), mark = Math.max(3 * ratio, 0.022 * place(0, 0, 0)[3]);
       items.sort((a, b) => b[0] - a[0]);
       for (const [, x, y, k] of items) {
         context.fillStyle = onTarget[k] ? scene.colours.target

@@ -18,22 +18,25 @@ from datagen.train.html_page import escape
 SCRIPT = files("datagen.html_report").joinpath("scene_view.js").read_text(encoding="utf-8")
 STYLE = """
 .scene { border-top: 1px solid var(--line); padding-top: .2rem; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); gap: .8rem; }
+.pictures { display: grid; gap: .8rem;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); }
 .pictures figure { margin: 0; }
-.pictures img, .scene-view canvas { display: block; width: 100%; }
+.pictures img, .scene-view canvas { display: block; width: 100%; height: auto; }
 .scene-view canvas { aspect-ratio: 4 / 3; touch-action: pan-y; cursor: grab; border-radius: 4px; }
 .scene-view canvas:focus-visible { outline: 3px solid #0b57a4; }
 .scene-view .buttons { display: flex; flex-wrap: wrap; gap: .3rem; margin: .4rem 0; }
-.scene-view button { font: inherit; min-width: 2.4rem; min-height: 2.2rem; padding: .1rem .5rem; cursor: pointer;
+.scene-view button { font: inherit; min-width: 2.1rem; min-height: 2.2rem; padding: .1rem .4rem;
+  cursor: pointer;
   color: #1b1f24; background: #f3f6f9; border: 1px solid #b7c0c9; border-radius: 5px; }
 .scene-view output { display: block; min-height: 1.5em; font-size: .92rem; }
 """
 _MOST_UNITS = 32767
 _BESIDE_RAD = 0.35
-_HELP = (
-    "Drag to turn, pinch to zoom. With the view in focus: arrow keys turn, + and - or the wheel zoom, n and p step "
-    "through the base poses, Home resets. Blue discs are good, orange triangles bad; hollow marks: the base collides. "
-    "The target is pink; the grid on the floor has cells of 0.5 m."
+_SHOWN_PERCENT = 95
+VIEW_HELP = (
+    "Drag a view to turn it, pinch to zoom. With a view in focus: arrow keys turn, + and - or the wheel "
+    "zoom, n and p step through the base poses, Home resets. Blue discs are good, orange triangles bad; marks are "
+    "hollow where the base collides. The target is pink; the grid on the floor has cells of 0.5 m."
 )
 _BUTTONS = (
     ("ArrowLeft", "←", "turn left"),
@@ -42,7 +45,7 @@ _BUTTONS = (
     ("ArrowDown", "↓", "look from the side"),
     ("+", "+", "zoom in"),
     ("-", "−", "zoom out"),
-    ("n", "next pose", "choose the next base pose"),
+    ("n", "next", "choose the next base pose"),
     ("Home", "reset", "reset the view"),
 )
 
@@ -56,7 +59,6 @@ def scene_view(rows: SceneRows, name: str) -> str:
     return (
         f'<figure class="scene-view"><canvas tabindex="0" role="img" aria-label="{escape(name)}"></canvas>'
         f'<div class="buttons">{buttons}</div><output aria-live="polite"></output>'
-        f"<figcaption>{_HELP}</figcaption>"
         f'<script type="application/json">{_embedded(_scene_data(rows))}</script></figure>'
     )
 
@@ -68,7 +70,7 @@ def _embedded(value: Any) -> str:
 
 
 def _scene_data(rows: SceneRows) -> dict[str, Any]:
-    """Cloud and base poses in the target's frame (m): coordinates as multiples of `unit`, colours as bytes."""
+    """Cloud and base poses in the target's frame (m). The cloud's coordinates are multiples of `unit`."""
     record, samples = rows.record, rows.samples
     n = int(record["n_points"])
     points_m = np.asarray(record["points_m"][:n], np.float64)
@@ -77,13 +79,18 @@ def _scene_data(rows: SceneRows) -> dict[str, Any]:
     unit_m = max(float(np.abs(points_m).max(initial=0.0)), 0.001) / _MOST_UNITS
     center_m = np.asarray(record["target_center_m"], np.float64)
     base_m = np.asarray(samples["base_xy_m"], np.float64) - center_m[:2]
-    radius_m = max(0.5, float(np.linalg.norm(base_m, axis=1).max(initial=0.0)))
+    floor_m = -float(center_m[2])
+    # What lies far off or high up, such as walls, may be cut off.
+    top_m = float(np.percentile(points_m[:, 2], _SHOWN_PERCENT)) if len(points_m) else 0.0
+    wide_m = float(np.percentile(np.abs(points_m[:, :2]), _SHOWN_PERCENT)) if len(points_m) else 0.0
+    radius_m = max(0.5, wide_m, (top_m - floor_m) / 2, float(np.linalg.norm(base_m, axis=1).max(initial=0.0)))
     return {
         "points": _packed(np.round(points_m / unit_m).astype("<i2")),
         "unit": unit_m,
         "rgb": _packed(np.asarray(record["rgb"][:n], np.uint8)[finite]),
         "target": _packed(np.asarray(record["target_mask"][:n]).astype(np.uint8)[finite]),
-        "floor": -float(center_m[2]),
+        "floor": floor_m,
+        "middle": (floor_m + top_m) / 2,
         "radius": round(radius_m, 3),
         "yaw": _first_yaw_rad(np.asarray(record["T_world_camera"], np.float64)[:2, 3] - center_m[:2]),
         "candidates": _candidates(samples, base_m),

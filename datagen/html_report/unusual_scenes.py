@@ -11,7 +11,7 @@ from datagen.html_report.outliers import FEWEST, Measure, Outlier, most_unusual
 from datagen.html_report.part_columns import PartColumns
 from datagen.html_report.report_paths import ReportedPart
 from datagen.html_report.scene_pictures import scene_pictures
-from datagen.html_report.scene_view import scene_view
+from datagen.html_report.scene_view import VIEW_HELP, scene_view
 from datagen.schemas.errors import InputError
 from datagen.schemas.fields import SceneRows
 from datagen.train.html_page import escape, html_facts
@@ -20,7 +20,6 @@ from datagen.workers.scenes.reconstruct import reconstruct_scene
 from datagen.workers.world import World, open_world
 
 _MOST_EACH = 3  # scenes for one measure
-_PICTURE_SIZES = "width=624 height=500"
 
 
 def unusual_scenes(
@@ -32,7 +31,7 @@ def unusual_scenes(
     if not chosen:
         return []
     world, why = _open_world(columns.part, given)
-    body = [f"<p>{escape(_introduction(columns, len(chosen)))}</p>"]
+    body = [f"<p>{escape(_introduction(columns, len(chosen)))}</p><p class=note>{VIEW_HELP}</p>"]
     if why:
         body.append(f"<p class=note>{escape(f'Without pictures: {why}')}</p>")
     by_name = {measure.name: measure for measure in measures}
@@ -48,8 +47,8 @@ def _introduction(columns: PartColumns, count: int) -> str:
     if scenes < FEWEST:
         return f"{count} of {scenes} scenes: too few to tell which are unusual."
     return (
-        f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest robust z-score of "
-        "seven measures."
+        f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest robust "
+        "z-score of six measures."
     )
 
 
@@ -75,7 +74,7 @@ def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | No
             shown = Shown(columns.part.place, columns.part.spec, rows, reconstruct_scene(world, record))
             names = ("RGB frame, target outlined", "the room from above with the base poses")
             pictures = "".join(
-                f'<figure><img src="{address}" alt="{name}" {_PICTURE_SIZES}></figure>'
+                f'<figure><img src="{address}" alt="{name}"></figure>'
                 for address, name in zip(scene_pictures(shown), names, strict=True)
             )
         except InputError as error:
