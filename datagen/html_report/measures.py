@@ -39,11 +39,11 @@ def shard_measures(part: ReportedPart, columns: PartColumns | None) -> list[Meas
             if part.run is None:
                 positive[rows[shard]] = columns.samples["label"][scenes[columns.scene]].mean()
     return [
-        Measure(POSITIVE, positive, arcsine, _percent),
-        Measure(TIME, time_ms, log, lambda ms: f"{ms:.3g} ms"),
-        Measure(REJECTED, rejected, np.sqrt, lambda n: f"{n:.3g}"),
-        Measure(SETTLING, steps, log, lambda n: f"{n:,.0f}"),
-        Measure(VISIBLE, visible, arcsine, _percent),
+        Measure(POSITIVE, positive, arcsine, "%"),
+        Measure(TIME, time_ms, log, "ms"),
+        Measure(REJECTED, rejected, np.sqrt),
+        Measure(SETTLING, steps, log),
+        Measure(VISIBLE, visible, arcsine, "%"),
     ]
 
 
@@ -54,22 +54,13 @@ def scene_measures(columns: PartColumns) -> list[Measure]:
     near, label = columns.is_in_range, samples["label"].astype(np.float64)
     return [
         Measure(
-            "positive rate within reach", _ratio(columns, label * near, near.astype(float)), arcsine, _percent
+            "positive rate within reach", _ratio(columns, label * near, near.astype(float)), arcsine, "%"
         ),
-        Measure(
-            "share of free base poses", _ratio(columns, samples["base_is_clear"], ones), arcsine, _percent
-        ),
-        Measure(SETTLING, scenes["settle_steps"].astype(np.float64), log, lambda n: f"{n:,.0f}"),
-        Measure(
-            "deepest contact",
-            1000 * scenes["penetration_m"].astype(np.float64),
-            np.sqrt,
-            lambda v: f"{v:.2g} mm",
-        ),
-        Measure(VISIBLE, scenes["target_visible_fraction"].astype(np.float64), arcsine, _percent),
-        Measure(
-            "rejected tries", scenes["redraws"].sum(axis=1).astype(np.float64), np.sqrt, lambda n: f"{n:.0f}"
-        ),
+        Measure("share of free base poses", _ratio(columns, samples["base_is_clear"], ones), arcsine, "%"),
+        Measure(SETTLING, scenes["settle_steps"].astype(np.float64), log),
+        Measure("deepest contact", 1000 * scenes["penetration_m"].astype(np.float64), np.sqrt, "mm"),
+        Measure(VISIBLE, scenes["target_visible_fraction"].astype(np.float64), arcsine, "%"),
+        Measure("rejected tries", scenes["redraws"].sum(axis=1).astype(np.float64), np.sqrt),
     ]
 
 
@@ -77,7 +68,3 @@ def _ratio(columns: PartColumns, part: F64, whole: F64) -> F64:
     """Sums (S,) of `part` (N,) over those of `whole` (N,); nan where the latter are 0."""
     count = columns.per_scene(whole)
     return np.where(count > 0, columns.per_scene(part) / np.maximum(count, 1), np.nan)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f}%"

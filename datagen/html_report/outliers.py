@@ -18,13 +18,21 @@ THRESHOLD, FEWEST = 3.5, 8
 class Measure:
     """A quantity of K shards or scenes: `values` (K,), nan where it is not known.
 
-    Scores are of `scale(values)`, on which the quantity varies evenly; `text` writes a value for people.
+    Scores are of `scale(values)`, on which the quantity varies evenly. Shares have the unit "%" and lie
+    between 0 and 1.
     """
 
     name: str
     values: F64
     scale: Callable[[F64], F64]
-    text: Callable[[float], str]
+    unit: str = ""
+
+    def text(self, value: float) -> str:
+        """A value for people, with its unit."""
+        if self.unit == "%":
+            return f"{100 * value:.1f}%"
+        number = f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+        return f"{number} {self.unit}".rstrip()
 
     @property
     def median(self) -> float:

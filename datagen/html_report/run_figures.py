@@ -23,14 +23,14 @@ Bools = npt.NDArray[np.bool_]
 BALANCE_CAPTION = (
     "Share of positive labels by distance from the target and by the direction that the base stands in: 0 "
     "degrees is the side of the observation camera, counter-clockwise is positive. Bands are 95% intervals "
-    "by scene, bars the share of candidates. The map joins the two, without cells of fewer than 20 candidates."
+    "by scene, bars the share of candidates. The map joins the two, without cells of under 20 candidates."
 )
 SHARDS_CAPTION = (
     "One dot a shard, in the order of the run. The line is the median. Orange triangles, with their numbers, "
     f"have a robust z-score beyond {THRESHOLD:g}; the band holds the others."
 )
 _GOOD, _ODD = LABEL_STYLES[1].colour, LABEL_STYLES[0].colour
-_FEWEST = 20
+_FEWEST, _SECTOR_DEG = 20, 30
 _ALPHA, _Z95 = 0.05, 1.96
 _MOST_NAMED = 6
 _MOST_DOTS = 2000
@@ -42,7 +42,7 @@ def draw_balance(columns: PartColumns) -> Figure:
     distance_m, angle_deg = samples["distance_m"].astype(np.float64), angles_deg(columns)
     far_m = max(0.2, np.ceil(10 * float(distance_m.max())) / 10)
     rings_m = np.round(np.arange(0, far_m + 0.05, 0.1), 1)
-    sectors_deg = np.arange(-180, 181, 30)
+    sectors_deg = np.arange(-180, 181, _SECTOR_DEG)
     figure = new_figure(12, 4.3)
     left, middle = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
     sets = [("all candidates", np.ones(len(columns), np.bool_))]
@@ -123,11 +123,13 @@ def _draw_map(
     where = (angle_deg[rows], distance_m[rows])
     count = np.histogram2d(*where, (sectors_deg, rings_m))[0]
     good = np.histogram2d(*where, (sectors_deg, rings_m), weights=columns.samples["label"][rows])[0]
-    rate = np.where(count >= _FEWEST, good / np.maximum(count, 1), np.nan)
     scale = Normalize(0, 1)
-    ax.pcolormesh(
-        np.radians(sectors_deg), rings_m, rate.T, cmap=SCORE_COLOURS, norm=scale, edgecolors="face", lw=0.2
-    )
+    colours = ScalarMappable(scale, SCORE_COLOURS)
+    for sector, ring in np.argwhere(count >= _FEWEST).tolist():
+        middle, width = np.radians(sectors_deg[sector] + _SECTOR_DEG / 2), np.radians(_SECTOR_DEG)
+        colour = colours.to_rgba(good[sector, ring] / count[sector, ring])
+        ax.bar(middle, rings_m[ring + 1] - rings_m[ring], width, rings_m[ring], color=colour, lw=0)
+    ax.set_ylim(0, rings_m[-1])
     ax.set_title(name, fontsize=10)
     ax.tick_params(labelsize=8)
     ax.set_thetagrids(
@@ -136,7 +138,7 @@ def _draw_map(
     ax.set_rlabel_position(22.5)
     ax.set_rticks(rings_m[2 :: 4 if len(rings_m) > 8 else 2])
     ax.grid(color="#bbbbbb", lw=0.4)
-    figure.colorbar(ScalarMappable(scale, SCORE_COLOURS), ax=ax, shrink=0.75, pad=0.12, label="positive")
+    figure.colorbar(colours, ax=ax, shrink=0.75, pad=0.12, label="positive")
 
 
 def draw_shards(shards: Sequence[int], measures: Sequence[Measure]) -> Figure:
@@ -152,16 +154,13 @@ def draw_shards(shards: Sequence[int], measures: Sequence[Measure]) -> Figure:
 
 
 def _draw_measure(ax: Axes, number: F64, measure: Measure) -> None:
-    ax.set_title(measure.name, fontsize=10)
+    unit = f" ({measure.unit})" if measure.unit else ""
+    ax.set_title(measure.name + unit, fontsize=10)
     ax.set_xlabel("shard", fontsize=9)
     ax.tick_params(labelsize=8)
     known = np.isfinite(measure.values)
-    if not known.any():
-        ax.text(0.5, 0.5, "not known", ha="center", transform=ax.transAxes)
-        return
-    factor = 100 if measure.text(0.5).endswith("%") else 1
+    factor = 100 if measure.unit == "%" else 1
     values, scores = factor * measure.values, measure.scores
-    ax.set_title(measure.name + (" (%)" if factor > 1 else ""), fontsize=10)
     odd = np.abs(scores) > THRESHOLD
     usual = known & ~odd
     # Many dots are one image, so that the page stays small.

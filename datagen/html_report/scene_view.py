@@ -35,8 +35,8 @@ _BESIDE_RAD = 0.35
 _SHOWN_PERCENT = 95
 VIEW_HELP = (
     "Drag a view to turn it, pinch to zoom. With a view in focus: arrow keys turn, + and - or the wheel "
-    "zoom, n and p step through the base poses, Home resets. Blue discs are good, orange triangles bad; marks are "
-    "hollow where the base collides. The target is pink; the grid on the floor has cells of 0.5 m."
+    "zoom, n and p step through the base poses, Home resets. Blue discs are good, orange triangles bad; "
+    "marks are hollow where the base collides. The target is pink; the grid on the floor has cells of 0.5 m."
 )
 _BUTTONS = (
     ("ArrowLeft", "←", "turn left"),
