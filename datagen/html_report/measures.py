@@ -52,16 +52,21 @@ def scene_measures(columns: PartColumns) -> list[Measure]:
     samples, scenes = columns.samples, columns.scenes
     ones = np.ones(len(columns))
     near, label = columns.is_in_range, samples["label"].astype(np.float64)
-    return [
+    measures = [
         Measure(
             "positive rate within reach", _ratio(columns, label * near, near.astype(float)), arcsine, "%"
         ),
         Measure("share of free base poses", _ratio(columns, samples["base_is_clear"], ones), arcsine, "%"),
         Measure(SETTLING, scenes["settle_steps"].astype(np.float64), log),
-        Measure("deepest contact", 1000 * scenes["penetration_m"].astype(np.float64), np.sqrt, "mm"),
         Measure(VISIBLE, scenes["target_visible_fraction"].astype(np.float64), arcsine, "%"),
         Measure("rejected tries", scenes["redraws"].sum(axis=1).astype(np.float64), np.sqrt),
+        Measure("height of the target", scenes["target_center_m"][:, 2].astype(np.float64), np.asarray, "m"),
     ]
+    if "heuristic_label" in samples:
+        same = (samples["heuristic_label"] == samples["label"]) & near
+        agreed = _ratio(columns, same.astype(np.float64), near.astype(np.float64))
+        measures.append(Measure("agreement with the heuristic within reach", agreed, arcsine, "%"))
+    return measures
 
 
 def _ratio(columns: PartColumns, part: F64, whole: F64) -> F64:

@@ -17,14 +17,15 @@ I64 = npt.NDArray[np.int64]
 
 MOST_SHARDS, MOST_LABELS = 256, 400_000
 _SCENE = (
-    *("scene_index", "house_id", "room_type", "support_type", "object_name", "retry", "redraws"),
-    *("settle_steps", "residual_speed_mps", "penetration_m", "target_visible_fraction"),
+    *("scene_index", "house_id", "room_type", "support_type", "object_name", "redraws"),
+    *("settle_steps", "target_visible_fraction"),
     *("T_world_camera", "target_center_m"),
 )
 _SAMPLE = (
     *("sample_scene_index", "candidate_index", "base_xy_m", "base_height_m", "arm_reach_m"),
     *("distance_m", "mount_distance_m", "visibility", "base_is_clear", "label"),
 )
+_OF_ARMS = ("outcome", "heuristic_label")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ def chosen_shards(part: ReportedPart, seed: int) -> tuple[int, ...]:
 def read_columns(part: ReportedPart, seed: int, step: Callable[[], None]) -> PartColumns | None:
     """Read the short columns of `chosen_shards`; None without shards. `step` is called after each shard."""
     chosen = chosen_shards(part, seed)
-    names = [*_SCENE, *_SAMPLE, *(["outcome"] if "outcome" in part.names else [])]
+    names = [*_SCENE, *_SAMPLE, *(name for name in _OF_ARMS if name in part.names)]
     read: list[dict[str, Array]] = []
     for shard in chosen:
         read.append(part.read(shard, names))

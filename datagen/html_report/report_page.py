@@ -29,8 +29,14 @@ _STYLE = f"""{STYLE}
 pre {{ overflow-x: auto; max-width: 100%; font-size: .82rem; background: var(--band); padding: .5rem;
   border-radius: 5px; }}
 li {{ overflow-wrap: anywhere; }}
-table.overview td {{ white-space: normal; overflow-wrap: anywhere; }}
-table.overview td:first-child {{ min-width: 9rem; }}
+table.overview td {{ white-space: normal; }}
+@media (max-width: 40rem) {{
+  table.overview, table.overview tr, table.overview td {{ display: block; overflow-wrap: anywhere; }}
+  table.overview tr:first-child {{ display: none; }}
+  table.overview td {{ border: 0; padding: .1rem 0; }}
+  table.overview td:not(:first-child)::before {{ content: attr(data-head) ": "; color: var(--pale); }}
+  table.overview tr {{ border-bottom: 1px solid var(--line); padding: .4rem 0; }}
+}}
 a {{ color: var(--accent); }}
 h4 {{ margin: .8rem 0 .2rem; overflow-wrap: anywhere; }}
 h2, h3 {{ scroll-margin-top: .5rem; }}
@@ -74,10 +80,14 @@ def report_page(
 
 
 def _overview(sections: Sequence[_Section]) -> list[str]:
-    heads = "".join(f"<th>{head}</th>" for head in ("", "holds", "positive, or accuracy", "state", "cost"))
+    names = ("holds", "positive, or accuracy", "state", "cost")
+    heads = "".join(f"<th>{name}</th>" for name in ("", *names))
     rows = "".join(
         f'<tr><td><a href="#{s.id}">{escape(s.heading)}</a></td>'
-        + "".join(f"<td>{escape(cell)}</td>" for cell in s.row)
+        + "".join(
+            f'<td data-head="{name}">{escape(cell or "-")}</td>'
+            for name, cell in zip(names, s.row, strict=True)
+        )
         + "</tr>"
         for s in sections
     )

@@ -18,7 +18,7 @@ from datagen.train.html_page import escape
 SCRIPT = files("datagen.html_report").joinpath("scene_view.js").read_text(encoding="utf-8")
 STYLE = """
 .scene { border-top: 1px solid var(--line); padding-top: .2rem; }
-.pictures { display: grid; gap: .8rem;
+.pictures { display: grid; gap: .8rem; align-items: start;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); }
 .pictures figure { margin: 0; }
 .pictures img, .scene-view canvas { display: block; width: 100%; height: auto; }

@@ -31,7 +31,9 @@ def unusual_scenes(
     if not chosen:
         return []
     world, why = _open_world(columns.part, given)
-    body = [f"<p>{escape(_introduction(columns, len(chosen)))}</p><p class=note>{VIEW_HELP}</p>"]
+    body = [
+        f"<p>{escape(_introduction(columns, len(chosen), len(measures)))}</p><p class=note>{VIEW_HELP}</p>"
+    ]
     if why:
         body.append(f"<p class=note>{escape(f'Without pictures: {why}')}</p>")
     by_name = {measure.name: measure for measure in measures}
@@ -42,13 +44,14 @@ def unusual_scenes(
     return body
 
 
-def _introduction(columns: PartColumns, count: int) -> str:
+def _introduction(columns: PartColumns, count: int, measures: int) -> str:
     scenes = len(columns.shard)
     if scenes < FEWEST:
         return f"{count} of {scenes} scenes: too few to tell which are unusual."
     return (
-        f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest robust "
-        "z-score of six measures."
+        f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest "
+        ""
+        f"z-score of {measures} measures."
     )
 
 
