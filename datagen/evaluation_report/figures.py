@@ -17,6 +17,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from datagen.evaluation_report.report_tables import METRIC_WORDS, Report, paper_accuracy
+from datagen.schemas.errors import printable
 from datagen.schemas.styles import (
     BASELINE_COLOURS,
     BASELINE_MARKERS,
@@ -36,6 +37,7 @@ _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 LINES = ("--", "-.", ":")
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
+_MOST_CHARACTERS = 60  # of a name: a longer one leaves no room for axes
 _TRUTH = ListedColormap(CELL_COLOURS)
 _REACH_COLOUR = "#1b3a6b"
 GRIDS_CAPTION = (
@@ -111,9 +113,9 @@ def draw_curves(report: Report, told: Report) -> Figure:
         spread = look | {"markevery": (0.02 + 0.14 * (k % 8) / 8, 0.14)}
         curves, methods = told["curves"][name], told["methods"][name]
         area = methods["area_under_roc"]["value"]
-        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=plain(f"{name} ({area:.2f})"))
+        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=f"{plain(name)} ({area:.2f})")
         precision = curves["precision_recall"]
-        words = plain(f"{name} ({curves['average_precision']:.2f})")
+        words = f"{plain(name)} ({curves['average_precision']:.2f})"
         pr.step(precision["x"], precision["y"], where="pre", **spread, label=words)
         if methods["reliability"]:
             said, true = ([bin_[key] for bin_ in methods["reliability"]] for key in ("said", "true"))
@@ -121,7 +123,7 @@ def draw_curves(report: Report, told: Report) -> Figure:
             reliability.plot(said, true, **look | {"marker": ""})
             area_pt2 = [14 + 160 * n / max(sizes) for n in sizes]
             reliability.scatter(said, true, s=area_pt2, color=look["color"], marker=look["marker"], alpha=0.7)
-            reliability.plot([], [], **look, label=plain(f"{name} ({methods['brier']:.3f})"))
+            reliability.plot([], [], **look, label=f"{plain(name)} ({methods['brier']:.3f})")
     share = told["positives"] / told["count"]
     pr.axhline(share, color="#999999", lw=0.8, ls=":")
     for ax in (roc, reliability):
@@ -138,8 +140,10 @@ def draw_curves(report: Report, told: Report) -> Figure:
 
 
 def plain(text: str) -> str:
-    """The text as matplotlib shows it without reading formulas in it."""
-    return text.replace("$", r"\$")
+    """The text as matplotlib shows it: of bounded length, control characters escaped, without formulas."""
+    shown = printable(text)
+    shown = shown if len(shown) <= _MOST_CHARACTERS else shown[: _MOST_CHARACTERS - 3] + "..."
+    return shown.replace("$", r"\$")
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -153,7 +157,7 @@ def svg_of(figure: Figure, name: str) -> str:
     """The `<svg>` element; `name` makes its ids unique on the page."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     whole = text.getvalue()
     return whole[whole.index("<svg") :]
 

@@ -157,6 +157,7 @@ def _draw_measure(ax: Axes, number: F64, measure: Measure) -> None:
     unit = f" ({measure.unit})" if measure.unit else ""
     ax.set_title(measure.name + unit, fontsize=10)
     ax.set_xlabel("shard", fontsize=9)
+    ax.margins(y=0.15)
     ax.tick_params(labelsize=8)
     known = np.isfinite(measure.values)
     factor = 100 if measure.unit == "%" else 1

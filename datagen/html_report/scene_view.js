@@ -80,7 +80,7 @@
         items.push([depth, x, y, k]);
       }
       // Base poses lie on the floor: furniture in front of one hides it, but marks stay readable.
-      const dot = Math.max(1.5, 0.013 * place(0, 0, 0)[3]), mark = Math.max(3 * ratio, 0.022 * place(0, 0, 0)[3]);
+      const dot = Math.max(1.5, 0.013 * place(0, 0, 0)[3]), mark = Math.min(9 * ratio, Math.max(3 * ratio, 0.025 * place(0, 0, 0)[3]));
       items.sort((a, b) => b[0] - a[0]);
       for (const [, x, y, k] of items) {
         context.fillStyle = onTarget[k] ? scene.colours.target

@@ -83,7 +83,9 @@ def _scene_data(rows: SceneRows) -> dict[str, Any]:
     # What lies far off or high up, such as walls, may be cut off.
     top_m = float(np.percentile(points_m[:, 2], _SHOWN_PERCENT)) if len(points_m) else 0.0
     wide_m = float(np.percentile(np.abs(points_m[:, :2]), _SHOWN_PERCENT)) if len(points_m) else 0.0
-    radius_m = max(0.5, wide_m, (top_m - floor_m) / 2, float(np.linalg.norm(base_m, axis=1).max(initial=0.0)))
+    base_radius_m = float(np.linalg.norm(base_m, axis=1).max(initial=0.0))
+    # A ball that holds cloud and base poses from wherever it is seen.
+    radius_m = max(0.5, float(np.hypot(max(wide_m, base_radius_m), (top_m - floor_m) / 2)))
     return {
         "points": _packed(np.round(points_m / unit_m).astype("<i2")),
         "unit": unit_m,
