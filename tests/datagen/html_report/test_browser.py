@@ -1,4 +1,4 @@
-"""A report in a real browser: nothing fails or is fetched, figures are drawn, views turn, a phone shows all."""
+"""A report in a real browser: nothing fails or is fetched, figures are drawn, views turn, it fits a phone."""
 
 from __future__ import annotations
 
