@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,7 +67,7 @@ def report(
 
 def _costs(runs: Sequence[Run]) -> dict[str, Mapping[str, Any]]:
     """The audit of each run by its address."""
-    from datagen.commands.audit import audit_report
+    from datagen.reports.label_costs import audit_report
     from datagen.reports.spending import account_for
 
     return {run.storage.url: audit_report(account_for([run]), run.manifest.spec.label_source) for run in runs}
@@ -74,14 +75,22 @@ def _costs(runs: Sequence[Run]) -> dict[str, Mapping[str, Any]]:
 
 def _agreement(runs: Sequence[Run]) -> list[Mapping[str, Any]]:
     """The agreement of every two runs over the same candidates, of all and of those within reach."""
-    from datagen.commands.audit import pairs
+    from datagen.reports.agreement import read_labelled
+    from datagen.reports.label_costs import costs_of_runs
+    from datagen.reports.paired_runs import AuditedRun, fidelity, pairs
+    from datagen.reports.spending import account_for
 
-    ordered = sorted(runs, key=lambda run: _ORDER.get(run.manifest.spec.label_source, 0))
-    everywhere = pairs(ordered, "grid")
-    near = pairs(ordered, "in-range") if everywhere else []
+    # Labels are read of runs that share their candidates with another.
+    shared = Counter(run.manifest.spec.scenes_hash for run in runs)
+    ordered = sorted(
+        (run for run in runs if shared[run.manifest.spec.scenes_hash] > 1),
+        key=lambda run: fidelity(run.manifest.spec),
+    )
+    spendings = [account_for([run]) for run in ordered]
+    audited = [
+        AuditedRun(run, read_labelled(run), cost, spending.wall_s_per_label)
+        for run, cost, spending in zip(ordered, costs_of_runs(ordered, spendings), spendings, strict=True)
+    ]
+    everywhere, near = pairs(audited, "grid"), pairs(audited, "in-range")
     # Of runs whose candidates all lie within reach, the two are the same.
     return [*everywhere, *(b for a, b in zip(everywhere, near, strict=True) if a["count"] != b["count"])]
-
-
-# In ascending fidelity: the later of two is the reference for the earlier.
-_ORDER = {"heuristic": 0, "plan": 1, "sim": 2}

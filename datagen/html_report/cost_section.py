@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from datagen.console.printing import seconds, size
+from datagen.reports.agreement_tables import band_name, name_of, percent, set_name
 from datagen.train.html_page import escape, html_facts, html_table
 
 Numbers = Mapping[str, Any]
@@ -55,15 +56,19 @@ def agreement_section(pairs: Sequence[Numbers]) -> list[str]:
     pairs = [pair for pair in pairs if pair["count"]]
     if not pairs:
         return []
-    body = ["<p>Runs with labels of the same candidates. The reference is the source of higher fidelity.</p>"]
+    body = [
+        "<p>Runs with labels of the same candidates. The reference is the source of higher fidelity. "
+        "Intervals of 95% are by scene.</p>"
+    ]
     rows = [
         (
-            f"{_name(pair['said_by'])} against {_name(pair['true_by'])}", _set(pair), f"{pair['count']:,}",
-            _percent(pair["accuracy"]), _percent(pair["balanced_accuracy"]),
+            _against(pair),
+            set_name(pair["candidates"]),
+            *_agreed(pair),
             *(f"{pair['confusion'][key]:,}" for key in _CONFUSION),
         )
         for pair in pairs
-    ]  # fmt: skip
+    ]
     heads = ("labels", "candidates", "count", "accuracy", "balanced", *_CONFUSION.values())
     body.append(html_table(heads, rows))
     for pair in pairs:
@@ -79,45 +84,36 @@ _CONFUSION = {
 }
 
 
+def _against(pair: Numbers) -> str:
+    return f"{name_of(pair['said_by'])} against {name_of(pair['true_by'])}"
+
+
+def _agreed(group: Numbers) -> tuple[str, str, str]:
+    """Count, accuracy and balanced accuracy with their intervals."""
+    names = ("accuracy", "balanced_accuracy")
+    accuracy, balanced = (percent(group[name], group[f"{name}_interval"]) for name in names)
+    return f"{group['count']:,}", accuracy, balanced
+
+
 def _groups(pair: Numbers) -> list[str]:
-    title = f"{_name(pair['said_by'])} against {_name(pair['true_by'])}, {_set(pair)}"
+    title = f"{_against(pair)}, {set_name(pair['candidates'])}"
     tables = [
-        (
-            key,
-            [
-                (name(g), f"{g['count']:,}", _percent(g["accuracy"]), _percent(g["balanced_accuracy"]))
-                for g in pair[field]
-            ],
-        )
+        (key, [(name(g), *_agreed(g)) for g in pair[field]])
         for key, field, name in (
-            ("distance (m)", "by_distance", _band),
-            ("visibility", "by_visibility", _band),
-            ("reach (m)", "by_reach", _band),
+            ("distance (m)", "by_distance", band_name),
+            ("mount distance / reach", "by_distance_over_reach", band_name),
+            ("visibility", "by_visibility", band_name),
+            ("reach (m)", "by_reach", band_name),
+            ("mount height (m)", "by_height", band_name),
+            ("furniture", "by_furniture", lambda g: str(g["furniture"])),
             ("object", "by_object", lambda g: str(g["object"])),
         )
-    ]  # fmt: skip
+    ]
     outcomes = [
-        (o["outcome"], f"{o['count']:,}", _percent(o["said_positive"] / o["count"]))
+        (o["outcome"], f"{o['count']:,}", percent(o["said_positive"] / o["count"]))
         for o in pair["by_outcome"]
     ]
     inside = "".join(html_table((key, "count", "accuracy", "balanced"), rows) for key, rows in tables if rows)
     if outcomes:
         inside += html_table(("outcome of the reference", "count", "good by the first"), outcomes)
     return [f"<details><summary>{escape(title)}</summary>{inside}</details>"]
-
-
-def _name(who: Numbers) -> str:
-    return f"{who['label_source']} disturbed" if who["disturbed"] else str(who["label_source"])
-
-
-def _set(pair: Numbers) -> str:
-    return "all" if pair["candidates"] == "grid" else str(pair["candidates"])
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f}%"
-
-
-def _band(group: Numbers) -> str:
-    low, high = group["low"], group["high"]
-    return f"{low:g} on" if high is None else f"{low:g} to {high:g}"
