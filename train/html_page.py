@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Sequence
+from hashlib import sha256
 from html import escape as html_escape
 
 from datagen.schemas.errors import printable
@@ -39,14 +41,25 @@ code { font-size: 88%; overflow-wrap: anywhere; }
 """
 
 
-def html_page(title: str, body: Iterable[str]) -> str:
-    """The whole page; `body` is HTML."""
+def html_page(title: str, body: Iterable[str], style: str = "", script: str | None = None) -> str:
+    """The whole page; `body` is HTML, `style` is added to the page's.
+
+    With a `script`, the browser is told to run nothing but it, and to fetch nothing.
+    """
+    policy, end = "", ""
+    if script is not None:
+        digest = b64encode(sha256(script.encode()).digest()).decode()
+        policy = (
+            '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+            f"style-src 'unsafe-inline'; script-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'\">"
+        )
+        end = f"<script>{script}</script>"
     return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{policy}'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
+        f"<title>{escape(title)}</title><style>{_STYLE}{style}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(body)
-        + "\n</body></html>\n"
+        + f"\n{end}</body></html>\n"
     )
 
 

@@ -17,6 +17,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from datagen.evaluation_report.report_tables import METRIC_WORDS, Report, paper_accuracy
+from datagen.schemas.errors import printable
 from datagen.schemas.styles import (
     BASELINE_COLOURS,
     BASELINE_MARKERS,
@@ -36,6 +37,7 @@ _SHOWN = ("accuracy", "balanced_accuracy", "area_under_roc", "best_pick")
 LINES = ("--", "-.", ":")
 _MOST_METHODS = 5
 _PANEL_IN = 2.55
+_MOST_CHARACTERS = 60  # of a name: a longer one leaves no room for axes
 _TRUTH = ListedColormap(CELL_COLOURS)
 _REACH_COLOUR = "#1b3a6b"
 GRIDS_CAPTION = (
@@ -85,7 +87,7 @@ def draw_intervals(report: Report, told: Report) -> Figure:
         ax.set_axisbelow(True)
         for side in ("top", "right", "left"):
             ax.spines[side].set_visible(False)
-    panels[0].set_yticks(range(len(records)), [r["name"] for r in records])
+    panels[0].set_yticks(range(len(records)), [plain(r["name"]) for r in records])
     panels[0].invert_yaxis()
     return figure
 
@@ -111,9 +113,9 @@ def draw_curves(report: Report, told: Report) -> Figure:
         spread = look | {"markevery": (0.02 + 0.14 * (k % 8) / 8, 0.14)}
         curves, methods = told["curves"][name], told["methods"][name]
         area = methods["area_under_roc"]["value"]
-        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=f"{name} ({area:.2f})")
+        roc.plot(curves["roc"]["x"], curves["roc"]["y"], **spread, label=f"{plain(name)} ({area:.2f})")
         precision = curves["precision_recall"]
-        words = f"{name} ({curves['average_precision']:.2f})"
+        words = f"{plain(name)} ({curves['average_precision']:.2f})"
         pr.step(precision["x"], precision["y"], where="pre", **spread, label=words)
         if methods["reliability"]:
             said, true = ([bin_[key] for bin_ in methods["reliability"]] for key in ("said", "true"))
@@ -121,7 +123,7 @@ def draw_curves(report: Report, told: Report) -> Figure:
             reliability.plot(said, true, **look | {"marker": ""})
             area_pt2 = [14 + 160 * n / max(sizes) for n in sizes]
             reliability.scatter(said, true, s=area_pt2, color=look["color"], marker=look["marker"], alpha=0.7)
-            reliability.plot([], [], **look, label=f"{name} ({methods['brier']:.3f})")
+            reliability.plot([], [], **look, label=f"{plain(name)} ({methods['brier']:.3f})")
     share = told["positives"] / told["count"]
     pr.axhline(share, color="#999999", lw=0.8, ls=":")
     for ax in (roc, reliability):
@@ -137,6 +139,13 @@ def draw_curves(report: Report, told: Report) -> Figure:
     return figure
 
 
+def plain(text: str) -> str:
+    """The text as matplotlib shows it: of bounded length, control characters escaped, without formulas."""
+    shown = printable(text)
+    shown = shown if len(shown) <= _MOST_CHARACTERS else shown[: _MOST_CHARACTERS - 3] + "..."
+    return shown.replace("$", r"\$")
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure with constrained layout."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
@@ -148,7 +157,7 @@ def svg_of(figure: Figure, name: str) -> str:
     """The `<svg>` element; `name` makes its ids unique on the page."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     whole = text.getvalue()
     return whole[whole.index("<svg") :]
 

@@ -19,52 +19,59 @@ from datagen.train.html_page import escape, html_facts, html_figure, html_page, 
 
 def page_of(report: Report, gathered: Gathered) -> str:
     """The whole page."""
-    body = [_about(report)]
-    for number, part in enumerate(report["parts"]):
-        if title := tables.part_title(report, part):
-            body.append(f"<h2>{escape(title)}</h2>")
-        for name, told in part["sets"].items():
-            body += _set(report, told, f"{number}-{name}")
-        for name, why in part["left_out"].items():
-            body.append(f"<h2>Table I: {escape(name)} left out</h2><p>{escape(why)}</p>")
-        body += _grids(report, part)
+    body = [about(report), *tables_of(report)]
     if gathered.examples:
         figure = draw_examples(gathered.examples, gathered.columns, report["methods"])
         body += ["<h2>Example grids</h2>", html_figure(svg_of(figure, "examples"), GRIDS_CAPTION)]
-    body += [*_sources(report)]
+    body += [*sources_of(report)]
     return html_page("Evaluation of base placement", body)
 
 
-def _about(report: Report) -> str:
+def about(report: Report) -> str:
+    """The runs and the notes on the numbers."""
     places = ", ".join(run["place"] for run in report["runs"])
     return html_facts([("labels", places), *tables.notes(report)])
 
 
-def _set(report: Report, told: Report, name: str) -> list[str]:
-    candidates = told["candidates"]
+def tables_of(report: Report, name: str = "", level: int = 2) -> list[str]:
+    """All tables and curves. `name` makes ids unique on a page; `level` is that of the main headings."""
+    body: list[str] = []
+    for number, part in enumerate(report["parts"]):
+        if title := tables.part_title(report, part):
+            body.append(f"<h{level}>{escape(title)}</h{level}>")
+        for candidates, told in part["sets"].items():
+            body += _set(report, told, f"{name}{number}-{candidates}", level)
+        for candidates, why in part["left_out"].items():
+            body.append(f"<h{level}>Table I: {escape(candidates)} left out</h{level}><p>{escape(why)}</p>")
+        body += _grids(report, part, level)
+    return body
+
+
+def _set(report: Report, told: Report, name: str, level: int) -> list[str]:
+    candidates, below = told["candidates"], level + 1
     return [
         *_shown(
             tables.accuracy_table(report, told),
-            "h2",
+            level,
             html_figure(svg_of(draw_intervals(report, told), f"intervals-{name}")),
         ),
-        *_shown(tables.comparison_table(told["comparisons"], candidates), kind="text"),
+        *_shown(tables.comparison_table(told["comparisons"], candidates), below, kind="text"),
         *_order(report, told["differences"], tables.TABLE_I, candidates),
-        *_shown(tables.reach_table(report, told)),
-        "<h3>Curves</h3>",
+        *_shown(tables.reach_table(report, told), below),
+        f"<h{below}>Curves</h{below}>",
         html_figure(svg_of(draw_curves(report, told), f"curves-{name}")),
-        *_shown(tables.calibration_table(report, told)),
+        *_shown(tables.calibration_table(report, told), below),
         *(_folded(shown) for shown in tables.breakdown_tables(report, told)),
     ]
 
 
-def _grids(report: Report, part: Report) -> list[str]:
+def _grids(report: Report, part: Report, level: int) -> list[str]:
     grids = part["grids"]
     if grids is None:
-        return [f"<h2>Table III left out</h2><p>{escape(part['no_grids'])}</p>"]
+        return [f"<h{level}>Table III left out</h{level}><p>{escape(part['no_grids'])}</p>"]
     return [
-        *_shown(tables.grids_table(report, grids), "h2"),
-        *_shown(tables.comparison_table(grids["comparisons"], "whole grids"), kind="text"),
+        *_shown(tables.grids_table(report, grids), level),
+        *_shown(tables.comparison_table(grids["comparisons"], "whole grids"), level + 1, kind="text"),
         *_order(report, grids["differences"], tables.TABLE_III, "whole grids"),
     ]
 
@@ -73,8 +80,9 @@ def _order(report: Report, differences: Sequence[Report], metrics: Sequence[str]
     return [_folded(s, "text") for s in tables.order_tables(report["methods"], differences, metrics, where)]
 
 
-def _sources(report: Report) -> Iterable[str]:
-    yield "<h2>Runs and checkpoints</h2>"
+def sources_of(report: Report, level: int = 2) -> Iterable[str]:
+    """The runs, checkpoints and program behind the numbers."""
+    yield f"<h{level}>Runs and checkpoints</h{level}>"
     sources = [
         (run["place"], part["label_source"], part["split"], part["candidates"], str(part["per_scene"]),
          part["spec_hash"])
@@ -95,11 +103,11 @@ def _sources(report: Report) -> Iterable[str]:
     yield f"<p class=note>datagen {escape(report['datagen'])}</p>"
 
 
-def _shown(shown: TitledTable | None, level: str = "h3", first: str = "", kind: str = "") -> list[str]:
+def _shown(shown: TitledTable | None, level: int, first: str = "", kind: str = "") -> list[str]:
     """Heading, whatever comes first, and the table; nothing where it has no rows."""
     if shown is None or not shown.rows:
         return []
-    return [f"<{level}>{escape(shown.title)}</{level}>", first, html_table(shown.heads, shown.rows, kind)]
+    return [f"<h{level}>{escape(shown.title)}</h{level}>", first, html_table(shown.heads, shown.rows, kind)]
 
 
 def _folded(shown: TitledTable, kind: str = "") -> str:

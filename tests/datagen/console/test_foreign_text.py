@@ -68,6 +68,7 @@ VERBS = [
     ["status", "{run}", "--stacks"],
     ["status", "{run}", "--json"],
     ["audit", "{run}"],
+    ["report", "{run}", "--out", "{out}.html"],
     ["verify", "{run}"],
     ["repair", "{run}", "--workers", "0"],
     ["gc", "{run}", "--dry-run"],

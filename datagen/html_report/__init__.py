@@ -1,0 +1,1 @@
+"""Runs, checkpoints and evaluations as one HTML page that opens offline."""

@@ -1,0 +1,104 @@
+"""The scenes of a run that the page shows: the most unusual ones, with pictures where they can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from datagen.console.options import AssetSources
+from datagen.drawing.scene_picture import Shown
+from datagen.html_report.measures import scene_measures
+from datagen.html_report.outliers import FEWEST, Measure, Outlier, most_unusual
+from datagen.html_report.part_columns import PartColumns
+from datagen.html_report.report_paths import ReportedPart
+from datagen.html_report.scene_pictures import scene_pictures
+from datagen.html_report.scene_view import VIEW_HELP, scene_view
+from datagen.schemas.errors import InputError
+from datagen.schemas.fields import SceneRows
+from datagen.train.html_page import escape, html_facts
+from datagen.workers.extras import missing_library
+from datagen.workers.scenes.reconstruct import reconstruct_scene
+from datagen.workers.world import World, open_world
+
+_MOST_EACH = 3  # scenes for one measure
+
+
+def unusual_scenes(
+    columns: PartColumns, count: int, given: AssetSources, step: Callable[[], None]
+) -> list[str]:
+    """The section of a run's unusual scenes as HTML. `step` is called after each scene."""
+    measures = scene_measures(columns)
+    chosen = most_unusual(measures, count, max(_MOST_EACH, -(-count // len(measures))))
+    if not chosen:
+        return []
+    world, why = _open_world(columns.part, given)
+    body = [
+        f"<p>{escape(_introduction(columns, len(chosen), len(measures)))}</p><p class=note>{VIEW_HELP}</p>"
+    ]
+    if why:
+        body.append(f"<p class=note>{escape(f'Without pictures: {why}')}</p>")
+    by_name = {measure.name: measure for measure in measures}
+    for row, outlier in chosen:
+        rows = columns.part.scene(int(columns.shard[row]), int(columns.row[row]))
+        body.append(_scene(columns, rows, _reason(by_name[outlier.measure], outlier, columns), world))
+        step()
+    return body
+
+
+def _introduction(columns: PartColumns, count: int, measures: int) -> str:
+    scenes = len(columns.shard)
+    if scenes < FEWEST:
+        return f"{count} of {scenes} scenes: too few to tell which are unusual."
+    return (
+        f"The {count} most unusual of {scenes:,} scenes ({columns.sample_words}), by the largest "
+        ""
+        f"z-score of {measures} measures."
+    )
+
+
+def _reason(measure: Measure, outlier: Outlier, columns: PartColumns) -> str:
+    if len(columns.shard) < FEWEST:
+        return f"{measure.name} {measure.text(outlier.value)}"
+    median = measure.text(measure.median)
+    return f"{measure.name} {measure.text(outlier.value)}, median {median} (z {outlier.score:+.1f})"
+
+
+def _scene(columns: PartColumns, rows: SceneRows, reason: str, world: World | None) -> str:
+    record, label = rows.record, rows.samples["label"]
+    index = int(record["scene_index"])
+    title = f"Scene {index}: {record['object_name'][0]} on {record['support_type']}, {record['room_type']}"
+    facts = [
+        ("unusual", reason),
+        ("house", str(record["house_id"])),
+        ("positive", f"{int(label.sum())} of {len(label)} base poses"),
+    ]
+    pictures = ""
+    if world is not None:
+        try:
+            shown = Shown(columns.part.place, columns.part.spec, rows, reconstruct_scene(world, record))
+            names = ("RGB frame, target outlined", "the room from above with the base poses")
+            pictures = "".join(
+                f'<figure><img src="{address}" alt="{name}"></figure>'
+                for address, name in zip(scene_pictures(shown), names, strict=True)
+            )
+        except InputError as error:
+            facts.append(("picture", f"cannot be drawn: {error}"))
+    view = scene_view(rows, f"{title}: cloud and base poses; arrow keys turn the view")
+    return (
+        f'<section class="scene"><h4>{escape(title)}</h4>{html_facts(facts)}'
+        f'<div class="pictures">{view}{pictures}</div></section>'
+    )
+
+
+def _open_world(part: ReportedPart, given: AssetSources) -> tuple[World | None, str]:
+    """Houses and objects of a part, or None and why they cannot be opened."""
+    sources = part.run.manifest.sources if part.run is not None else {}
+    houses = given.houses or sources.get("houses", "builtin")
+    objects = given.objects or sources.get("objects", "builtin")
+    try:
+        return open_world(part.spec, houses, objects), ""
+    except InputError as error:
+        return None, str(error)
+    except ImportError as error:
+        if (missing := missing_library(error)) is None:
+            raise
+        return None, str(missing)
