@@ -134,10 +134,10 @@ def _join(of_scenes: dict[str, Run], names: Sequence[str], dear_name: str) -> di
             problem = f"no run here has {name} labels of its candidates"
             fix = "Make them with `datagen submit ... --scenes-from`, or omit the run"
             raise InputError(url, "scenes", problem, fix)
-    tables = [_read(of_scenes[name], _CHEAP) for name in names]
+    tables = [read_whole_scenes(of_scenes[name], _CHEAP) for name in names]
     dear_run = of_scenes[dear_name]
     selection = ("selection_probability",) if _is_selected(dear_run) else ()
-    dear = _read(dear_run, (*_KEYS, "label", *selection))
+    dear = read_whole_scenes(dear_run, (*_KEYS, "label", *selection))
     keys = tables[0]["key"]
     for table in tables[1:]:
         keys = np.intersect1d(keys, table["key"], assume_unique=True)
@@ -189,7 +189,7 @@ def _is_selected(run: Run) -> bool:
     return any(f.name == "selection_probability" for f in run.schema.sample_fields)
 
 
-def _read(run: Run, names: Sequence[str]) -> dict[str, Array]:
+def read_whole_scenes(run: Run, names: Sequence[str]) -> dict[str, Array]:
     """Columns of the committed whole scenes within n, with a `key` of scene and candidate, ascending.
 
     InputError for a damaged file, and for a run without such a scene.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from datagen.estimation.mixed_labels import MixedLabels
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH
@@ -63,23 +64,38 @@ def score_population(
     """
     if not methods:
         return []
-    first = labels.cheap_names[0]
-    scores = {method.name: np.full(len(labels.robot), np.nan) for method in methods}
-    order = np.argsort(labels.sample_id)
-    known = labels.sample_id[order]
+    places = [run.storage.url for run in labels.runs_of(labels.cheap_names[0])]
+    scores = score_candidates(places, labels.sample_id, methods, json, _refuse_seen)
+    return [Scored(method, scores[method.name]) for method in methods]
+
+
+def score_candidates(
+    places: Sequence[str],
+    sample_id: npt.NDArray[np.void],
+    methods: Sequence[EvaluatedMethod],
+    json: bool = False,
+    check: Callable[[SampleStream, EvaluatedMethod], None] = lambda stream, method: None,
+) -> dict[str, F64]:
+    """Return each method's scores (N,) of the samples of these runs, with progress on standard error.
+
+    `check` is called for each run and method before any is scored.
+    """
+    scores = {method.name: np.full(len(sample_id), np.nan) for method in methods}
+    order = np.argsort(sample_id)
+    known = sample_id[order]
     streams = [
         SampleStream(
-            [run.storage.url],
+            [place],
             scenes_per_batch=SCENES_PER_BATCH,
             extra=FIELDS,
             shuffle=False,
             allow_incomplete=True,
         )
-        for run in labels.runs_of(first)
+        for place in places
     ]
     for method in methods:
         for stream in streams:
-            _refuse_seen(stream, method)
+            check(stream, method)
     total, done = sum(stream.n_scenes for stream in streams), 0
     with counting("scenes", json) as seen:
         for stream in streams:
@@ -91,7 +107,7 @@ def score_population(
                     scores[method.name][order[place[there]]] = scored(method.scorer, batch)[there]
                 done += len(batch.clouds)
                 seen(done, total)
-    return [Scored(method, scores[method.name]) for method in methods]
+    return scores
 
 
 def with_models(labels: MixedLabels, scores: Sequence[Scored]) -> MixedLabels:
