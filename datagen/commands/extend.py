@@ -36,11 +36,8 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
     def grow(job_runs: Sequence[JobRun]) -> None:
         wanted = longer([job_run.run for job_run in job_runs], n, run)
         for job_run, more in zip(job_runs, wanted, strict=True):
-            selection = selection_of(job_run.run)
-            if (
-                selection is not None
-                and more > len(selection.scenes) * job_run.run.layout.candidates_per_scene
-            ):
+            selection = job_run.run.manifest.spec.selection
+            if selection is not None and more > job_run.run.n:
                 problem = f"{job_run.run.storage.url} has no more selected candidates"
                 fix = "Select others into another run with `datagen submit --candidates-from`"
                 raise InputError("--n", str(n), problem, fix)

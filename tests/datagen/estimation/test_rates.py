@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from datagen.estimation.rates import Population, RateEstimate, estimate_rate
+from datagen.estimation.two_stage_sampling import draw_sample, in_proportion
 from datagen.train.inputs import F64, Bools
 
 
@@ -128,7 +129,18 @@ def whole_scenes(cheap: F64, rng: np.random.Generator) -> tuple[Bools, F64]:
     return np.repeat(chosen[:, None], PER_SCENE, 1), np.full(cheap.shape, 50 / n)
 
 
-@pytest.mark.parametrize("design", [whole_scenes])
+def selected(cheap: F64, rng: np.random.Generator) -> tuple[Bools, F64]:
+    """Four candidates of each of 120 scenes, more where cheap labels of a scene differ, a fifth at random."""
+    mean = cheap.mean(axis=1, keepdims=True)
+    size = np.broadcast_to(0.05 + mean * (1 - mean), cheap.shape)
+    sample = draw_sample(in_proportion(size, 120, 4), 120, 4, 0.2, rng)
+    chosen, probability = np.zeros(cheap.shape, np.bool_), np.ones(cheap.shape)
+    at = sample.scene[:, None], sample.candidate
+    chosen[at], probability[at] = True, sample.probability
+    return chosen, probability
+
+
+@pytest.mark.parametrize("design", [whole_scenes, selected])
 def test_intervals_hold_the_truth_in_95_percent(design: Design) -> None:
     rng = np.random.default_rng(5)
     labels, _, members = draw(TRUTH_OF, rng)
