@@ -147,7 +147,7 @@ def submit(
         models = [str(path) for path in model or ()]
         per_scene = chosen if isinstance(chosen, int) else None
         selecting = SelectOptions(select, models, per_scene, random_share, seed or 0)
-        selecting.refuse_bad(n, label_source)
+        selecting.refuse_bad(label_source)
     elif select is not None or model:
         option = "--select" if select is not None else "--model"
         raise InputError(option, "", "selects nothing without --candidates-from", "Name the run there")

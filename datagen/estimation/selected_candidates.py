@@ -36,7 +36,7 @@ class SelectOptions:
     random_share: float
     seed: int
 
-    def refuse_bad(self, n: int, label_source: str) -> None:
+    def refuse_bad(self, label_source: str) -> None:
         """Raise InputError for options that do not fit each other."""
         if label_source == "heuristic":
             fix = "Submit plan or sim, or label all of them with --scenes-from"
@@ -51,9 +51,6 @@ class SelectOptions:
         if method != "random" and not self.models:
             fix = "Give a checkpoint of `datagen train`"
             raise InputError("--model", "", f"is needed to select by {method}", fix)
-        if self.per_scene is not None and n < self.per_scene:
-            problem = f"is fewer than {self.per_scene} candidates of one scene"
-            raise InputError("--n", str(n), problem, "Give more, or fewer --candidates-per-scene")
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def test_a_lost_selection_is_found_and_restored(folder: Path, tmp_path: Path) ->
 
 def test_what_cannot_be_selected_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def words(*more: str) -> list[str]:
-        return ["submit", "plan", "--n", "8", "--out", str(folder / "no"), "--workers", "0", *more]
+        return ["submit", "plan", "--n", "9", "--out", str(folder / "no"), "--workers", "0", *more]
 
     cheap = ["--candidates-from", str(folder / "cheap")]
     for more, told in (
@@ -134,7 +134,7 @@ def test_what_cannot_be_selected_is_refused(folder: Path, capsys: pytest.Capture
         ([*cheap, "--model", "x.ckpt"], "is not used to select at random"),
         ([*cheap, "--select", "margin", "--model", "x.ckpt"], "no such file"),
         ([*cheap, "--candidates-per-scene", "9"], "is more than the 8 candidates of a scene"),
-        ([*cheap, "--candidates-per-scene", "1", "--n", "99"], "but"),
+        ([*cheap, "--candidates-per-scene", "1", "--seed", "1"], "needs 9 scenes of 1 candidates"),
         ([*cheap, "--random-share", "0"], "--random-share"),
         ([*cheap, "--scenes-from", str(folder / "cheap")], "--candidates-from"),
         ([*cheap, "--split", "train"], "--split"),
