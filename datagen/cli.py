@@ -56,6 +56,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "calibrate": ("datagen.commands.calibrate:calibrate", "Fit the heuristic's parameters to trial labels."),
     "audit": ("datagen.commands.audit:audit", "Show the cost of labels by stage, and of 180,000."),
     "report": ("datagen.commands.report:report", "Write one HTML page about runs and models."),
+    "estimate": ("datagen.commands.estimate:estimate", "Estimate success rates from mixed labels."),
     "gc": ("datagen.commands.gc:gc", "Remove leftover files of a run."),
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
     "train": ("datagen.commands.train:train_model", "Train a model on labels."),
@@ -68,7 +69,7 @@ VERBS: dict[str, tuple[str, str]] = {
 
 _HEADINGS = {
     "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
-    "Look at runs": ("status", "logs", "show", "audit", "report"),
+    "Look at runs": ("status", "logs", "show", "audit", "report", "estimate"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
     "Models": ("train", "evaluate", "frontier", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),

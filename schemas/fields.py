@@ -214,6 +214,10 @@ SIM_FIELDS = (
           "outcome of the last execution after a first that failed; the label is the first's",
           0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES, since=3),
 )
+# Stored by runs of selected candidates alone.
+SELECTION_PROBABILITY = Field(
+    "selection_probability", "float64", (), "1", "",
+    "probability with which the candidate, and its scene, was selected to be labelled", 0, 1)
 # fmt: on
 
 _SIZES = {
@@ -245,4 +249,6 @@ def sized_schema(name: str, spec: Specification, version: int | None = None) -> 
                 "Use the version of the program that made the run, or start a new run",
             )
         schema = schema.at(version)
+    if spec.selection is not None:
+        schema = replace(schema, sample_fields=(*schema.sample_fields, SELECTION_PROBABILITY))
     return schema.sized(point=spec.observation.n_points, object=1 + spec.scene.n_clutter)

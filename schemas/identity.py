@@ -21,6 +21,7 @@ class Stream(IntEnum):
     NOISE = 4
     PATH = 5
     DISTURBANCE = 6
+    SELECTION = 7
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:

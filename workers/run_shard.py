@@ -19,7 +19,7 @@ import numpy as np
 
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
-from datagen.schemas.fields import SceneRows, sized_schema
+from datagen.schemas.fields import SELECTION_PROBABILITY, SceneRows, sized_schema
 from datagen.schemas.identity import sample_ids
 from datagen.schemas.outcomes import REDRAW_CAUSES
 from datagen.schemas.specification import Specification
@@ -75,7 +75,10 @@ def run_shard(
             candidates, record = reconstruct_candidates(rows.samples, scene), rows.record
         labelled = source.label(scene, candidates, spec, clock)
         scene_rows.append(record)
-        sample_blocks.append(candidate_columns(index, candidates, spec_hash, source) | labelled)
+        columns = candidate_columns(index, candidates, spec_hash, source) | labelled
+        if spec.selection is not None and rows is not None:
+            columns[SELECTION_PROBABILITY.name] = rows.samples[SELECTION_PROBABILITY.name]
+        sample_blocks.append(columns)
 
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
@@ -141,8 +144,7 @@ def candidate_columns(
     scene_index: int, candidates: SceneCandidates, spec_hash: str, source: LabelSource
 ) -> Columns:
     """The columns that the candidates alone decide, one row a candidate."""
-    n = len(candidates)
-    index = np.arange(n, dtype=np.int32)
+    n, index = len(candidates), candidates.index
     return {
         "sample_id": sample_ids(spec_hash, scene_index, index),
         "sample_scene_index": np.full(n, scene_index, np.int64),

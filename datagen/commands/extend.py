@@ -36,7 +36,12 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
     def grow(job_runs: Sequence[JobRun]) -> None:
         wanted = longer([job_run.run for job_run in job_runs], n, run)
         for job_run, more in zip(job_runs, wanted, strict=True):
-            if job_run.scenes_from:
+            selection = job_run.run.manifest.spec.selection
+            if selection is not None and more > job_run.run.n:
+                problem = f"{job_run.run.storage.url} has no more selected candidates"
+                fix = "Select others into another run with `datagen submit --candidates-from`"
+                raise InputError("--n", str(n), problem, fix)
+            if job_run.scenes_from and selection is None:
                 stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
                 refuse_too_few(stored, job_run.run.layout, more)
         for job_run, more in zip(job_runs, wanted, strict=True):

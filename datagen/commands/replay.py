@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 from datagen.configuration.arms import refuse_missing_packages
@@ -30,6 +29,7 @@ from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import Step, steps
 from datagen.schemas.run import Run
 from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.selection import keys_of
 from datagen.workers.scenes.reconstruct import reconstruct_scene
 
 _PREFIX_AT_LEAST = 6
@@ -83,7 +83,7 @@ def replay(
         return replay_shard(run, found, shard, open_sources(found, given), json)
     assert index is not None
     stored = read_scene(found, index)
-    return _compare(run, found, stored, row, open_sources(found, given, needs_scenes=False), out, json)
+    return _compare(run, found, index, stored, row, open_sources(found, given, needs_scenes=False), out, json)
 
 
 def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[Run, int, int]:
@@ -126,7 +126,8 @@ def find_sample(runs: list[Run], text: str, step: Step = lambda: None) -> tuple[
 
 
 def _ids(run: Run, scene: int, count: int) -> list[bytes]:
-    ids = sample_ids(run.manifest.spec_hash, scene, np.arange(count, dtype=np.int32))
+    index, candidates = keys_of(run, scene)
+    ids = sample_ids(run.manifest.spec_hash, index, candidates[:count])
     return [row.tobytes() for row in ids]
 
 
@@ -141,6 +142,7 @@ def _only(place: str, runs: list[Run], option: str) -> Run:
 def _compare(
     place: str,
     run: Run,
+    scene: int,
     stored: SceneRows,
     row: int | None,
     origin: OpenedSources,
@@ -148,9 +150,11 @@ def _compare(
     json: bool,
 ) -> int:
     replayer = open_replayer(run, origin)
-    scene = int(stored.record["scene_index"])
     shard = scene // run.layout.scenes_per_shard
-    drawn = None if replayer.drawing is None else replayer.redraw(scene)
+    candidates = stored.samples["candidate_index"].tolist()
+    drawn = (
+        None if replayer.drawing is None else replayer.redraw(int(stored.record["scene_index"]), candidates)
+    )
     stages = [] if drawn is None else compare_stages(run.schema, stored, drawn)
     rows = range(len(stored.samples["label"])) if row is None else [row]
     kept = chosen_rows(stored, rows)
@@ -185,7 +189,7 @@ def _sample_of(stored: SceneRows, row: int) -> dict[str, Any]:
     samples = stored.samples
     return {
         "id": samples["sample_id"][row].tobytes().hex(),
-        "candidate": row,
+        "candidate": int(samples["candidate_index"][row]),
         "base_xy_m": [float(v) for v in samples["base_xy_m"][row]],
         "label": int(samples["label"][row]),
         "heuristic_score": float(samples["heuristic_score"][row]),

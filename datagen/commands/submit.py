@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Unpack
 
@@ -18,6 +19,7 @@ from datagen.configuration.stored_scenes import (
 )
 from datagen.console.command_lines import prints, words_of
 from datagen.console.options import File, Place, Whole
+from datagen.estimation.selected_candidates import SelectBy, SelectOptions, select_candidates
 from datagen.jobs.detach import detach_job
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
@@ -36,6 +38,7 @@ from datagen.schemas.keys import MERGED
 from datagen.schemas.progress import Progress
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
+from datagen.schemas.selection import selection_of
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
@@ -66,6 +69,10 @@ def submit(
     houses: str | None = None,
     objects: str | None = None,
     scenes_from: Place | None = None,
+    candidates_from: Place | None = None,
+    select: SelectBy | None = None,
+    model: Annotated[Sequence[str | Path] | None, Parameter(metavar="PATH...")] = None,
+    random_share: float = 0.2,
     robot: str | None = None,
     perturb: Whole | None = None,
     candidates: Literal["grid", "clear", "in-range"] | None = None,
@@ -94,10 +101,16 @@ def submit(
         houses: builtin, procthor:DIR or ai2thor:DIR [builtin].
         objects: builtin or ycb:DIR [builtin].
         scenes_from: Run whose scenes and candidates are labelled again.
+        candidates_from: Run of whose candidates n are selected and labelled (plan, sim).
+        select: Rule of the selection: nearest to the model's threshold (margin), in proportion to its entropy
+            (uncertain), or where model and stored label differ (disagree) [random].
+        model: Checkpoints for the selection; several: their mean.
+        random_share: Share of the selection that is random, so that each candidate has a chance.
         robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
         perturb: Trials per candidate, each with random errors of pose and world (sim) [1, without].
         candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
-        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60].
+        candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60];
+            with --candidates-from, those selected in each selected scene [a quarter].
         robots_per_scene: Robots that share a scene's candidates [4; 1 on a whole grid].
         split: Split of the houses; splits share no house [all].
         seed: Seed of the whole run [0].
@@ -122,6 +135,22 @@ def submit(
         (True, 8, True)
     """
     out, job_options = str(out), JobOptions(**job)
+    if candidates_from is not None and scenes_from is not None:
+        problem = "labels selected candidates, but --scenes-from all of them"
+        raise InputError("--candidates-from", str(candidates_from), problem, "Give one of the two")
+    selecting = None
+    if candidates_from is not None:
+        chosen = _per_scene(None if candidates_per_scene is None else str(candidates_per_scene))
+        if chosen == "grid":
+            fix = "Give a number, or label all candidates with --scenes-from"
+            raise InputError("--candidates-per-scene", "grid", "is no selection", fix)
+        models = [str(path) for path in model or ()]
+        per_scene = chosen if isinstance(chosen, int) else None
+        selecting = SelectOptions(select, models, per_scene, random_share, seed or 0)
+        selecting.refuse_bad(label_source)
+    elif select is not None or model:
+        option = "--select" if select is not None else "--model"
+        raise InputError(option, "", "selects nothing without --candidates-from", "Name the run there")
     scenes_from = None if scenes_from is None else str(scenes_from)
     config = None if config is None else Path(config)
     refuse_missing_packages(label_source)
@@ -134,6 +163,8 @@ def submit(
         "--houses": houses and absolute_source(houses),
         "--objects": objects and absolute_source(objects),
         "--scenes-from": scenes_from and absolute_place(scenes_from),
+        "--candidates-from": candidates_from and absolute_place(str(candidates_from)),
+        "--select": select,
         "--robot": robot,
         "--perturb": perturb,
         "--candidates": candidates,
@@ -147,6 +178,10 @@ def submit(
         "--config": config and config.expanduser().absolute(),
     }
     words = ["submit", label_source, *words_of(said), *job_options.words()]
+    if selecting is not None:
+        for path in selecting.models:
+            words += ["--model", str(Path(path).expanduser().absolute())]
+        words += ["--random-share", str(random_share)]
     if job_options.detach and job_options.address != "local":
         return detach_job(words, out, job_options)  # its sources are paths on the cluster
     options = {
@@ -159,7 +194,9 @@ def submit(
         "observation.noise.enabled": True if noise else None,
     }
     with opening(words, job_options) as began_s:
-        if scenes_from is None:
+        selection = None
+        stored_in = scenes_from or (None if candidates_from is None else str(candidates_from))
+        if stored_in is None:
             houses, objects = houses or "builtin", objects or "builtin"
             house_source, object_source = open_houses(houses), open_objects(objects)
             spec = specify(label_source, house_source, object_source, options, config, robot, perturb)
@@ -169,22 +206,29 @@ def submit(
                 _refuse_no_scene(world, houses)
             source_url, layout, schema_version = "", layout_of(spec, n), None
         else:
+            mine = () if selecting is None else ("--seed", "--candidates-per-scene")
             stored = open_stored_scenes(
-                scenes_from, houses, objects, {name: said[name] for name in _OF_SCENES}
+                stored_in, houses, objects, {name: said[name] for name in _OF_SCENES if name not in mine}
             )
             spec = specify_again(label_source, stored, config, robot, perturb)
             houses, objects = stored.houses, stored.objects
             world = open_world(spec, houses, objects)
             refuse_unusable_engines(spec, job_options.address)
-            source_url, layout = stored.run.storage.url, _layout_there(out) or layout_again(spec, stored, n)
-            schema_version = stored.run.manifest.schema_version
-            refuse_too_few(stored, layout, n)
+            source_url, schema_version = stored.run.storage.url, stored.run.manifest.schema_version
+            if selecting is None:
+                layout = _layout_there(out) or layout_again(spec, stored, n)
+                selection = selection_of(stored.run)
+                refuse_too_few(stored, layout, n)
+            else:
+                there = _run_there(out)
+                selected = select_candidates(spec, stored, n, selecting, there, job_options.json)
+                spec, layout, n, selection = selected.spec, selected.layout, selected.n, selected.record
         sources = {"houses": absolute_source(houses), "objects": absolute_source(objects)}
         sources |= {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
         if source_url:
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
-        run = Run.create_or_open(open_storage(out), manifest, n)
+        run = Run.create_or_open(open_storage(out), manifest, n, selection)
     if said["--houses"] is None and not source_url:
         Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
     if job_options.detach:
@@ -197,6 +241,12 @@ def submit(
 
 def _layout_there(out: str) -> Layout | None:
     """The layout of the run at `out`; None where there is none yet. InputError for merged runs."""
+    run = _run_there(out)
+    return None if run is None else run.layout
+
+
+def _run_there(out: str) -> Run | None:
+    """The run at `out`; None where there is none yet. InputError for merged runs."""
     try:
         storage = open_storage(out, probe=False, create=False)
     except InputError:
@@ -204,7 +254,7 @@ def _layout_there(out: str) -> Layout | None:
     if storage.exists(MERGED):
         fix = "Extend it with `datagen extend`, or choose another --out"
         raise InputError(out, "", "holds merged runs, each with its own specification", fix)
-    return Run.open(storage).layout if storage.exists("manifest.json") else None
+    return Run.open(storage) if storage.exists("manifest.json") else None
 
 
 def _refuse_no_scene(world: World, houses: str) -> None:

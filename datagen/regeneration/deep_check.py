@@ -89,7 +89,8 @@ def _sample_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterato
 def _scene_findings(replayer: Replayer, scene: int, rows: list[int]) -> Iterator[Finding]:
     run, stages = replayer.run, tuple(STAGES)
     stored = next(read_scenes(run, [scene]))
-    made, kept = replayer.redraw(scene, rows), chosen_rows(stored, rows)
+    kept = chosen_rows(stored, rows)
+    made = replayer.redraw(int(stored.record["scene_index"]), kept.samples["candidate_index"].tolist())
     if what_differs_here(run, scene // run.layout.scenes_per_shard):
         # Other physics results may cause a resampling, after which all draws differ.
         stages = DRAWN[:1] if int(made.record["retry"]) == int(stored.record["retry"]) else ()

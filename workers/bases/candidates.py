@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,12 @@ class SceneCandidates:
     base_height_m: F32  # (N,)
     arm_reach_m: F32  # (N,)
     clearance_m: F32  # (N,), free distance around the robot's body; below 0 it does not fit
+    # (N,), of each candidate in its scene; by default these are all candidates of the scene.
+    index: npt.NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+
+    def __post_init__(self) -> None:
+        if len(self.index) != len(self):
+            object.__setattr__(self, "index", np.arange(len(self), dtype=np.int32))
 
     def __len__(self) -> int:
         return len(self.base_xy_m)

@@ -141,13 +141,14 @@ def try_candidate(
     if not at.is_within_reach(T_world_base):
         return CandidateTrial("out_of_reach")
     other = (at.draw,) if at.draw else ()
-    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, row, *other)
+    index = int(candidates.index[row])
+    rng = generator(spec.seed, Stream.PATH, at.scene.index, at.scene.retry, index, *other)
     planning, clock = at.planning, at.clock
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)
     if report.plan is None or at.arm.trial is None:
         return CandidateTrial(report.outcome, report, report.plan)
-    disturbances = disturbances_of(at, row, spec)
+    disturbances = disturbances_of(at, index, spec)
     if disturbances:
         fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
         return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
@@ -246,11 +247,11 @@ def _fits(
     return base_clearance_m(xy, height_m, camera_m, radius_m, at.scene.house.obstacles, mast_m) >= 0
 
 
-def disturbances_of(at: ArmInScene, row: int, spec: Specification) -> list[Disturbance]:
-    """The worlds that candidate `row` is tried in; none where it is the planned one."""
+def disturbances_of(at: ArmInScene, index: int, spec: Specification) -> list[Disturbance]:
+    """The worlds that candidate `index` of its scene is tried in; none where it is the planned one."""
     if at.arm.disturbance is None:
         return []
-    rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, row)
+    rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, index)
     return draw_disturbances(at.arm.disturbance, at.scene.T_world_object[0], rng)
 
 

@@ -95,6 +95,7 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
     apart_m = np.hypot(*(columns["base_xy_m"] - scene.target_center_m[:2]).T)
     for name, sound in (
         ("base_xy_m", apart_m < _NEAR_M),
+        ("candidate_index", columns["candidate_index"] >= 0),
         ("robot_index", columns["robot_index"] >= 0),
         ("camera_height_m", _within(columns["camera_height_m"], 0.0, _NEAR_M)),
         ("base_height_m", _within(columns["base_height_m"], 0.0, _NEAR_M)),
@@ -110,6 +111,7 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
         base_height_m=columns["base_height_m"],
         arm_reach_m=columns["arm_reach_m"],
         clearance_m=columns["base_clearance_m"],
+        index=columns["candidate_index"],
     )
 
 
