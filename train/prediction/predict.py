@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from datagen.train.prediction.base_cells import (
     RobotSize,
     observe_cells,
     seen_share,
+    yaws_to_target,
 )
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
@@ -65,8 +66,7 @@ class Prediction:
     @property
     def yaw_rad(self) -> F64:
         """Headings (N,) that face the target, counter-clockwise from x."""
-        x, y = -self.cells.offset_m.astype(np.float64).T
-        return np.arctan2(y, x)
+        return yaws_to_target(self.cells.offset_m)
 
     def T_world_base(self, row: int) -> F64:
         """Pose (4, 4) of the arm's mount at one base pose: at base height, x towards the target."""
@@ -110,7 +110,8 @@ class Prediction:
     def sure(self) -> str:
         """Confidence in the answer, as text."""
         if self.best is None:
-            return "no answer: no clear base pose was observed around the target"
+            hint = "; unseen ones are left, show their floor in more frames" if len(self.rows(UNSEEN)) else ""
+            return f"no answer: no clear base pose was observed around the target{hint}"
         score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
         if score < _LIKELY:
             unseen = self.rows(UNSEEN)
@@ -119,7 +120,7 @@ class Prediction:
                 "; some whose floor is not visible score higher" if better else ""
             )
         if self.cells.state[self.best] == STATES.index(UNSEEN):
-            return "good if the floor there is free, which is not visible"
+            return "good if the floor there and on the way is free, which is not visible"
         doubt = any(ground.doubt is not None for ground in self.grounds)
         if score < _SURE or thin or doubt or self.crop_seen < 0.1:
             return "likely: " + (
@@ -138,7 +139,25 @@ _CROP = ObservationParams()
 
 
 def load_scorer(checkpoint: str | Path) -> ModelScorer:
-    """A checkpoint's model, ready to predict. InputError for what is no checkpoint."""
+    """The model of a checkpoint, ready to predict many frames: `datagen.predict` accepts it as `checkpoint`.
+
+    Args:
+        checkpoint: Checkpoint of `datagen train`.
+
+    Returns:
+        A scorer with `name`, `threshold` and `score(batch)`.
+
+    Raises:
+        InputError: The file is no checkpoint.
+
+    Example:
+        >>> scorer = datagen.load_scorer(checkpoint)
+        >>> answers = [
+        ...     datagen.predict(scorer, frame=[each], base_height=0.7, reach=0.9) for each in [frame, frame]
+        ... ]
+        >>> len(answers)
+        2
+    """
     # Imported here: frames are read and refused without torch.
     from datagen.train.training.checkpoints import load_model
 
@@ -264,7 +283,12 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
             one(target.center_m[2]),
             one(target.radius_m),
         ),
-        RobotInputs(np.zeros(1, np.int64), *map(one, astuple(robot))),
+        RobotInputs(
+            np.zeros(1, np.int64),
+            one(robot.camera_height_m),
+            one(robot.base_height_m),
+            one(robot.arm_reach_m),
+        ),
         CandidateInputs(np.zeros(n, np.int64), cells.offset_m),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),

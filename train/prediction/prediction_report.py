@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.base_cells import SEEN_SHARE, STATES
+from datagen.train.prediction.floor_ways import WAYS
 from datagen.train.prediction.predict import Prediction
 
 _OWN_AXES = (
@@ -34,7 +35,9 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
     unseen = p.rows("unseen")
     if len(unseen):
         x, y = p.base_xy_m[unseen[0]]
-        lines.append(("unseen", f"their best scores {p.score[unseen[0]]:.3f} at ({x:.3f}, {y:.3f}) m"))
+        hidden = int((p.cells.floor_seen[unseen] >= SEEN_SHARE).sum())
+        way = f"; of {hidden} only the way there is not visible" if hidden else ""
+        lines.append(("unseen", f"their best scores {p.score[unseen[0]]:.3f} at ({x:.3f}, {y:.3f}) m{way}"))
     x, y, z = p.target.center_m
     floor = p.grounds[0]
     residual = "not visible" if floor.residual_m is None else f"residual {1000 * floor.residual_m:.1f} mm"
@@ -46,7 +49,7 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
         (
             "robot",
             f"camera {robot.camera_height_m:.2f} m, mount {robot.base_height_m:.2f} m, "
-            f"reach {robot.arm_reach_m:.2f} m",
+            f"reach {robot.arm_reach_m:.2f} m, base {robot.outline}",
         ),
         ("world", _world_axes(p)),
     ]
@@ -65,7 +68,11 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "best": None if p.best is None else _pose(p, p.best),
         "best_unseen": None if not len(rows := p.rows("unseen")) else _pose(p, int(rows[0])),
         "margin_to_10th": p.margin,
-        "robot": asdict(p.robot),
+        "robot": {
+            **{name: value for name, value in asdict(p.robot).items() if name != "footprint"},
+            "base_radius_m": p.robot.outline.radius_m,
+            "footprint_m": [list(corner) for corner in p.robot.outline.corners_m] or None,
+        },
         "target": {
             **asdict(p.target),
             "center_m": list(p.target.center_m),
@@ -95,6 +102,7 @@ def _candidate(p: Prediction, row: int) -> dict[str, Any]:
         "score": float(p.score[row]),
         "state": STATES[int(p.cells.state[row])],
         "floor_seen": float(p.cells.floor_seen[row]),
+        "way": WAYS[int(p.cells.way[row])],
     }
 
 
