@@ -97,6 +97,8 @@ def predict(
     grid: Whole = 25,
     half_width: float = 1.0,
     allow_unseen: bool = False,
+    arrival: str | None = None,
+    arrival_std: str | None = None,
     out: File | None = None,
     html: File | None = None,
     json: AsJson = False,
@@ -129,6 +131,8 @@ def predict(
         grid: Cells per side of the grid around the target.
         half_width: Half the side of the grid (m).
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
+        arrival: Choose by expected success with an arrival error: normal:M[,YAW], disc:M[,YAW], nav2, FILE.csv.
+        arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.
         json: Of the command line alone.
@@ -153,6 +157,7 @@ def predict(
         ((625, 2), (4, 4))
     """
     # Imported here: the libraries of training take seconds to import.
+    from datagen.train.arrivals import arrival_of
     from datagen.train.prediction import RobotSize, load_scorer, read_footprint
     from datagen.train.prediction import predict as scored
 
@@ -163,6 +168,7 @@ def predict(
         fix = "Give metres per step: 0.001 for millimetres"
         raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", fix)
     outline = None if footprint is None else read_footprint(footprint)
+    error = arrival_of(arrival, arrival_std)
     falls = None if gravity is None else _direction(gravity)
     rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html = (
         None if path is None else Path(path)
@@ -188,6 +194,7 @@ def predict(
         gravity=falls,
         click=click,
         allow_unseen=allow_unseen,
+        arrival=error,
         grid=grid,
         half_width_m=half_width,
     )

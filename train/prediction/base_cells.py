@@ -63,12 +63,15 @@ def yaws_to_target(offset_m: F32) -> F64:
     return np.arctan2(y, x)
 
 
-def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> BaseCells:
+def observe_cells(
+    seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams, yaw_error_rad: float = 0.0
+) -> BaseCells:
     """The grid around the target, each cell blocked, unreachable, unseen or clear, in this order.
 
     Blocked where observed points lie in the base's outline between the floor and a board's thickness above
     the mount, or within the mast's radius from there to the camera; unreachable where no way leads there
-    (`floor_ways`); unseen where too little of the floor below it, or of the way, was seen.
+    (`floor_ways`); unseen where too little of the floor below it, or of the way, was seen. A polygon must
+    also fit where the base turns up to twice `yaw_error_rad` too far.
     """
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, yaws_to_target(offsets.astype(np.float32))
@@ -81,7 +84,8 @@ def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: Can
     tops = seen.points_m[above & (z >= mount) & (z < top)]
     floor = seen.points_m[is_floor]
     high = _counts(tops, base_xy, yaw, Footprint(params.mast_radius_m))
-    low = _counts(stands, base_xy, yaw, base)
+    turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
+    low = np.max([_counts(stands, base_xy, yaw + turn, base) for turn in turns], axis=0)
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
     share = _floor_share(floor, base_xy, yaw, base)
     way = ways_to(

@@ -114,6 +114,10 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
         legend.append(
             Line2D([], [], ls="", marker="o", ms=11, mfc="none", mec=BEST.colour, mew=3, label="best")
         )
+    if (nominal := prediction.choice.nominal) not in (None, prediction.best):
+        xy = prediction.base_xy_m[nominal]
+        axes.plot(*xy, "D", color="white", mec="black", ms=8, zorder=9)
+        legend.append(Line2D([], [], ls="", marker="D", ms=8, mfc="white", mec="black", label="best score"))
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
     axes.set_aspect("equal")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="from above")

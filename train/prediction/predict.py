@@ -10,6 +10,7 @@ import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
+from datagen.train.arrivals import Arrival
 from datagen.train.inputs import F64, I64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.base_cells import (
     BLOCKED,
@@ -22,6 +23,7 @@ from datagen.train.prediction.base_cells import (
     seen_share,
     yaws_to_target,
 )
+from datagen.train.prediction.choice import Choice, choose
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
@@ -50,8 +52,14 @@ class Prediction:
     cloud: Cloud
     cells: BaseCells
     score: F64  # (N,)
-    best: int | None  # the best of those that may be chosen; None where there is none
+    choice: Choice
+    arrival: Arrival | None
     notes: tuple[str, ...]
+
+    @property
+    def best(self) -> int | None:
+        """Row of the best of those that may be chosen; None where there is none."""
+        return self.choice.best
 
     @property
     def center_m(self) -> F64:
@@ -175,6 +183,7 @@ def predict(
     click: tuple[int, int] | None = None,
     target_center_m: F64 | None = None,
     allow_unseen: bool = False,
+    arrival: Arrival | None = None,
     grid: int = 25,
     half_width_m: float = 1.0,
     seed: int = 0,
@@ -184,7 +193,8 @@ def predict(
     Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
     `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
     The target is told by masks, by one click into the first frame, or by a cloud's own marks;
-    `target_center_m` (3,), world, replaces the estimated centre. InputError for what does not suffice.
+    `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
+    with the highest expected success. InputError for what does not suffice.
     """
     grounds = _grounds(frames, camera_height_m, gravity)
     frames = _with_target(frames, grounds, click)
@@ -200,12 +210,14 @@ def predict(
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
-    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
+    yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
+    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad)
     score = scored(scorer, _batch(cloud, target, robot, cells))
-    best = _best(score, cells, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
+    allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
+    choice = choose(score, cells, allowed, scorer.threshold, arrival)
     notes = _notes(grounds, filled, cloud)
     given = (scorer.name, robot, tuple(frames), tuple(grounds))
-    return Prediction(*given, seen, target, filled, cloud, cells, score, best, notes)
+    return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)
 
 
 def _grounds(
@@ -294,11 +306,6 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
         np.zeros((n, 16), np.uint8),
         {"base_is_clear": cells.state != STATES.index(BLOCKED)},
     )
-
-
-def _best(score: F64, cells: BaseCells, allowed: Sequence[str]) -> int | None:
-    rows = np.flatnonzero(np.isin(cells.state, [STATES.index(name) for name in allowed]))
-    return int(rows[np.argmax(score[rows])]) if len(rows) else None
 
 
 def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tuple[str, ...]:

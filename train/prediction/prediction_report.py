@@ -30,6 +30,7 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
         margin = "" if p.margin is None else f", {p.margin:.3f} above the 10th"
         pose = f"({x:.3f}, {y:.3f}) m, yaw {np.degrees(p.yaw_rad[p.best]):.1f} deg"
         lines[0] = ("best", f"{pose}, score {p.score[p.best]:.3f}{margin}")
+        lines += _arrival_lines(p)
     counts = [f"{len(p.rows(state))} {state}" for state in STATES]
     lines.append(("poses", ", ".join(counts)))
     unseen = p.rows("unseen")
@@ -56,6 +57,21 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
     return lines + [("note", note) for note in p.notes]
 
 
+def _arrival_lines(p: Prediction) -> list[tuple[str, str]]:
+    """How far the best may be missed, and what an arrival error changed."""
+    lines = list[tuple[str, str]]()
+    if p.choice.expected is not None and p.arrival is not None and p.choice.nominal is not None:
+        best, nominal = p.choice.expected[[p.best, p.choice.nominal]]
+        text = f"{p.arrival.text}; expected success {best:.3f}"
+        if p.best != p.choice.nominal:
+            x, y = p.base_xy_m[p.choice.nominal]
+            text += f", and {nominal:.3f} at the best score, ({x:.3f}, {y:.3f}) m"
+        lines.append(("arrival", text))
+    if p.choice.miss_m is not None:
+        lines.append(("may miss", f"by {p.choice.miss_m:.2f} m in any direction with scores that stay good"))
+    return lines
+
+
 def document(prediction: Prediction) -> dict[str, Any]:
     """The answer as plain values: all base poses with scores; the best also in the camera frame."""
     p = prediction
@@ -67,6 +83,9 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),
         "best_unseen": None if not len(rows := p.rows("unseen")) else _pose(p, int(rows[0])),
+        "best_score": None if (nominal := p.choice.nominal) is None else _pose(p, nominal),
+        "arrival": None if p.arrival is None else p.arrival.text,
+        "may_miss_m": p.choice.miss_m,
         "margin_to_10th": p.margin,
         "robot": {
             **{name: value for name, value in asdict(p.robot).items() if name != "footprint"},
@@ -103,6 +122,7 @@ def _candidate(p: Prediction, row: int) -> dict[str, Any]:
         "state": STATES[int(p.cells.state[row])],
         "floor_seen": float(p.cells.floor_seen[row]),
         "way": WAYS[int(p.cells.way[row])],
+        "expected_success": None if p.choice.expected is None else float(p.choice.expected[row]),
     }
 
 
