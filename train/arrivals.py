@@ -155,7 +155,8 @@ def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
             np.add.at(kernel, (y + up + n, x + across + n), weight / len(dx))
         return np.asarray(ndimage.correlate(value, kernel, mode="constant"), np.float64)
     rows, columns = np.indices(value.shape).astype(np.float64)
-    yaw = np.arctan2((value.shape[0] - 1) / 2 - rows, (value.shape[1] - 1) / 2 - columns)[..., None]
+    middle = (np.array(value.shape) - 1) / 2
+    yaw: F64 = np.arctan2(middle[0] - rows, middle[1] - columns)[..., None]
     x = columns[..., None] + np.cos(yaw) * dx - np.sin(yaw) * dy
     y = rows[..., None] + np.sin(yaw) * dx + np.cos(yaw) * dy
     return np.asarray(ndimage.map_coordinates(value, [y, x], order=1, mode="constant"), np.float64).mean(

@@ -131,7 +131,7 @@ def predict(
         grid: Cells per side of the grid around the target.
         half_width: Half the side of the grid (m).
         allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
-        arrival: Choose by expected success with an arrival error: normal:M[,YAW], disc:M[,YAW], nav2, FILE.csv.
+        arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
         arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.

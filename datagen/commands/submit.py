@@ -95,7 +95,7 @@ def submit(
         objects: builtin or ycb:DIR [builtin].
         scenes_from: Run whose scenes and candidates are labelled again.
         robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
-        perturb: Trials per candidate, each with random errors of pose and world (sim) [1, without].
+        perturb: Arrivals per candidate, with random errors of pose; in sim also of the world [1, without].
         candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
         candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60].
         robots_per_scene: Robots that share a scene's candidates [4; 1 on a whole grid].

@@ -163,8 +163,8 @@ def _floor_share(floor_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> F64:
     # Far away, rows of pixels are farther apart than cells are wide.
     seen |= np.asarray(ndimage.binary_closing(seen), np.bool_)
     n = int(np.ceil(base.radius_m / _CELL_M))
-    step = (np.arange(-n, n + 1)) * _CELL_M
-    under = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    step = np.arange(-n, n + 1) * _CELL_M
+    under: F64 = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2).astype(np.float64)
     under = under[base.holds(under)]
     below = _turned(under, yaw) if base.corners_m else under  # a circle is the same at every heading
     rows = np.floor((base_xy[:, None] + below - low) / _CELL_M).astype(np.int64)  # (N, D, 2)

@@ -27,8 +27,8 @@ def choose(
 ) -> Choice:
     """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
 
-    A robot that arrives where a base is in another state fails. Scores stay good from `threshold` on; a method
-    that only picks has none (nan), and no `miss_m`.
+    A robot that arrives where a base is in another state fails. Scores stay good from `threshold` on; a
+    method that only picks has none (nan), and no `miss_m`.
     """
     can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
     rows = np.flatnonzero(can_stand)

@@ -83,8 +83,8 @@ def ways_to(
 ) -> I64:
     """How a circular base of `radius_m` comes from the cameras to its middles (N, 2): index into `WAYS`.
 
-    `slack_m` is how far the last bit may be for a base that is narrower than its circle. `points_m` (M, 3) are
-    all that was observed. No way leads through what lies behind a wall as seen from all cameras (F, 3).
+    `slack_m` is how far the last bit may be for a base that is narrower than its circle. `points_m` (M, 3)
+    are all that was observed. No way leads through what lies behind a wall as seen from all cameras (F, 3).
     """
     near, ends = _sights(points_m, eyes_m)
     hidden = _hidden(floor_map, ends, eyes_m)

@@ -106,22 +106,23 @@ def circle_footprint(radius_m: float, place: str = "--footprint") -> Footprint:
 def polygon_footprint(corners_m: Sequence[Sequence[float]], place: str = "--footprint") -> Footprint:
     """The polygon with these corners (x, y), in order. InputError where they outline no base."""
     try:
-        corners = np.array([[float(c) for c in corner] for corner in corners_m], np.float64)
+        corners: F64 = np.array([[float(c) for c in corner] for corner in corners_m], np.float64)
     except (TypeError, ValueError):
-        corners = np.empty(0)
+        corners = np.zeros((0, 2))
     if corners.ndim != 2 or corners.shape[1] != 2 or not 3 <= len(corners) <= _MOST_CORNERS:
         problem = f"is not 3 to {_MOST_CORNERS} corners of x and y"
         raise InputError(place, "", problem, _FIX)
     far_m = np.abs(corners).max()
     if not (np.isfinite(corners).all() and far_m <= _LARGEST_M):
         raise InputError(place, "", f"has a corner farther than {_LARGEST_M:g} m", _FIX)
-    if np.ptp(corners, axis=0).min() < 2 * _SMALLEST_M or _crosses_itself(corners):
+    wide_m = corners.max(axis=0) - corners.min(axis=0)
+    if wide_m.min() < 2 * _SMALLEST_M or _crosses_itself(corners):
         raise InputError(place, "", "crosses itself or has no area", _FIX)
     if not inside_polygon(np.zeros((1, 2)), corners)[0]:
         fix = "Give corners around the arm's mount: its axis is the origin, x to the front"
         raise InputError(place, "", "does not hold the arm's mount", fix)
     radius_m = float(np.linalg.norm(corners, axis=1).max())
-    return Footprint(radius_m, tuple((float(x), float(y)) for x, y in corners))
+    return Footprint(radius_m, tuple((x, y) for x, y in corners.tolist()))
 
 
 def _crosses_itself(corners: F64) -> bool:

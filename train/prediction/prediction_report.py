@@ -60,11 +60,12 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
 def _arrival_lines(p: Prediction) -> list[tuple[str, str]]:
     """How far the best may be missed, and what an arrival error changed."""
     lines = list[tuple[str, str]]()
-    if p.choice.expected is not None and p.arrival is not None and p.choice.nominal is not None:
-        best, nominal = p.choice.expected[[p.best, p.choice.nominal]]
+    expected, at = p.choice.expected, p.choice.nominal
+    if expected is not None and p.arrival is not None and p.best is not None and at is not None:
+        best, nominal = expected[p.best], expected[at]
         text = f"{p.arrival.text}; expected success {best:.3f}"
-        if p.best != p.choice.nominal:
-            x, y = p.base_xy_m[p.choice.nominal]
+        if p.best != at:
+            x, y = p.base_xy_m[at]
             text += f", and {nominal:.3f} at the best score, ({x:.3f}, {y:.3f}) m"
         lines.append(("arrival", text))
     if p.choice.miss_m is not None:

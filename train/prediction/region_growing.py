@@ -9,7 +9,7 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.clicked_surface import refuse_surface
 from datagen.train.prediction.frames import RgbdImage
-from datagen.train.prediction.ground import depth_error_m
+from datagen.train.prediction.ground import depth_error_m, floor_points
 from datagen.train.prediction.target import from_nearest
 
 _GROWS_M = 0.24  # from the clicked point
@@ -56,7 +56,8 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked:
     joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
     level = around & (grid[..., 2] < seed[2] - 0.003)
     allowed = grown = np.zeros((h, w), np.bool_)
-    stands_out = True  # above its support, and ends before the distance that it may grow
+    # Off the floor, above its support, and ends before the distance that it may grow.
+    stands_out = not floor_points(seed[None], T_world_camera[:3, 3])[0]
     for k in range(_ROUNDS):
         lowest_m = _above_support(grid, facets, level, seed)
         stands_out &= k > 0 or seed[2] > lowest_m
