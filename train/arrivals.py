@@ -154,7 +154,8 @@ def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
             weight = np.abs(1 - across - (dx - x)) * np.abs(1 - up - (dy - y))
             np.add.at(kernel, (y + up + n, x + across + n), weight / len(dx))
         return np.asarray(ndimage.correlate(value, kernel, mode="constant"), np.float64)
-    rows, columns = np.indices(value.shape).astype(np.float64)
+    cells: F64 = np.indices(value.shape).astype(np.float64)
+    rows, columns = cells[0], cells[1]
     middle = (np.array(value.shape) - 1) / 2
     yaw: F64 = np.arctan2(middle[0] - rows, middle[1] - columns)[..., None]
     x = columns[..., None] + np.cos(yaw) * dx - np.sin(yaw) * dy

@@ -64,6 +64,8 @@ def arrival_table(
     if maps is None:
         return []
     some = np.flatnonzero((maps.truth * maps.is_clear).any(axis=(1, 2)))
+    if not len(some):
+        return []
     scores = {m.name: _values(columns.scores[m.name][maps.order], maps, m) for m in methods}
     found: list[dict[str, Any]] = []
     for arrival in [*map(ring_arrival, DISTANCES_M), *([given] if given else [])]:

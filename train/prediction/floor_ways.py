@@ -18,6 +18,7 @@ WAYS = ("seen", "unseen", "none")
 _MARGIN_M = 2.5  # of the map around the base poses, for ways around obstacles
 _EYE_M = 6.0  # a camera farther from the target than this is outside the map
 _BEARINGS = 360  # of the circle around a camera
+_SIGHT_POINTS = 60_000  # are enough for them
 # Of the points in one bearing, as many may be stray at either end.
 _STRAY = 3
 # What ends the sight along a bearing is a wall where it rises by this within the depth, or above the camera.
@@ -153,6 +154,7 @@ class _Ends:
 def _sights(points_m: F32, eyes_m: F64) -> tuple[list[F64], list[_Ends]]:
     """For each camera: floor distance to the nearest thing along each bearing (_BEARINGS,), and its ends."""
     nearest, ends = list[F64](), list[_Ends]()
+    points_m = points_m[:: max(1, len(points_m) // _SIGHT_POINTS)]
     for eye in eyes_m:
         rel = points_m[:, :2] - eye[:2].astype(np.float32)
         gap = np.hypot(rel[:, 0], rel[:, 1])

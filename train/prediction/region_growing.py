@@ -57,7 +57,8 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked:
     level = around & (grid[..., 2] < seed[2] - 0.003)
     allowed = grown = np.zeros((h, w), np.bool_)
     # Off the floor, above its support, and ends before the distance that it may grow.
-    stands_out = not floor_points(seed[None], T_world_camera[:3, 3])[0]
+    on_floor = bool(floor_points(seed[None], T_world_camera[:3, 3])[0])
+    stands_out = not on_floor
     for k in range(_ROUNDS):
         lowest_m = _above_support(grid, facets, level, seed)
         stands_out &= k > 0 or seed[2] > lowest_m
@@ -72,6 +73,9 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked:
         stands_out = False
     if not stands_out:
         refuse_surface(grid, facets, depth_m, joined, click, asked, _GROWS_M)
+    if on_floor:
+        fix = "Click higher on the target, or give --mask"
+        raise InputError("--click", f"{asked[0]},{asked[1]}", "lies on the floor", fix)
     grown[v, u] = True
     # What breaks left out at the rim is the target's where it is as near as the target beside it.
     rim = np.asarray(ndimage.binary_dilation(grown, iterations=2), np.bool_) & allowed
