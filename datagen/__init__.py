@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from datagen.tables.candidates import candidates
     from datagen.tables.dataset import open_dataset
     from datagen.train.prediction.frames import SensorFrame
+    from datagen.train.prediction.predict import load_scorer
     from datagen.train.torch_stream import TorchStream, stream
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "evaluate",
     "houses",
     "label_sources",
+    "load_scorer",
     "merge",
     "objects",
     "open_dataset",
@@ -63,6 +65,7 @@ _HOMES = {
     "datagen.tables.candidates": ("candidates",),
     "datagen.tables.dataset": ("open_dataset",),
     "datagen.train.prediction.frames": ("SensorFrame",),
+    "datagen.train.prediction.predict": ("load_scorer",),
     "datagen.train.torch_stream": ("TorchStream", "stream"),
 }
 

@@ -20,7 +20,7 @@ Table = Literal["scene", "sample"]
 TABLES: tuple[Table, Table] = ("scene", "sample")
 
 # Version of all schemas. New fields raise it and note it in `since`; fields are never removed or changed.
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 OLDEST_SCHEMA_VERSION = 2
 
 
@@ -185,7 +185,7 @@ SAMPLE_FIELDS = (
 
 _OUTCOME_CODES = tuple(OUTCOMES)
 
-PLAN_FIELDS = (
+_PLANNED_FIELDS = (
     *SAMPLE_FIELDS,
     Field("heuristic_label", "uint8", (), "1", "", "label of the distance-visibility rule", 0, 1),
     Field("outcome", "uint8", (), "1", "",
@@ -201,8 +201,17 @@ PLAN_FIELDS = (
           "smallest distance of the arm to the scene on the way to the pregrasp", 0, 10),
 )
 
+PLAN_FIELDS = (
+    *_PLANNED_FIELDS,
+    Field("trials", "int16", (), "1", "",
+          "arrivals that were planned from: repeats, or 1, the candidate itself; 0 where nothing was planned",
+          0, since=4),
+    Field("successes", "int16", (), "1", "", "those with a whole plan; the label is the candidate's own",
+          0, since=4),
+)
+
 SIM_FIELDS = (
-    *PLAN_FIELDS,
+    *_PLANNED_FIELDS,
     Field("attempts", "int16", (), "1", "", "grasps that were executed", 0),
     Field("trials", "int16", (), "1", "", "what the label is a rate of: repeats, or 1; 0 without a plan", 0),
     Field("successes", "int16", (), "1", "", "those in which the target was lifted and held", 0),

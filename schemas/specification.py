@@ -200,9 +200,9 @@ class Interval(Range):
 
 
 class DisturbanceParams(_Frozen):
-    """Disturbed trials: the robot arrives near a candidate `repeats` times and plans from there.
+    """Disturbed labels: the robot arrives near a candidate `repeats` times and plans from there.
 
-    It knows its pose, but not the errors of the target's pose, friction and mass.
+    It knows its pose, but not the errors of the target's pose, friction and mass, which only trials show.
     """
 
     repeats: int = Field(default=5, ge=1, le=1000)

@@ -47,6 +47,8 @@ def evaluate(
     baselines: Sequence[str] | None = None,
     detector: File | None = None,
     heuristic: File | None = None,
+    arrival: str | None = None,
+    arrival_std: str | None = None,
     bootstrap: Whole = 1000,
     seed: Whole = 0,
     allow_seen_houses: bool = False,
@@ -71,6 +73,8 @@ def evaluate(
         baselines: Baseline to compare with, or none; repeat for more [all].
         detector: Folder of a zero-shot object detector, for the detector baseline.
         heuristic: Parameters of the analytic baseline, from `datagen calibrate`.
+        arrival: Arrival error to report too: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
+        arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
         bootstrap: Resamples of scenes for each interval.
         seed: Seed of the resamples and example scenes.
         allow_seen_houses: Report training houses separately instead of failing.
@@ -102,11 +106,13 @@ def evaluate(
     )
     from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
     from datagen.evaluation_report.report import evaluation_report
+    from datagen.train.arrivals import arrival_of
     from datagen.train.evaluation.columns import gather
 
     fit = [str(path) for path in fit or ()]
     detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
     refuse_odd_draws(bootstrap, seed)
+    error = arrival_of(arrival, arrival_std)
     if threads is not None and not 1 <= threads <= 1024:
         raise InputError("--threads", str(threads), "is below 1", "Give 1 or more")
     if html is not None:
@@ -140,7 +146,7 @@ def evaluate(
         batches = [(place.cells, place.stream.epoch(0)) for place in opened]
         rng = np.random.default_rng([seed, 0])
         gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
-    report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed)
+    report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed, error)
     if html is not None:
         from datagen.evaluation_report.page import page_of
 

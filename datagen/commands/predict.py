@@ -23,13 +23,16 @@ from datagen.schemas.whole_files import whole_file
 from datagen.workers.geometry.mesh import F64
 
 if TYPE_CHECKING:
-    from datagen.train.prediction import Prediction
+    from datagen.train.prediction import Footprint, Prediction
     from datagen.train.prediction.frames import SensorFrame
+    from datagen.train.scorers import Scorer
 
     Frames = Sequence[str | Path | SensorFrame]
+    Checkpoint = str | Path | Scorer
+    Outline = str | float | Sequence[Sequence[float]] | Footprint
 else:
     # What the command line resolves, without importing torch.
-    Prediction, Frames = Any, Sequence[Path]
+    Prediction, Frames, Checkpoint, Outline = Any, Sequence[Path], str | Path, str
 
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
@@ -58,6 +61,10 @@ def _pixel(kind: Any, tokens: Sequence[Token]) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
+def _text(kind: Any, tokens: Sequence[Token]) -> str:
+    return tokens[0].value
+
+
 def _numbers(kind: Any, tokens: Sequence[Token]) -> list[float]:
     try:
         return [float(part) for part in tokens[0].value.split(",")]
@@ -67,7 +74,7 @@ def _numbers(kind: Any, tokens: Sequence[Token]) -> list[float]:
 
 @prints(print_prediction)
 def predict(
-    checkpoint: Annotated[str | Path, Parameter(name="CHECKPOINT")],
+    checkpoint: Annotated[Checkpoint, Parameter(name="CHECKPOINT")],
     /,
     *,
     base_height: float,
@@ -85,10 +92,13 @@ def predict(
         Sequence[float] | None, Parameter(converter=_numbers, n_tokens=1, metavar="STR")
     ] = None,
     robot_camera_height: float | None = None,
+    footprint: Annotated[Outline | None, Parameter(converter=_text, n_tokens=1, metavar="STR")] = None,
     depth_scale: float = 0.001,
     grid: Whole = 25,
     half_width: float = 1.0,
     allow_unseen: bool = False,
+    arrival: str | None = None,
+    arrival_std: str | None = None,
     out: File | None = None,
     html: File | None = None,
     json: AsJson = False,
@@ -102,7 +112,7 @@ def predict(
     For example: datagen predict model.ckpt --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
 
     Args:
-        checkpoint: Checkpoint of `datagen train`.
+        checkpoint: Checkpoint of `datagen train`; in Python also what `datagen.load_scorer` made of it.
         base_height: Height of the arm's mount above the floor (m).
         reach: Reach of the arm from its mount (m).
         rgb: Colour image, aligned with the depth image.
@@ -116,10 +126,13 @@ def predict(
         camera_pose: JSON file: T_world_camera (4x4); world z up, floor at z = 0.
         gravity: Direction of gravity x,y,z in the camera frame (x right, y down).
         robot_camera_height: Height of the robot's own camera (m) [that of the frame's camera].
+        footprint: Base: radius (m), corners x,y;x,y;... around the mount, x ahead, or a robot [as trained].
         depth_scale: Metres per step of 16-bit depth.
         grid: Cells per side of the grid around the target.
         half_width: Half the side of the grid (m).
-        allow_unseen: Also consider cells whose floor no camera saw.
+        allow_unseen: Also consider cells of which the floor, or the way there, was not seen.
+        arrival: Arrival error to choose for: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv.
+        arrival_std: The same as --arrival normal:, in metres, with yaw after a comma: 0.05,3deg.
         out: Picture to write, FILE.png.
         html: Page to write, FILE.html.
         json: Of the command line alone.
@@ -144,7 +157,8 @@ def predict(
         ((625, 2), (4, 4))
     """
     # Imported here: the libraries of training take seconds to import.
-    from datagen.train.prediction import RobotSize, load_scorer
+    from datagen.train.arrivals import arrival_of
+    from datagen.train.prediction import RobotSize, load_scorer, read_footprint
     from datagen.train.prediction import predict as scored
 
     lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
@@ -153,6 +167,8 @@ def predict(
     if not (math.isfinite(depth_scale) and 1e-6 <= depth_scale <= 1.0):
         fix = "Give metres per step: 0.001 for millimetres"
         raise InputError("--depth-scale", str(depth_scale), "is not between 0.000001 and 1", fix)
+    outline = None if footprint is None else read_footprint(footprint)
+    error = arrival_of(arrival, arrival_std)
     falls = None if gravity is None else _direction(gravity)
     rgb, depth, intrinsics, mask, camera_pose, frame_dir, out, html = (
         None if path is None else Path(path)
@@ -161,7 +177,8 @@ def predict(
     named = [Path(each) if isinstance(each, str) else each for each in frame or ()]
     frames = _frames(rgb, depth, intrinsics, mask, camera_pose, named, frame_dir, depth_scale)
     files = [each for each in named if isinstance(each, Path)]
-    _refuse_outputs(out, html, [Path(checkpoint), rgb, depth, intrinsics, mask, camera_pose, *files])
+    model = Path(checkpoint) if isinstance(checkpoint, (str, Path)) else None
+    _refuse_outputs(out, html, [model, rgb, depth, intrinsics, mask, camera_pose, *files])
     own_height = robot_camera_height if robot_camera_height is not None else camera_height
     if own_height is None:
         own_height = float(frames[0].T_world_camera[2, 3]) if frames[0].T_world_camera is not None else None
@@ -170,13 +187,14 @@ def predict(
         raise InputError("--camera-height", "", "missing", fix)
     _refuse_length("--robot-camera-height", own_height)
     answer = scored(
-        load_scorer(checkpoint),
+        load_scorer(checkpoint) if isinstance(checkpoint, (str, Path)) else checkpoint,
         frames,
-        RobotSize(own_height, base_height, reach),
+        RobotSize(own_height, base_height, reach, outline),
         camera_height_m=camera_height,
         gravity=falls,
         click=click,
         allow_unseen=allow_unseen,
+        arrival=error,
         grid=grid,
         half_width_m=half_width,
     )

@@ -107,7 +107,7 @@ def submit(
         model: Checkpoints for the selection; several: their mean.
         random_share: Share of the selection that is random, so that each candidate has a chance.
         robot: fetch, panda, panda-scaled or xarm7; sets reach and height [plan, sim: panda-scaled].
-        perturb: Trials per candidate, each with random errors of pose and world (sim) [1, without].
+        perturb: Arrivals per candidate, with random errors of pose; in sim also of the world [1, without].
         candidates: Cells to sample from: all, those with a clear base, or those also within reach [grid].
         candidates_per_scene: Candidates sampled per scene from the 25x25 grid, or grid for all 625 [60];
             with --candidates-from, those selected in each selected scene [a quarter].

@@ -18,7 +18,7 @@ ARM_PACKAGES: dict[str, tuple[str, ...]] = {
     "sim": ("coal", "mani_skill", "pin", "sapien"),
 }
 # Sections of the arm that only some label sources have.
-_NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial", "disturbance"), "sim": ()}
+_NOT_FOR: dict[str, tuple[str, ...]] = {"plan": ("trial",), "sim": ()}
 # Reaches are stated in whole millimetres.
 _STEP_M = 0.001
 # Of the reaches that are drawn: opening an arm costs as much as planning ten candidates.
@@ -51,15 +51,15 @@ def complete_arm(
     `robot` and `repeats` are the options --robot and --perturb, and override the section that came from
     `place`. Raises InputError for what the label source does not support.
     """
-    if repeats is not None and label_source != "sim":
-        fix = "Omit it, or submit sim"
-        raise InputError("--perturb", str(repeats), f"{label_source} runs no trials", fix)
+    if repeats is not None and label_source not in ARM_PACKAGES:
+        fix = "Omit it, or submit plan or sim"
+        raise InputError("--perturb", str(repeats), f"{label_source} has no arm", fix)
     if repeats is not None:
         try:
             DisturbanceParams(repeats=repeats)
         except ValidationError as error:
             problem = error.errors()[0]["msg"]
-            raise InputError("--perturb", str(repeats), problem, "Omit it for undisturbed trials") from None
+            raise InputError("--perturb", str(repeats), problem, "Omit it for undisturbed labels") from None
     if label_source not in ARM_PACKAGES:
         if "arm" in fields:
             raise InputError(place, "arm", f"{label_source} has no arm", "Remove the section")
@@ -77,10 +77,10 @@ def complete_arm(
         raise InputError(place, "arm.robot", f"{named!r} is unknown", choices(ROBOTS, str(named)))
     if label_source == "sim":
         arm.setdefault("trial", {})
-        if repeats is not None:
-            disturbance = arm.setdefault("disturbance", {})
-            if isinstance(disturbance, dict):
-                disturbance["repeats"] = repeats
+    if repeats is not None:
+        disturbance = arm.setdefault("disturbance", {})
+        if isinstance(disturbance, dict):
+            disturbance["repeats"] = repeats
 
 
 def robot_of(fields: Fields, robot: str | None) -> str | None:

@@ -69,7 +69,7 @@ def best_success(samples: Columns) -> int | None:
     if not len(rows):
         return None
     keys = [-samples["path_clearance_m"][rows]]
-    if "trials" in samples:
+    if "attempts" in samples:
         share = samples["successes"][rows] / np.maximum(samples["trials"][rows], 1)
         keys += [samples["attempts"][rows], -share]
     return int(rows[np.lexsort(keys)[0]])
@@ -172,7 +172,7 @@ def _described(samples: Columns, row: int | None) -> str:
     path_rad, clear_cm = samples["path_length_rad"][row], 100 * samples["path_clearance_m"][row]
     if path_rad > 0:
         text += f"; path {path_rad:.1f} rad long, {clear_cm:.1f} cm clear"
-        if "trials" in samples and samples["trials"][row]:
+        if "lift_m" in samples and samples["trials"][row]:
             lift_cm, slip_cm = (100 * samples[key][row] for key in ("lift_m", "slip_m"))
             text += f"; lifted {int(samples['successes'][row])} of {int(samples['trials'][row])} times, "
             text += f"lift {lift_cm:.1f} cm, slip {slip_cm:.1f} cm"

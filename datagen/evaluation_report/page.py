@@ -70,6 +70,7 @@ def _grids(report: Report, part: Report, level: int) -> list[str]:
     if grids is None:
         return [f"<h{level}>Table III left out</h{level}><p>{escape(part['no_grids'])}</p>"]
     return [
+        *_shown(tables.arrival_table(report, grids), level),
         *_shown(tables.grids_table(report, grids), level),
         *_shown(tables.comparison_table(grids["comparisons"], "whole grids"), level + 1, kind="text"),
         *_order(report, grids["differences"], tables.TABLE_III, "whole grids"),

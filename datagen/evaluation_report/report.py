@@ -11,7 +11,9 @@ from datagen import __version__
 from datagen.evaluation_report.evaluated_runs import EvaluatedRun
 from datagen.evaluation_report.methods import BaselineMethods, EvaluatedMethod
 from datagen.schemas.errors import InputError
+from datagen.train.arrivals import Arrival
 from datagen.train.evaluation import paper_results
+from datagen.train.evaluation.arrival_success import arrival_table
 from datagen.train.evaluation.bootstrap import LEVEL
 from datagen.train.evaluation.columns import Columns, Gathered
 from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
@@ -28,6 +30,7 @@ def evaluation_report(
     fit: Sequence[str],
     resamples: int,
     seed: int,
+    arrival: Arrival | None = None,
 ) -> dict[str, Any]:
     """All tables and curves. Scenes in houses that a method was trained on are a part of their own.
 
@@ -42,7 +45,9 @@ def evaluation_report(
     parts = [
         {
             "houses": name,
-            **_part(columns.of_scenes(rows), methods, sets, objects, resamples, seed, len(sides) > 1),
+            **_part(
+                columns.of_scenes(rows), methods, sets, objects, resamples, seed, len(sides) > 1, arrival
+            ),
         }
         for name, rows in sides
     ]
@@ -76,6 +81,7 @@ def _part(
     resamples: int,
     seed: int,
     is_one_of_two: bool,
+    arrival: Arrival | None,
 ) -> dict[str, Any]:
     """The tables of some scenes. A set with too few scenes on one side is omitted."""
     told: dict[str, Any] = {}
@@ -94,7 +100,9 @@ def _part(
         why = "no scene has a whole grid of one robot: submit sim with --candidates-per-scene grid"
     else:
         whole = columns.of_scenes(columns.is_grid)
-        grids = evaluate_grids(whole, methods, weights_for(whole, resamples, seed))
+        weights = weights_for(whole, resamples, seed)
+        grids = evaluate_grids(whole, methods, weights)
+        grids["arrivals"] = arrival_table(whole, methods, weights, arrival)
         if grids["scenes"] == grids["scenes_without_positive"]:
             grids, why = None, f"none of {grids['scenes']} whole grids has a positive candidate"
     return {

@@ -140,6 +140,25 @@ def grids_table(report: Report, grids: Report) -> TitledTable:
     return TitledTable(f"Table III: {grids_line(grids)}", heads, rows)
 
 
+def arrival_table(report: Report, grids: Report) -> TitledTable | None:
+    """Return the success of picks where the robot arrives off them; None without whole square grids."""
+    if not (found := grids["arrivals"]):
+        return None
+
+    def success(name: str, pick: str) -> list[str]:
+        return [percent(row["methods"][name][pick]["value"]) for row in found]
+
+    rows = [
+        (record["name"] if pick == "nominal" else "", pick, *success(record["name"], pick))
+        for record in models_first(report["methods"])
+        for pick in ("nominal", "smoothed")
+    ]
+    rows.append(("best clear candidate", "", *(percent(row["best"]) for row in found)))
+    rows.append(("any clear candidate", "", *(percent(row["any"]) for row in found)))
+    title = "success (%) where the robot parks off the pick, in any direction; smoothed by that error"
+    return TitledTable(title, ("method", "pick", *(row["arrival"] for row in found)), rows)
+
+
 def calibration_table(report: Report, told: Report) -> TitledTable:
     """Return the table of calibration errors; without rows where no method predicts probabilities."""
     rows = [
@@ -277,6 +296,7 @@ def print_evaluation(report: Report) -> None:
         if (grids := part["grids"]) is None:
             print_rows("Table III: omitted", [("", part["no_grids"])])
         else:
+            _print(arrival_table(report, grids))
             _print(grids_table(report, grids))
             _print(comparison_table(grids["comparisons"], "whole grids"))
             for shown in order_tables(models, grids["differences"], TABLE_III, "whole grids"):

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from datagen.train.prediction.base_cells import RobotSize
+from datagen.train.prediction.footprints import Footprint, read_footprint
 from datagen.train.prediction.frames import read_frame, read_place
 from datagen.train.prediction.predict import Prediction, load_scorer, predict
 
-__all__ = ["Prediction", "RobotSize", "load_scorer", "predict", "read_frame", "read_place"]
+__all__ = [
+    "Footprint",
+    "Prediction",
+    "RobotSize",
+    "load_scorer",
+    "predict",
+    "read_footprint",
+    "read_frame",
+    "read_place",
+]

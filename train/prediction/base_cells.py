@@ -1,4 +1,4 @@
-"""Base positions around the target, and whether they are clear, blocked or unseen."""
+"""Base positions around the target, and whether they are clear, blocked, unseen or unreachable."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.specification import CandidateParams
 from datagen.train.inputs import F32, F64, I64, Bools
+from datagen.train.prediction.floor_ways import CELL_M, WAYS, counted, draw_map, ways_to
+from datagen.train.prediction.footprints import Footprint
 from datagen.train.prediction.fusing import SeenPoints
-from datagen.train.prediction.ground import depth_error_m, floor_points
+from datagen.train.prediction.ground import depth_error_m, distances_m, floor_points
 from datagen.workers.bases.candidates import grid_offsets
 from datagen.workers.bases.clearance import STEP_M
 
-CLEAR, BLOCKED, UNSEEN = STATES = ("clear", "blocked", "unseen")
+CLEAR, BLOCKED, UNSEEN, UNREACHABLE = STATES = ("clear", "blocked", "unseen", "unreachable")
 # Share of the floor under a base that must have been seen for the base to be clear.
 SEEN_SHARE = 0.8
 # One stray pixel of a stereo camera is no obstacle.
 _LEAST_POINTS = 3
-_CELL_M = 0.04
+_CELL_M = CELL_M
 _GAP_CELLS = 4  # gaps up to twice as wide are closed
 # Table tops and shelves reach down below the top that is seen of them, by about so much.
 _BOARD_M = 0.08
 _AROUND_M = 3.0  # farther from the grid's middle nothing matters
+_THIN_M = 0.01  # points of obstacles are counted in cells of this side
 
 
 @dataclass(frozen=True)
@@ -34,11 +37,14 @@ class RobotSize:
     camera_height_m: float
     base_height_m: float
     arm_reach_m: float
+    footprint: Footprint | None = None  # None: the circle that the base of such an arm has in runs
 
     @property
-    def base_radius_m(self) -> float:
-        """The radius that the base of such an arm has in runs."""
-        return float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m))
+    def outline(self) -> Footprint:
+        """Outline of the base."""
+        if self.footprint is not None:
+            return self.footprint
+        return Footprint(float(CandidateParams(scaled_base=True).radius_of_base_m(self.arm_reach_m)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,30 +54,54 @@ class BaseCells:
     offset_m: F32  # (N, 2), from the target's centre, world axes
     state: I64  # (N,), index into STATES
     floor_seen: F64  # (N,), share of the floor under the base that was seen
+    way: I64  # (N,), index into WAYS: how the base gets there from the camera
 
 
-def observe_cells(seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams) -> BaseCells:
-    """The grid around the target, each cell blocked, clear or unseen.
+def yaws_to_target(offset_m: F32) -> F64:
+    """Headings (N,) that face the target from offsets (N, 2), counter-clockwise from x."""
+    x, y = -offset_m.astype(np.float64).T
+    return np.arctan2(y, x)
 
-    Blocked where observed points lie within the base's radius between the floor and a board's thickness
-    above the mount, or within the mast's from there to the camera; otherwise unseen where too little of its
-    floor was seen.
+
+def observe_cells(
+    seen: SeenPoints, center_m: F64, robot: RobotSize, params: CandidateParams, yaw_error_rad: float = 0.0
+) -> BaseCells:
+    """The grid around the target, each cell blocked, unreachable, unseen or clear, in this order.
+
+    Blocked where observed points lie in the base's outline between the floor and a board's thickness above
+    the mount, or within the mast's radius from there to the camera; unreachable where no way leads there
+    (`floor_ways`); unseen where too little of the floor below it, or of the way, was seen. A polygon must
+    also fit where the base turns up to twice `yaw_error_rad` too far.
     """
-    offsets = grid_offsets(params)
-    base_xy = center_m[:2] + offsets
+    offsets, base = grid_offsets(params), robot.outline
+    base_xy, yaw = center_m[:2] + offsets, yaws_to_target(offsets.astype(np.float32))
     z = seen.points_m[:, 2]
-    gap_m = np.min([np.linalg.norm(seen.points_m - eye, axis=1) for eye in seen.eyes_m], axis=0)
+    gap_m = np.min([distances_m(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
-    low = _counts(seen.points_m[above & (z < mount + _BOARD_M)], base_xy, robot.base_radius_m)
+    stands = seen.points_m[above & (z < mount + _BOARD_M)]
     tops = seen.points_m[above & (z >= mount) & (z < top)]
-    high = _counts(tops, base_xy, params.mast_radius_m)
+    floor = seen.points_m[is_floor]
+    high = _counts(tops, base_xy, yaw, Footprint(params.mast_radius_m))
+    turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
+    low = np.max([_counts(stands, base_xy, yaw + turn, base) for turn in turns], axis=0)
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
-    share = _floor_share(seen.points_m[is_floor], base_xy, robot.base_radius_m)
-    state = np.where(blocked, STATES.index(BLOCKED), STATES.index(UNSEEN))
-    state[~blocked & (share >= SEEN_SHARE)] = STATES.index(CLEAR)
-    return BaseCells(offsets.astype(np.float32), state, share)
+    share = _floor_share(floor, base_xy, yaw, base)
+    way = ways_to(
+        draw_map(base_xy, seen.eyes_m, stands, tops, floor),
+        base_xy + _turned(np.broadcast_to(base.middle_m, (1, 2)), yaw)[:, 0],
+        base.turning_radius_m - base.width_m,
+        base.turning_radius_m,
+        params.mast_radius_m,
+        seen.points_m,
+        seen.eyes_m,
+    )
+    state = np.full(len(base_xy), STATES.index(UNSEEN))
+    state[(share >= SEEN_SHARE) & (way == WAYS.index("seen"))] = STATES.index(CLEAR)
+    state[way == WAYS.index("none")] = STATES.index(UNREACHABLE)
+    state[blocked] = STATES.index(BLOCKED)
+    return BaseCells(offsets.astype(np.float32), state, share, way)
 
 
 def seen_share(cloud_m: F32, radius_m: float) -> float:
@@ -82,22 +112,38 @@ def seen_share(cloud_m: F32, radius_m: float) -> float:
     return float(hit[np.hypot(*np.meshgrid(centres, centres)) <= radius_m].mean())
 
 
-def _counts(points_m: F32, base_xy: F64, radius_m: float) -> I64:
-    """Points (N, 3) within the radius of each base, seen from above."""
-    near = np.linalg.norm(points_m[:, :2] - base_xy.mean(axis=0), axis=1) < _AROUND_M
-    if not near.any():
+def _counts(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> I64:
+    """Points (N, 3) in the outline of each base, seen from above."""
+    near = np.abs(points_m[:, :2] - base_xy.mean(axis=0)).max(axis=1, initial=0) < _AROUND_M
+    xy = points_m[near, :2].astype(np.float64)
+    low = base_xy.mean(axis=0) - _AROUND_M
+    n = int(np.ceil(2 * _AROUND_M / _THIN_M))
+    counts = counted(xy, low, _THIN_M, (n, n)).ravel()
+    cells = np.flatnonzero(counts)
+    if not len(cells):
         return np.zeros(len(base_xy), np.int64)
-    counts = KDTree(points_m[near, :2]).query_ball_point(base_xy, radius_m, return_length=True)
-    return np.asarray(counts, np.int64)
+    thin, weight = low + _THIN_M * (np.column_stack(np.divmod(cells, n)) + 0.5), counts[cells]
+    found = KDTree(thin).query_ball_point(base_xy, base.radius_m)
+    row = np.repeat(np.arange(len(base_xy)), [len(rows) for rows in found])
+    point = np.concatenate([*found, np.empty(0)]).astype(np.int64)
+    if base.corners_m:
+        rel, c, s = thin[point] - base_xy[row], np.cos(yaw[row]), np.sin(yaw[row])
+        # Most points are in many outlines: all are looked at in one go.
+        inside = base.holds(np.column_stack([c * rel[:, 0] + s * rel[:, 1], c * rel[:, 1] - s * rel[:, 0]]))
+        row, point = row[inside], point[inside]
+    return np.bincount(row, weight[point], len(base_xy)).astype(np.int64)
+
+
+def _turned(points_m: F64, yaw: F64) -> F64:
+    """Points (D, 2) of the base frame at each heading (N,), as (N, D, 2) from the base, world axes."""
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = points_m.T
+    return np.stack([c * x - s * y, s * x + c * y], axis=2)
 
 
 def _occupied(points_m: F32, low: F64, cell_m: float, size: tuple[int, int]) -> Bools:
     """Cells (size) of a grid on the floor, from corner `low` (2,), with a point (N, 3) above or in them."""
-    cells = np.floor((points_m[:, :2] - low) / cell_m).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
-    hit = np.zeros(size, np.bool_)
-    hit[cells[:, 0], cells[:, 1]] = True
-    return hit
+    return counted(points_m, low, cell_m, size) > 0
 
 
 def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
@@ -109,17 +155,18 @@ def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
     return np.asarray(closed, np.bool_)[rows[:, 0], rows[:, 1]]
 
 
-def _floor_share(floor_m: F32, base_xy: F64, radius_m: float) -> F64:
+def _floor_share(floor_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> F64:
     """Share (N,) of the cells under each base in which floor was seen."""
-    low = base_xy.min(axis=0) - radius_m - _CELL_M
-    size = np.ceil((base_xy.max(axis=0) + radius_m + _CELL_M - low) / _CELL_M).astype(np.int64) + 1
+    low = base_xy.min(axis=0) - base.radius_m - _CELL_M
+    size = np.ceil((base_xy.max(axis=0) + base.radius_m + _CELL_M - low) / _CELL_M).astype(np.int64) + 1
     seen = _occupied(floor_m, low, _CELL_M, (int(size[0]), int(size[1])))
     # Far away, rows of pixels are farther apart than cells are wide.
     seen |= np.asarray(ndimage.binary_closing(seen), np.bool_)
-    n = int(np.ceil(radius_m / _CELL_M))
-    step = (np.arange(-n, n + 1)) * _CELL_M
-    disc = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    disc = disc[np.linalg.norm(disc, axis=1) <= radius_m]
-    rows = np.floor((base_xy[:, None] + disc - low) / _CELL_M).astype(np.int64)  # (N, D, 2)
+    n = int(np.ceil(base.radius_m / _CELL_M))
+    step = np.arange(-n, n + 1) * _CELL_M
+    under: F64 = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2).astype(np.float64)
+    under = under[base.holds(under)]
+    below = _turned(under, yaw) if base.corners_m else under  # a circle is the same at every heading
+    rows = np.floor((base_xy[:, None] + below - low) / _CELL_M).astype(np.int64)  # (N, D, 2)
     rows = np.clip(rows, 0, size - 1)
     return seen[rows[..., 0], rows[..., 1]].mean(axis=1)

@@ -58,6 +58,13 @@ class RgbdImage:
         v, u = np.divmod(pixels, self.depth_m.shape[1])
         return self.pinhole.points(u, v, (self.depth_m if depth_m is None else depth_m).ravel()[pixels])
 
+    def cut(self, left: int, top: int, right: int, bottom: int) -> RgbdImage:
+        """The part of the picture between these columns and rows, with its pinhole."""
+        p, part = self.pinhole, np.s_[top:bottom, left:right]
+        pinhole = Pinhole(p.fx_px, p.fy_px, p.cx_px - left, p.cy_px - top)
+        mask = None if self.mask is None else self.mask[part]
+        return RgbdImage(self.rgb[part], self.depth_m[part], pinhole, mask)
+
     def facets(self, T: F64) -> F64:
         """Area times normal (H, W, 3) of each pixel of smoothed depth, towards the camera; world frame."""
         known = (self.depth_m > 0).astype(np.float32)
@@ -71,8 +78,7 @@ class RgbdImage:
     def world_grid(self, T: F64, depth_m: F32 | None = None) -> F64:
         """Points (H, W, 3) of all pixels in T's parent frame; those without depth lie in the camera."""
         h, w = self.depth_m.shape
-        points_m = self.points(np.arange(h * w), depth_m).astype(np.float64)
-        return (points_m @ T[:3, :3].T + T[:3, 3]).reshape(h, w, 3)
+        return moved(self.points(np.arange(h * w), depth_m), T).reshape(h, w, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +91,15 @@ class SensorFrame:
     on_target: Bools | None  # (N,)
     T_world_camera: F64 | None  # (4, 4)
     image: RgbdImage | None
+
+
+def moved(points_m: F32 | F64, T: F64) -> F64:
+    """Points (N, 3) by a transform (4, 4).
+
+    Written out: a product of a long and a 3x3 matrix costs BLAS ten times as much, most of it in threads.
+    """
+    x, y, z = (np.ascontiguousarray(points_m[:, k], np.float64) for k in range(3))
+    return np.stack([x * T[k, 0] + y * T[k, 1] + z * T[k, 2] + T[k, 3] for k in range(3)], axis=1)
 
 
 def read_frame(

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.specification import ObservationParams
 from datagen.train.inputs import F32, F64, U8, Bools
-from datagen.train.prediction.frames import SensorFrame
+from datagen.train.prediction.frames import SensorFrame, moved
 from datagen.workers.rendering.cloud import Cloud, stored_cloud
 
 VOXEL_M = 0.005
@@ -35,9 +35,7 @@ def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
     Of several frames one point a voxel stays, a target's before another's, then the nearest to its
     camera; a single frame keeps every point, so that it is sampled by pixels as in training.
     """
-    worlds = [
-        (f.points_m @ T[:3, :3].T + T[:3, 3]).astype(np.float32) for f, T in zip(frames, poses, strict=True)
-    ]
+    worlds = [moved(f.points_m, T).astype(np.float32) for f, T in zip(frames, poses, strict=True)]
     points = np.concatenate(worlds)
     rgb = np.concatenate([f.rgb for f in frames])
     none = [np.zeros(len(f.points_m), np.bool_) if f.on_target is None else f.on_target for f in frames]

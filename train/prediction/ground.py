@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, I64, Bools
-from datagen.train.prediction.frames import SensorFrame
+from datagen.train.prediction.frames import SensorFrame, moved
 
 _SAMPLE = 20_000  # points that are looked at
 _MODES, _VOTERS = 200, 2500  # normals that are tried as the way up, and those that vote
@@ -99,15 +99,21 @@ def level_pose(up: F64, height_m: float) -> F64:
     return T
 
 
+def distances_m(points_m: F32 | F64, eye_m: F64) -> F64:
+    """Distances (N,) of points (N, 3) from a camera at (3,)."""
+    x, y, z = (points_m[:, k] - eye_m[k] for k in range(3))
+    return np.sqrt(x * x + y * y + z * z)
+
+
 def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
     """Which of world points (N, 3) lie on z = 0 as far as a camera at `eye_m` (3,) can tell."""
-    far_m = np.linalg.norm(points_m - eye_m, axis=1)
+    far_m = distances_m(points_m, eye_m)
     slope = np.abs(eye_m[2]) / np.maximum(far_m, 1e-6)
     return np.abs(points_m[:, 2]) < 0.015 + 3 * depth_error_m(far_m) * np.minimum(slope, 1.0)
 
 
 def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
-    world = frame.points_m @ T[:3, :3].T + T[:3, 3]
+    world = moved(frame.points_m, T)
     # Twice the tolerance of the floor, so that a floor with a small offset is reported.
     z = world[np.abs(world[:, 2]) < 0.1, 2]
     near = world[floor_points(world, T[:3, 3]), 2]

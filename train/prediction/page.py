@@ -14,7 +14,7 @@ from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
 
 _MOST_POINTS = 20_000
-_SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open"}
+_SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open", "unreachable": "diamond-open"}
 _TARGET_RGB = tuple(int(TARGET.colour[k : k + 2], 16) for k in (1, 3, 5))
 _CAPTION = (
     "The cloud with the target in pink, and the grid of base poses, from red (score 0) to blue (1). Drag "
@@ -73,7 +73,7 @@ def _base_poses(prediction: Prediction) -> list[go.Scatter3d]:
             for s, a, b, w in zip(scores, x, y, yaw_deg, strict=True)
         ]
         marker = {
-            "size": 3 if state == "blocked" else 6,
+            "size": 3 if state in ("blocked", "unreachable") else 6,
             "symbol": _SYMBOLS[state],
             "color": scores.tolist(),
             "colorscale": SCORE_COLOURS,

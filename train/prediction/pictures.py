@@ -10,20 +10,21 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.path import Path
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64
-from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNSEEN
+from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
 from datagen.train.prediction.predict import Prediction
 from datagen.train.prediction.prediction_report import told
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
-_EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none"}
-_ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9}
-_SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3}  # of a cell's side
+_EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none", UNREACHABLE: "none"}
+_ALPHA = {CLEAR: 1.0, UNSEEN: 0.6, BLOCKED: 0.9, UNREACHABLE: 0.9}
+_SHARE = {CLEAR: 0.92, UNSEEN: 0.92, BLOCKED: 0.3, UNREACHABLE: 0.3}  # of a cell's side
+_MARK = {CLEAR: "s", UNSEEN: "s", BLOCKED: "s", UNREACHABLE: "D"}
 _MOST_POINTS = 3_000
 
 
@@ -77,13 +78,20 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
             scale.to_rgba(prediction.score[rows], alpha=_ALPHA[state]),
             strict=True,
         ):
-            corner = (x - size / 2, y - size / 2)
-            axes.add_patch(Rectangle(corner, size, size, fc=colour, ec=_EDGE[state], lw=0.9, zorder=3))
+            corner, turn_deg = (x - size / 2, y - size / 2), 45 * (_MARK[state] == "D")
+            axes.add_patch(
+                Rectangle(
+                    corner, size, size, angle=turn_deg, rotation_point="center",
+                    fc=colour, ec=_EDGE[state], lw=0.9, zorder=3,
+                )
+            )  # fmt: skip
         if len(rows):
             look: dict[str, Any] = {"ms": 11 * _SHARE[state], "mec": _EDGE[state], "alpha": _ALPHA[state]}
             label = f"{len(rows)} {state}"
             legend.append(
-                Line2D([], [], ls="", marker="s", mfc=colormaps[SCORE_COLOURS](0.8), label=label, **look)
+                Line2D(
+                    [], [], ls="", marker=_MARK[state], mfc=colormaps[SCORE_COLOURS](0.8), label=label, **look
+                )
             )
     target = prediction.seen.points_m[prediction.seen.on_target]
     axes.scatter(target[:, 0], target[:, 1], s=3, c=TARGET.colour, lw=0, zorder=4)
@@ -96,9 +104,9 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
         legend.append(axes.scatter(*eyes.T, marker=marker, label=CAMERA.words, zorder=6, **camera))
     if prediction.best is not None:
         xy, yaw = prediction.base_xy_m[prediction.best], prediction.yaw_rad[prediction.best]
-        radius_m = prediction.robot.base_radius_m
-        axes.add_patch(Circle(tuple(xy), radius_m, fc="none", ec="black", lw=5, zorder=7))
-        axes.add_patch(Circle(tuple(xy), radius_m, fc="none", ec=BEST.colour, lw=3, zorder=7))
+        outline = prediction.robot.outline.outline(xy, float(yaw))
+        axes.add_patch(Polygon(outline, fc="none", ec="black", lw=5, zorder=7))
+        axes.add_patch(Polygon(outline, fc="none", ec=BEST.colour, lw=3, zorder=7))
         tip = xy + 0.38 * np.array([np.cos(yaw), np.sin(yaw)])
         arrow = {"arrowstyle": "-|>", "color": BEST.colour, "lw": 3, "mutation_scale": 22}
         axes.annotate("", tuple(tip), tuple(xy), arrowprops=arrow, zorder=8)
@@ -106,6 +114,10 @@ def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
         legend.append(
             Line2D([], [], ls="", marker="o", ms=11, mfc="none", mec=BEST.colour, mew=3, label="best")
         )
+    if (nominal := prediction.choice.nominal) not in (None, prediction.best):
+        xy = prediction.base_xy_m[nominal]
+        axes.plot(*xy, "D", color="white", mec="black", ms=8, zorder=9)
+        legend.append(Line2D([], [], ls="", marker="D", ms=8, mfc="white", mec="black", label="best score"))
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
     axes.set_aspect("equal")
     axes.set(xlabel="x [m]", ylabel="y [m]", title="from above")
@@ -118,7 +130,7 @@ def _draw_perspective(axes: Any, prediction: Prediction) -> None:
     rows = shown_rows(prediction, _MOST_POINTS, half)
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.computed_zorder = False
-    drawn = np.flatnonzero(prediction.cells.state != STATES.index(BLOCKED))
+    drawn = np.flatnonzero(np.isin(prediction.cells.state, [STATES.index(CLEAR), STATES.index(UNSEEN)]))
     tiles = [_square(xy, 0.92 * _side_m(prediction)) for xy in prediction.base_xy_m[drawn]]
     faces = colormaps[SCORE_COLOURS](prediction.score[drawn], alpha=0.85)
     if tiles:
@@ -141,15 +153,17 @@ def _draw_perspective(axes: Any, prediction: Prediction) -> None:
 
 
 def robot_lines(prediction: Prediction, row: int) -> list[F64]:
-    """Lines (K, 3) of the robot at a base pose: base and mount as circles, heading, and the camera's mast."""
+    """Lines (K, 3) of the robot at a base pose: outline at two heights, heading, and the camera's mast."""
     (x, y), yaw = prediction.base_xy_m[row], float(prediction.yaw_rad[row])
-    angle = np.linspace(0, 2 * np.pi, 49) + yaw
-    radius_m = prediction.robot.base_radius_m
-    ring = np.column_stack([x + radius_m * np.cos(angle), y + radius_m * np.sin(angle)])
+    ring = prediction.robot.outline.outline(np.array([x, y]), yaw)
+    ring = np.concatenate([ring, ring[:1]])
     mount, top = prediction.robot.base_height_m, prediction.robot.camera_height_m
     return [
-        *(np.column_stack([ring, np.full(49, z)]) for z in (0.01, mount)),
-        *(np.array([[*ring[k], 0.01], [*ring[k], mount]]) for k in range(0, 48, 8)),
+        *(np.column_stack([ring, np.full(len(ring), z)]) for z in (0.01, mount)),
+        *(
+            np.array([[*ring[k], 0.01], [*ring[k], mount]])
+            for k in range(0, len(ring) - 1, max(1, len(ring) // 6))
+        ),
         np.array([[x, y, 0.01], [x, y, max(top, mount)]]),
         np.array([[x, y, mount], [x + 0.35 * np.cos(yaw), y + 0.35 * np.sin(yaw), mount]]),
     ]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
+from datagen.train.arrivals import Arrival
 from datagen.train.inputs import F64, I64, Array, Batch, CandidateInputs, Clouds, RobotInputs
 from datagen.train.prediction.base_cells import (
     BLOCKED,
@@ -20,7 +21,9 @@ from datagen.train.prediction.base_cells import (
     RobotSize,
     observe_cells,
     seen_share,
+    yaws_to_target,
 )
+from datagen.train.prediction.choice import Choice, choose
 from datagen.train.prediction.frames import SensorFrame, image_frame
 from datagen.train.prediction.fusing import SeenPoints, crop_cloud, fuse, join_target
 from datagen.train.prediction.ground import Ground, find_ground
@@ -49,8 +52,14 @@ class Prediction:
     cloud: Cloud
     cells: BaseCells
     score: F64  # (N,)
-    best: int | None  # the best of those that may be chosen; None where there is none
+    choice: Choice
+    arrival: Arrival | None
     notes: tuple[str, ...]
+
+    @property
+    def best(self) -> int | None:
+        """Row of the best of those that may be chosen; None where there is none."""
+        return self.choice.best
 
     @property
     def center_m(self) -> F64:
@@ -65,8 +74,7 @@ class Prediction:
     @property
     def yaw_rad(self) -> F64:
         """Headings (N,) that face the target, counter-clockwise from x."""
-        x, y = -self.cells.offset_m.astype(np.float64).T
-        return np.arctan2(y, x)
+        return yaws_to_target(self.cells.offset_m)
 
     def T_world_base(self, row: int) -> F64:
         """Pose (4, 4) of the arm's mount at one base pose: at base height, x towards the target."""
@@ -110,7 +118,8 @@ class Prediction:
     def sure(self) -> str:
         """Confidence in the answer, as text."""
         if self.best is None:
-            return "no answer: no clear base pose was observed around the target"
+            hint = "; unseen ones are left, show their floor in more frames" if len(self.rows(UNSEEN)) else ""
+            return f"no answer: no clear base pose was observed around the target{hint}"
         score, thin = float(self.score[self.best]), self.target_points < _CROP.min_target_points
         if score < _LIKELY:
             unseen = self.rows(UNSEEN)
@@ -119,7 +128,7 @@ class Prediction:
                 "; some whose floor is not visible score higher" if better else ""
             )
         if self.cells.state[self.best] == STATES.index(UNSEEN):
-            return "good if the floor there is free, which is not visible"
+            return "good if the floor there and on the way is free, which is not visible"
         doubt = any(ground.doubt is not None for ground in self.grounds)
         if score < _SURE or thin or doubt or self.crop_seen < 0.1:
             return "likely: " + (
@@ -138,7 +147,25 @@ _CROP = ObservationParams()
 
 
 def load_scorer(checkpoint: str | Path) -> ModelScorer:
-    """A checkpoint's model, ready to predict. InputError for what is no checkpoint."""
+    """The model of a checkpoint, ready to predict many frames: `datagen.predict` accepts it as `checkpoint`.
+
+    Args:
+        checkpoint: Checkpoint of `datagen train`.
+
+    Returns:
+        A scorer with `name`, `threshold` and `score(batch)`.
+
+    Raises:
+        InputError: The file is no checkpoint.
+
+    Example:
+        >>> scorer = datagen.load_scorer(checkpoint)
+        >>> answers = [
+        ...     datagen.predict(scorer, frame=[each], base_height=0.7, reach=0.9) for each in [frame, frame]
+        ... ]
+        >>> len(answers)
+        2
+    """
     # Imported here: frames are read and refused without torch.
     from datagen.train.training.checkpoints import load_model
 
@@ -156,6 +183,7 @@ def predict(
     click: tuple[int, int] | None = None,
     target_center_m: F64 | None = None,
     allow_unseen: bool = False,
+    arrival: Arrival | None = None,
     grid: int = 25,
     half_width_m: float = 1.0,
     seed: int = 0,
@@ -165,7 +193,8 @@ def predict(
     Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
     `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
     The target is told by masks, by one click into the first frame, or by a cloud's own marks;
-    `target_center_m` (3,), world, replaces the estimated centre. InputError for what does not suffice.
+    `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
+    with the highest expected success. InputError for what does not suffice.
     """
     grounds = _grounds(frames, camera_height_m, gravity)
     frames = _with_target(frames, grounds, click)
@@ -181,12 +210,14 @@ def predict(
         target = replace(target, center_m=(x, y, z), how="given")
     centre = np.array(target.center_m)
     cloud = crop_cloud(seen, centre, _CROP, np.random.default_rng(seed))
-    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m))
+    yaw_rad = 0.0 if arrival is None else arrival.yaw_std_rad
+    cells = observe_cells(seen, centre, robot, _grid(grid, half_width_m), yaw_rad)
     score = scored(scorer, _batch(cloud, target, robot, cells))
-    best = _best(score, cells, (CLEAR, UNSEEN) if allow_unseen else (CLEAR,))
+    allowed = (CLEAR, UNSEEN) if allow_unseen else (CLEAR,)
+    choice = choose(score, cells, allowed, scorer.threshold, arrival)
     notes = _notes(grounds, filled, cloud)
     given = (scorer.name, robot, tuple(frames), tuple(grounds))
-    return Prediction(*given, seen, target, filled, cloud, cells, score, best, notes)
+    return Prediction(*given, seen, target, filled, cloud, cells, score, choice, arrival, notes)
 
 
 def _grounds(
@@ -264,17 +295,17 @@ def _batch(cloud: Cloud, target: TargetBox, robot: RobotSize, cells: BaseCells) 
             one(target.center_m[2]),
             one(target.radius_m),
         ),
-        RobotInputs(np.zeros(1, np.int64), *map(one, astuple(robot))),
+        RobotInputs(
+            np.zeros(1, np.int64),
+            one(robot.camera_height_m),
+            one(robot.base_height_m),
+            one(robot.arm_reach_m),
+        ),
         CandidateInputs(np.zeros(n, np.int64), cells.offset_m),
         np.zeros(n, np.int64),
         np.zeros((n, 16), np.uint8),
         {"base_is_clear": cells.state != STATES.index(BLOCKED)},
     )
-
-
-def _best(score: F64, cells: BaseCells, allowed: Sequence[str]) -> int | None:
-    rows = np.flatnonzero(np.isin(cells.state, [STATES.index(name) for name in allowed]))
-    return int(rows[np.argmax(score[rows])]) if len(rows) else None
 
 
 def _notes(grounds: Sequence[Ground], filled: Filled | None, cloud: Cloud) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.train.prediction.base_cells import STATES
+from datagen.train.prediction.base_cells import SEEN_SHARE, STATES
+from datagen.train.prediction.floor_ways import WAYS
 from datagen.train.prediction.predict import Prediction
 
 _OWN_AXES = (
@@ -29,12 +30,15 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
         margin = "" if p.margin is None else f", {p.margin:.3f} above the 10th"
         pose = f"({x:.3f}, {y:.3f}) m, yaw {np.degrees(p.yaw_rad[p.best]):.1f} deg"
         lines[0] = ("best", f"{pose}, score {p.score[p.best]:.3f}{margin}")
+        lines += _arrival_lines(p)
     counts = [f"{len(p.rows(state))} {state}" for state in STATES]
     lines.append(("poses", ", ".join(counts)))
     unseen = p.rows("unseen")
     if len(unseen):
         x, y = p.base_xy_m[unseen[0]]
-        lines.append(("unseen", f"their best scores {p.score[unseen[0]]:.3f} at ({x:.3f}, {y:.3f}) m"))
+        hidden = int((p.cells.floor_seen[unseen] >= SEEN_SHARE).sum())
+        way = f"; of {hidden} only the way there is not visible" if hidden else ""
+        lines.append(("unseen", f"their best scores {p.score[unseen[0]]:.3f} at ({x:.3f}, {y:.3f}) m{way}"))
     x, y, z = p.target.center_m
     floor = p.grounds[0]
     residual = "not visible" if floor.residual_m is None else f"residual {1000 * floor.residual_m:.1f} mm"
@@ -46,11 +50,27 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
         (
             "robot",
             f"camera {robot.camera_height_m:.2f} m, mount {robot.base_height_m:.2f} m, "
-            f"reach {robot.arm_reach_m:.2f} m",
+            f"reach {robot.arm_reach_m:.2f} m, base {robot.outline}",
         ),
         ("world", _world_axes(p)),
     ]
     return lines + [("note", note) for note in p.notes]
+
+
+def _arrival_lines(p: Prediction) -> list[tuple[str, str]]:
+    """How far the best may be missed, and what an arrival error changed."""
+    lines = list[tuple[str, str]]()
+    expected, at = p.choice.expected, p.choice.nominal
+    if expected is not None and p.arrival is not None and p.best is not None and at is not None:
+        best, nominal = expected[p.best], expected[at]
+        text = f"{p.arrival.text}; expected success {best:.3f}"
+        if p.best != at:
+            x, y = p.base_xy_m[at]
+            text += f", and {nominal:.3f} at the best score, ({x:.3f}, {y:.3f}) m"
+        lines.append(("arrival", text))
+    if p.choice.miss_m is not None:
+        lines.append(("may miss", f"by {p.choice.miss_m:.2f} m in any direction with scores that stay good"))
+    return lines
 
 
 def document(prediction: Prediction) -> dict[str, Any]:
@@ -64,8 +84,15 @@ def document(prediction: Prediction) -> dict[str, Any]:
         "world": _world_axes(p),
         "best": None if p.best is None else _pose(p, p.best),
         "best_unseen": None if not len(rows := p.rows("unseen")) else _pose(p, int(rows[0])),
+        "best_score": None if (nominal := p.choice.nominal) is None else _pose(p, nominal),
+        "arrival": None if p.arrival is None else p.arrival.text,
+        "may_miss_m": p.choice.miss_m,
         "margin_to_10th": p.margin,
-        "robot": asdict(p.robot),
+        "robot": {
+            **{name: value for name, value in asdict(p.robot).items() if name != "footprint"},
+            "base_radius_m": p.robot.outline.radius_m,
+            "footprint_m": [list(corner) for corner in p.robot.outline.corners_m] or None,
+        },
         "target": {
             **asdict(p.target),
             "center_m": list(p.target.center_m),
@@ -95,6 +122,8 @@ def _candidate(p: Prediction, row: int) -> dict[str, Any]:
         "score": float(p.score[row]),
         "state": STATES[int(p.cells.state[row])],
         "floor_seen": float(p.cells.floor_seen[row]),
+        "way": WAYS[int(p.cells.way[row])],
+        "expected_success": None if p.choice.expected is None else float(p.choice.expected[row]),
     }
 
 

@@ -7,13 +7,15 @@ from scipy import ndimage
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, Bools
+from datagen.train.prediction.clicked_surface import refuse_surface
 from datagen.train.prediction.frames import RgbdImage
-from datagen.train.prediction.ground import depth_error_m
+from datagen.train.prediction.ground import depth_error_m, floor_points
 from datagen.train.prediction.target import from_nearest
 
 _GROWS_M = 0.24  # from the clicked point
 # Growth that comes so near to that distance has run out over a surface.
 _RAN_OUT, _ROUNDS = 0.95, 4
+_FEW_FAR = 0.01  # share of the region's pixels that may be so far
 _SUPPORT_AREA_M2 = 0.004  # less of a level surface is no support
 _BIN_M = 0.004
 
@@ -22,7 +24,8 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     """Mask (H, W) of the object at pixel (u, v), by region growing above its support.
 
     The region grows to neighbours of similar depth, above the largest level surface below the clicked point;
-    where it spreads over a higher surface, that surface is the support.
+    where it spreads over a higher surface, that surface is the support. InputError for a click on a wall, a
+    table or the floor, and for a region that grows into its surroundings.
     """
     h, w = image.depth_m.shape
     u, v = click
@@ -33,15 +36,32 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
         fix = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
         raise InputError("--click", f"{u},{v}", "has no depth", fix)
-    grid, facets = image.world_grid(T_world_camera), image.facets(T_world_camera)
+    # Beyond, nothing can be nearer than that to the point.
+    around_px = max(image.pinhole.fx_px, image.pinhole.fy_px) * _GROWS_M / max(depth_m[v, u] - _GROWS_M, 0.1)
+    n = int(around_px) + 16
+    left, top = max(u - n, 0), max(v - n, 0)
+    window = np.s_[top : v + n, left : u + n]
+    mask = np.zeros((h, w), np.bool_)
+    mask[window] = _grown(image.cut(left, top, u + n, v + n), (u - left, v - top), T_world_camera, click)
+    return mask
+
+
+def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked: tuple[int, int]) -> Bools:
+    """The mask of an image around pixel (u, v), which was `asked` in the whole one."""
+    (h, w), (u, v), depth_m = image.depth_m.shape, click, image.depth_m
+    facets, grid = image.facets(T_world_camera), image.world_grid(T_world_camera)
     seed = grid[v, u]
     far_m = np.linalg.norm(grid - seed, axis=2)
     around = (depth_m > 0) & (far_m < _GROWS_M)
     joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
     level = around & (grid[..., 2] < seed[2] - 0.003)
     allowed = grown = np.zeros((h, w), np.bool_)
-    for _ in range(_ROUNDS):
+    # Off the floor, above its support, and ends before the distance that it may grow.
+    on_floor = bool(floor_points(seed[None], T_world_camera[:3, 3])[0])
+    stands_out = not on_floor
+    for k in range(_ROUNDS):
         lowest_m = _above_support(grid, facets, level, seed)
+        stands_out &= k > 0 or seed[2] > lowest_m
         allowed = around & (grid[..., 2] > min(lowest_m, seed[2] - 1e-4))
         labels = np.zeros((h, w), np.int64)
         ndimage.label(allowed & joined, output=labels)
@@ -49,12 +69,34 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
         if not grown.any() or far_m[grown].max() < _RAN_OUT * _GROWS_M:
             break
         level = grown & (grid[..., 2] < seed[2] - 0.003)
+    else:
+        stands_out = False
+    if not stands_out:
+        refuse_surface(grid, facets, depth_m, joined, click, asked, _GROWS_M)
+    if on_floor:
+        fix = "Click higher on the target, or give --mask"
+        raise InputError("--click", f"{asked[0]},{asked[1]}", "lies on the floor", fix)
     grown[v, u] = True
     # What breaks left out at the rim is the target's where it is as near as the target beside it.
     rim = np.asarray(ndimage.binary_dilation(grown, iterations=2), np.bool_) & allowed
     step_m = np.abs(depth_m - from_nearest(depth_m, grown))
     filled = np.asarray(ndimage.binary_fill_holes(grown | (rim & (step_m < _step_m(depth_m)))), np.bool_)
-    return filled & (depth_m > 0)
+    mask = filled & (depth_m > 0)
+    _refuse_spread(grid, mask, far_m, asked)
+    return mask
+
+
+def _refuse_spread(grid: F64, mask: Bools, far_m: F64, asked: tuple[int, int]) -> None:
+    """InputError where the region is wider than any target, or runs on as far as it may grow."""
+    points = grid[mask]
+    x, y, z = np.ptp(points, axis=0)
+    size = f"{max(x, y):.2f} x {min(x, y):.2f} m wide and {z:.2f} m high"
+    far = int((far_m[mask] > _RAN_OUT * _GROWS_M).sum())
+    if far > _FEW_FAR * len(points):
+        problem = f"grows into its surroundings: a region {size}, {points[:, 2].mean():.2f} m above the floor"
+        raise InputError(
+            "--click", f"{asked[0]},{asked[1]}", problem, "Click on another pixel, or give --mask"
+        )
 
 
 def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:

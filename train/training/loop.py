@@ -15,11 +15,11 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from datagen.schemas.errors import InputError
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
+from datagen.train.rates import label_losses
 from datagen.train.tensors import to_torch
 from datagen.train.training.callbacks import TrainingCallback, TrainingStep
 from datagen.train.training.checkpoints import EpochRecord
@@ -115,7 +115,7 @@ def _step(
     given = to_torch(batch, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
         logits = logits_of(given.clouds, given.candidates, given.robots)
-    losses = functional.cross_entropy(logits.float(), given.label, reduction="none")
+    losses = label_losses(logits.float(), given)
     weights = training.class_weights[given.label]
     loss = (weights * losses).sum()
     hits = (logits.argmax(dim=1) == given.label).sum()

@@ -19,6 +19,8 @@ from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.label_versions import refuse_mixed_labels
 from datagen.train.models import Model, build_model
+from datagen.train.rates import rate_fields
+from datagen.train.run_parts import open_parts
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
 from datagen.train.training.callbacks import TensorBoardCallback, TrainingCallback, TrainingProgress
 from datagen.train.training.checkpoints import (
@@ -145,8 +147,10 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
     sizes: dict[str, Any] = {"scenes_per_batch": options.batch_scenes // ranks.world, "seed": options.seed}
     sizes["allow_incomplete"] = job.allow_incomplete
     drawn: dict[str, Any] = {"candidates_per_robot": options.candidates_per_robot, "augment": job.augment}
+    sizes["extra"] = _rate_fields(job, job.runs)
     if job.val_runs:
         train = SampleStream(job.runs, **sizes, **drawn, houses=HouseShare(options.house_share))
+        sizes["extra"] = _rate_fields(job, job.val_runs)
         val = SampleStream(job.val_runs, **sizes, shuffle=False)
     else:
         train, val = split_by_house(job.runs, options.house_share, **sizes, **drawn)
@@ -161,6 +165,10 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
     if val.n_scenes >= ranks.world:
         val.use_rank(ranks.rank, ranks.world)
     return train, val
+
+
+def _rate_fields(job: TrainingJob, runs: tuple[str, ...]) -> tuple[str, ...]:
+    return rate_fields(open_parts(runs, ["label"], job.allow_incomplete))
 
 
 def _refuse_other_labels(stage: str, stream: SampleStream) -> None:

@@ -13,6 +13,7 @@ from datagen.schemas.errors import InputError
 from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
 from datagen.train.inputs import Array, Batch
 from datagen.train.models import Model
+from datagen.train.rates import label_losses
 from datagen.train.tensors import to_torch
 from datagen.train.training.launching import Ranks
 
@@ -39,7 +40,7 @@ def validate(
             given = to_torch(batch, model.device)
             logits = model.score(given.clouds, given.candidates, given.robots).double()
             log_p = torch.log_softmax(logits, dim=1)
-            loss = -log_p.gather(1, given.label[:, None])[:, 0]
+            loss = label_losses(logits, given)
             rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss], dim=1)
             ids.append(batch.sample_id)
             columns.append(rows.cpu().numpy())

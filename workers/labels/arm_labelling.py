@@ -1,6 +1,7 @@
 """Plan and trials of one candidate, shared by the label sources `plan` and `sim`.
 
-base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here)
+base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here,
+   and where it is disturbed plans again from `repeats` poses where a robot arrived nearby)
 -> executed in physics once, or `repeats` times where a robot arrived nearby   (`sim`)
 """
 
@@ -146,13 +147,43 @@ def try_candidate(
     planning, clock = at.planning, at.clock
     with clock.stage("plan"):
         report = plan_candidate(planning, T_world_base, rng)
-    if report.plan is None or at.arm.trial is None:
-        return CandidateTrial(report.outcome, report, report.plan)
     disturbances = disturbances_of(at, index, spec)
+    if at.arm.trial is None:
+        return _plan_arrivals(at, T_world_base, report, disturbances, candidates, row, spec, rng)
+    if report.plan is None:
+        return CandidateTrial(report.outcome, report)
     if disturbances:
         fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
         return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
+
+
+def _plan_arrivals(
+    at: ArmInScene,
+    T_world_base: F64,
+    report: PlanReport,
+    disturbances: list[Disturbance],
+    candidates: SceneCandidates,
+    row: int,
+    spec: Specification,
+    rng: np.random.Generator,
+) -> CandidateTrial:
+    """Plan again from where each disturbance lets the robot arrive; the label stays that of the candidate.
+
+    Candidates without a plan are planned from too: a robot that misses them may succeed.
+    """
+    if not disturbances:
+        return CandidateTrial(
+            report.outcome, report, report.plan, successes=int(report.plan is not None), trials=1
+        )
+    fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
+    successes = 0
+    with at.clock.stage("plan"):
+        for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
+            if does_fit:
+                found = plan_candidate(at.planning, T_world_base @ disturbance.T_base_moved, rng)
+                successes += found.plan is not None
+    return CandidateTrial(report.outcome, report, report.plan, successes=successes, trials=len(disturbances))
 
 
 def _attempt(

@@ -62,6 +62,8 @@ def label_with_trials(
         "q_grasp_rad": np.zeros((n, 7), np.float32),
         "path_length_rad": np.zeros(n, np.float32),
         "path_clearance_m": np.zeros(n, np.float32),
+        "trials": np.zeros(n, np.int16),
+        "successes": np.zeros(n, np.int16),
     }
     arms: dict[tuple[float, float], ArmInScene] = {}
     trials: list[CandidateTrial] = []
@@ -80,6 +82,7 @@ def label_with_trials(
 
 def _write(columns: Columns, k: int, trial: CandidateTrial) -> None:
     columns["outcome"][k] = _CODES[trial.outcome]
+    columns["trials"][k], columns["successes"][k] = trial.trials, trial.successes
     if trial.report is not None:
         columns["grasps_free"][k] = trial.report.grasps_free
         columns["grasps_tried"][k] = trial.report.grasps_tried

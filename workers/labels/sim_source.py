@@ -35,8 +35,6 @@ def label(
     columns |= {
         "attempts": column("int16", [len(t.results) for t in trials]),
         "retry_outcome": column("uint8", [_RETRY_CODES[t.retry_outcome or "none"] for t in trials]),
-        "trials": column("int16", [t.trials for t in trials]),
-        "successes": column("int16", [t.successes for t in trials]),
         "lift_m": column("float32", [t.results[-1].lift_m if t.results else 0.0 for t in trials]),
         "slip_m": column("float32", [t.results[-1].slip_m if t.results else 0.0 for t in trials]),
         "disturbed_m": column("float32", [t.results[-1].disturbed_m if t.results else 0.0 for t in trials]),

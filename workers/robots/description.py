@@ -18,6 +18,8 @@ class RobotLimits:
     reach_m: tuple[float, float]
     base_height_m: tuple[float, float] | None  # None: a pedestal of any height
     base_radius_m: float | None  # of its own mobile base; None stands on a pedestal
+    # Corners (x, y) of its base's outline in the base frame: origin below the mount, x to the front.
+    footprint_m: tuple[tuple[float, float], ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,19 @@ _FOLDS = tuple(
     (fold, tuple(s * q for s, q in zip((-1, 1, -1, 1, -1, 1, -1), fold, strict=True))) for fold in _LEFT_FOLDS
 )
 
+# Half of the outline of base_link_collision.STL around shoulder_pan_joint, which lies 0.03265 m ahead of the
+# base's middle: the sixteen sides that hold its hull, corners rounded outwards to millimetres.
+_LEFT_OUTLINE_M = (
+    (0.254, 0.058),
+    (0.210, 0.163),
+    (0.135, 0.239),
+    (0.073, 0.265),
+    (-0.139, 0.265),
+    (-0.201, 0.239),
+    (-0.277, 0.164),
+    (-0.320, 0.059),
+)
+
 FETCH = RobotDescription(
     name="fetch",
     urdf="fetch/fetch.urdf",
@@ -57,6 +70,7 @@ FETCH = RobotDescription(
         base_height_m=(0.727, 1.112),
         # Of the base's hull around shoulder_pan_joint's axis, which is not its middle.
         base_radius_m=0.32,
+        footprint_m=_LEFT_OUTLINE_M + tuple((x, -y) for x, y in reversed(_LEFT_OUTLINE_M)),
     ),
     # torso_lift_joint and shoulder_pan_joint, 0.37743 + 0.34858 m; base_link stands on the floor.
     lift=TorsoLift(joint="torso_lift_joint", mount_at_zero_m=0.72601),

@@ -49,6 +49,7 @@ def completed(
 def test_each_label_source_gets_the_sections_it_has() -> None:
     assert completed("heuristic") is None
     assert completed("plan") == ArmParams()
+    assert completed("plan", repeats=3) == ArmParams(disturbance=DisturbanceParams(repeats=3))
     assert completed("sim") == ArmParams(trial=TrialParams())
     assert completed("sim", repeats=3) == ArmParams(
         trial=TrialParams(), disturbance=DisturbanceParams(repeats=3)
@@ -70,8 +71,6 @@ def test_the_option_wins_over_the_file_and_the_file_over_the_default() -> None:
     [
         ("heuristic", {"arm": {}}, None, ["run.toml", "arm", "heuristic has no arm"]),
         ("plan", {"arm": {"trial": {}}}, None, ["run.toml", "arm.trial", "submit sim"]),
-        ("plan", {"arm": {"disturbance": {}}}, None, ["run.toml", "arm.disturbance", "submit sim"]),
-        ("plan", {}, 3, ["--perturb", "plan"]),
         ("heuristic", {}, 3, ["--perturb", "heuristic"]),
         ("sim", {}, 0, ["--perturb: 0:", "greater than or equal to 1"]),
         ("sim", {}, -1, ["--perturb: -1:", "greater than or equal to 1"]),

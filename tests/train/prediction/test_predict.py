@@ -196,7 +196,7 @@ def test_cell_states_agree_with_the_house(seen: Seen, scorer: ModelScorer) -> No
         answer.base_xy_m.astype(np.float32),
         np.full(n, ROBOT.base_height_m, np.float32),
         np.full(n, ROBOT.camera_height_m, np.float32),
-        np.full(n, ROBOT.base_radius_m),
+        np.full(n, ROBOT.outline.radius_m),
         seen.scene.house.obstacles,
         CandidateParams().mast_radius_m,
     )

@@ -168,6 +168,19 @@ def test_repeats_are_counted(labelled: dict[str, Any]) -> None:
     np.testing.assert_array_equal(columns["label"] == 1, planned & good)
 
 
+def test_plans_from_arrivals_are_counted_and_leave_the_label(labelled: dict[str, Any]) -> None:
+    at, wild = scene(), DisturbanceParams(repeats=4, base_position_std_m=0.15)
+    plan = load_label_source("plan").label(at, candidates(at), specification(disturbance=wild), StageClock())
+    calm = labelled["plan"]
+    for name in calm.keys() - {"trials", "successes"}:
+        np.testing.assert_array_equal(plan[name], calm[name], err_msg=name)
+    np.testing.assert_array_equal(calm["successes"], calm["label"])
+    assert (calm["trials"] <= 1).all() and (calm["successes"] <= calm["trials"]).all()
+    np.testing.assert_array_equal(plan["trials"], 4 * calm["trials"])
+    good = calm["label"] == 1
+    assert 0 < plan["successes"][good].sum() < plan["trials"][good].sum()
+
+
 def test_a_robot_plans_from_where_it_arrives(labelled: dict[str, Any]) -> None:
     at = scene()
     near = DisturbanceParams(

@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 pytest.importorskip("pinocchio", reason="pinocchio cannot be imported here: run `datagen doctor`")
 
+from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.geometry.transforms import inverse
 from datagen.workers.robots import open_robot
 from datagen.workers.robots.description import RobotDescription, robots_folder
@@ -51,7 +52,11 @@ def test_fetch() -> None:
     np.testing.assert_allclose(FETCH.T_flange_palm, tree.joint("gripper_axis").T_parent_child)
     points, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/base_link_collision.STL")
     offset = (torso.T_parent_child @ mount.T_parent_child)[:2, 3]
-    assert np.hypot(*(points[:, :2] - offset).T).max() <= FETCH.limits.base_radius_m
+    outline = points[:, :2] - offset
+    assert np.hypot(*outline.T).max() <= FETCH.limits.base_radius_m
+    footprint = np.array(FETCH.limits.footprint_m)
+    assert inside_polygon(outline.astype(np.float64), footprint).all()
+    assert ConvexHull(footprint).volume < 1.02 * ConvexHull(outline).volume  # the area of a planar hull
     finger, _ = read_points(robots_folder() / "fetch/fetch_description/meshes/r_gripper_finger_link.STL")
     np.testing.assert_allclose(FETCH.hand.pad_size_m, np.ptp(finger, axis=0)[[2, 0]], atol=1e-3)
     # The wheels lie within the base's outline; their treads dip into the floor.

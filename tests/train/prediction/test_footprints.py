@@ -1,0 +1,66 @@
+"""Outlines of bases: what lies in them, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datagen.schemas.errors import InputError
+from datagen.train.prediction.footprints import Footprint, circle_footprint, polygon_footprint, read_footprint
+
+LONG = ((0.2, 0.1), (-0.6, 0.1), (-0.6, -0.1), (0.2, -0.1))
+
+
+def test_a_polygon_holds_points_of_its_own_frame() -> None:
+    base = polygon_footprint(LONG)
+    points = np.array([[0.19, 0.0], [-0.59, 0.09], [0.21, 0.0], [0.0, 0.11]])
+    assert base.holds(points).tolist() == [True, True, False, False]
+    np.testing.assert_allclose(base.middle_m, [-0.2, 0.0])
+    assert base.radius_m == pytest.approx(np.hypot(0.6, 0.1))
+    assert base.turning_radius_m == pytest.approx(np.hypot(0.4, 0.1))
+    assert base.width_m == pytest.approx(0.1)
+
+
+def test_an_outline_turns_with_the_base() -> None:
+    turned = polygon_footprint(LONG).outline(np.array([1.0, 2.0]), np.pi / 2)
+    np.testing.assert_allclose(turned[1], [1 - 0.1, 2 - 0.6], atol=1e-12)
+
+
+def test_a_notch_is_outside() -> None:
+    notched = polygon_footprint(
+        [(0.3, 0.3), (-0.3, 0.3), (-0.3, -0.3), (0.3, -0.3), (0.3, -0.1), (0.1, 0.0), (0.3, 0.1)]
+    )
+    assert notched.holds(np.array([[0.25, 0.0], [0.25, 0.2], [-0.2, 0.0]])).tolist() == [False, True, True]
+
+
+def test_texts_and_robots() -> None:
+    assert read_footprint("0.3") == read_footprint(0.3) == circle_footprint(0.3)
+    assert (
+        read_footprint("0.2,0.1;-0.6,0.1;-0.6,-0.1;0.2,-0.1")
+        == read_footprint(LONG)
+        == polygon_footprint(LONG)
+    )
+    fetch = read_footprint("fetch")
+    assert 0.31 < fetch.radius_m < 0.33 and fetch.middle_m[0] == pytest.approx(-0.033, abs=2e-3)
+    assert isinstance(fetch, Footprint) and read_footprint(fetch) is fetch
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("0", "radius"),
+        ("nan", "radius"),
+        ("9", "radius"),
+        ("wide", "not a footprint"),
+        ("panda", "pedestal"),
+        ("0.1,0.1;0.2,0.2", "3 to 256 corners"),
+        ("0.1,0.1;0.2;0.3,0.3", "3 to 256 corners"),
+        ("30,20;-30,20;-30,-20;30,-20", "farther than"),
+        ("0.3,0.2;-0.3,-0.2;0.3,-0.2;-0.3,0.2", "crosses itself"),
+        ("0.3,0;-0.3,0;0.1,0", "no area"),
+        ("0.3,0.2;0.1,0.2;0.1,-0.2;0.3,-0.2", "hold the arm's mount"),
+    ],
+)
+def test_what_is_no_base_is_refused(given: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_footprint(given)

@@ -1,0 +1,184 @@
+"""Arrival error: where a robot stands when it was sent to a base pose, and what that leaves of a score map.
+
+Source of the preset `nav2`: SimpleGoalChecker of Nav2 ends a drive within xy_goal_tolerance 0.25 m and
+yaw_goal_tolerance 0.25 rad by default
+(docs.nav2.org/configuration/packages/nav2_controller-plugins/simple_goal_checker.html).
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+from scipy.special import ndtri
+
+from datagen.schemas.errors import InputError
+from datagen.schemas.untrusted_files import read_regular
+from datagen.train.inputs import F64, Bools
+
+_RINGS, _ANGLES = 8, 16
+_LARGEST_M = 2.0
+_MOST_BYTES, _LEAST_ROWS, _MOST_ROWS = 10_000_000, 10, 100_000
+_USED_ROWS = 1000  # of a file of samples, evenly
+_FIX = (
+    "Give normal:0.05 (m), normal:0.05,3deg, disc:0.25, nav2 or a CSV file with columns x_m, y_m[, yaw_rad]"
+)
+_TOLERANCE_STEP_M, _TOLERANCE_MOST_M = 0.01, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """Equally likely errors (K, 3) at the goal: x ahead and y to the left (m), and yaw (rad)."""
+
+    text: str
+    offsets: F64  # (K, 3)
+    is_round: bool  # alike in all directions, so that the goal's heading does not matter
+
+    @property
+    def yaw_std_rad(self) -> float:
+        """Root mean square of the yaw errors."""
+        return float(np.sqrt(np.mean(self.offsets[:, 2] ** 2)))
+
+
+def normal_arrival(std_m: float, yaw_std_rad: float = 0.0) -> Arrival:
+    """Normal errors, with one standard deviation along x and y."""
+    ring = std_m * np.sqrt(-2 * np.log1p(-_shares()))
+    yaw = f", {math.degrees(yaw_std_rad):.3g} deg" if yaw_std_rad else ""
+    return Arrival(f"normal, {std_m:g} m{yaw}", _round(ring, yaw_std_rad * ndtri(_yaw_shares())), True)
+
+
+def disc_arrival(radius_m: float, yaw_rad: float = 0.0) -> Arrival:
+    """Uniform errors in a disc, and uniform yaw errors up to `yaw_rad`."""
+    yaw = f", {math.degrees(yaw_rad):.3g} deg" if yaw_rad else ""
+    text = f"uniform within {radius_m:g} m{yaw}"
+    return Arrival(text, _round(radius_m * np.sqrt(_shares()), yaw_rad * (2 * _yaw_shares() - 1)), True)
+
+
+def ring_arrival(distance_m: float) -> Arrival:
+    """Errors of exactly this distance in all directions."""
+    return Arrival(f"{distance_m:g} m off", _round(np.array([distance_m]), np.zeros(_ANGLES)), True)
+
+
+def read_arrival(given: str) -> Arrival:
+    """The arrival error of normal:STD[,YAW], disc:RADIUS[,YAW], nav2, or a CSV file; yaw as 3deg or in rad.
+
+    InputError for anything else.
+    """
+    if given == "nav2":
+        return disc_arrival(0.25, 0.25)
+    kind, _, numbers = given.partition(":")
+    if kind not in ("normal", "disc") or not numbers:
+        return _read_samples(Path(given))
+    found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(?:,\s*([0-9.eE+-]+)\s*(deg)?\s*)?", numbers, re.ASCII)
+    try:
+        size_m, yaw = (float(found[1]), float(found[2] or 0)) if found else (math.nan, math.nan)
+    except ValueError:
+        size_m = yaw = math.nan
+    yaw_rad = math.radians(yaw) if found and found[3] else yaw
+    if not (0 <= size_m <= _LARGEST_M and 0 <= yaw_rad <= math.pi):
+        problem = f"is not a length from 0 to {_LARGEST_M:g} m and an angle"
+        raise InputError("--arrival", given[:60], problem, _FIX)
+    return normal_arrival(size_m, yaw_rad) if kind == "normal" else disc_arrival(size_m, yaw_rad)
+
+
+def arrival_of(arrival: str | None, arrival_std: str | None) -> Arrival | None:
+    """The arrival error of the options --arrival and --arrival-std; None without them."""
+    if arrival is not None and arrival_std is not None:
+        raise InputError("--arrival-std", arrival_std[:60], "is given with --arrival", "Give one of the two")
+    if arrival_std is not None:
+        return read_arrival(f"normal:{arrival_std}")
+    return None if arrival is None else read_arrival(arrival)
+
+
+def _read_samples(path: Path) -> Arrival:
+    if not path.is_file():
+        raise InputError("--arrival", str(path)[:60], "is neither a distribution nor a file", _FIX)
+    text = read_regular(path, _MOST_BYTES, _FIX).decode("utf-8", errors="replace")
+    lines = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
+    heads = [head.strip() for head in lines[0]] if lines else []
+    fix = "Give a header x_m,y_m,yaw_rad and one arrival a line: ahead of and left of the goal, and its turn"
+    if heads not in (["x_m", "y_m"], ["x_m", "y_m", "yaw_rad"]):
+        raise InputError(path, "header", f"is {','.join(heads)[:60]!r}", fix)
+    if not _LEAST_ROWS <= len(lines) - 1 <= _MOST_ROWS:
+        problem = f"are {len(lines) - 1}, not {_LEAST_ROWS} to {_MOST_ROWS:,}"
+        raise InputError(path, "arrivals", problem, "Record more arrivals, or cut the file")
+    rows = list[list[float]]()
+    for k, line in enumerate(lines[1:], start=2):
+        try:
+            row = [float(cell) for cell in line]
+        except ValueError:
+            row = []
+        sound = len(row) == len(heads) and all(math.isfinite(value) for value in row)
+        if not sound or math.hypot(*row[:2]) > _LARGEST_M or abs(row[-1]) > math.pi:
+            problem = f"is not {len(heads)} numbers within {_LARGEST_M:g} m and half a turn"
+            raise InputError(path, f"row {k}", problem, fix)
+        rows.append([*row, 0.0][:3])
+    samples = np.array(rows)[np.linspace(0, len(rows) - 1, min(len(rows), _USED_ROWS)).astype(np.int64)]
+    return Arrival(f"{len(rows):,} arrivals of {path.name}", samples, False)
+
+
+def _shares() -> F64:
+    return (np.arange(_RINGS) + 0.5) / _RINGS
+
+
+def _yaw_shares() -> F64:
+    # In an order that has nothing to do with the directions.
+    return (np.arange(_ANGLES) * 7 % _ANGLES + 0.5) / _ANGLES
+
+
+def _round(rings_m: F64, yaws_rad: F64) -> F64:
+    """Errors (rings * _ANGLES, 3): each ring in all directions, every second one turned by half a step."""
+    step = 2 * np.pi / _ANGLES
+    angle = step * (np.arange(_ANGLES) + 0.5 * (np.arange(len(rings_m)) % 2)[:, None])
+    x, y = rings_m[:, None] * np.cos(angle), rings_m[:, None] * np.sin(angle)
+    return np.stack([x, y, np.broadcast_to(yaws_rad, x.shape)], axis=2).reshape(-1, 3)
+
+
+def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
+    """Mean of a map (Y, X) over where a robot arrives that is sent to each of its cells.
+
+    Rows of the map go along y and columns along x, `step_m` apart, with the target in the middle, which the
+    goals face. Between cells the map is bilinear; beyond it nothing succeeds.
+    """
+    dx, dy = arrival.offsets[:, 0] / step_m, arrival.offsets[:, 1] / step_m
+    if arrival.is_round:
+        n = int(np.ceil(max(np.abs(dx).max(), np.abs(dy).max()))) + 1
+        kernel = np.zeros((2 * n + 1, 2 * n + 1))
+        x, y = np.floor(dx).astype(int), np.floor(dy).astype(int)
+        for across, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            weight = np.abs(1 - across - (dx - x)) * np.abs(1 - up - (dy - y))
+            np.add.at(kernel, (y + up + n, x + across + n), weight / len(dx))
+        return np.asarray(ndimage.correlate(value, kernel, mode="constant"), np.float64)
+    cells: F64 = np.indices(value.shape).astype(np.float64)
+    rows, columns = cells[0], cells[1]
+    middle = (np.array(value.shape) - 1) / 2
+    yaw: F64 = np.arctan2(middle[0] - rows, middle[1] - columns)[..., None]
+    x = columns[..., None] + np.cos(yaw) * dx - np.sin(yaw) * dy
+    y = rows[..., None] + np.sin(yaw) * dx + np.cos(yaw) * dy
+    return np.asarray(ndimage.map_coordinates(value, [y, x], order=1, mode="constant"), np.float64).mean(
+        axis=2
+    )
+
+
+def tolerance_m(value: F64, step_m: float, cell: tuple[int, int], least: float) -> float:
+    """How far a robot may miss a cell (row, column) in any direction with the map (Y, X) at `least` or above.
+
+    Between cells the map is bilinear; in steps of 1 cm, at most 0.5 m.
+    """
+    far_m = np.arange(0.0, _TOLERANCE_MOST_M + 1e-9, _TOLERANCE_STEP_M)
+    angle = np.linspace(0, 2 * np.pi, 4 * _ANGLES, endpoint=False)
+    y = cell[0] + far_m[:, None] * np.sin(angle) / step_m
+    x = cell[1] + far_m[:, None] * np.cos(angle) / step_m
+    found = ndimage.map_coordinates(value, [y, x], order=1, mode="constant")
+    bad = np.flatnonzero(found.min(axis=1) < least - 1e-9)
+    return float(far_m[max(bad[0] - 1, 0)] if len(bad) else far_m[-1])
+
+
+def stands(value: F64, can_stand: Bools) -> F64:
+    """The map with 0 where the base does not or may not fit: an arrival there fails."""
+    return np.where(can_stand, value, 0.0)

@@ -1,0 +1,44 @@
+"""Learn from success rates: where trials were repeated, the loss is the binomial likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from datagen.schemas.fields import sized_schema
+from datagen.train.inputs import Batch
+from datagen.train.run_parts import RunPart
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+RATE_FIELDS = ("trials", "successes")
+
+
+def rate_fields(parts: Sequence[RunPart]) -> tuple[str, ...]:
+    """`RATE_FIELDS` where labels of a run are disturbed and all runs hold them; else none: labels count."""
+    disturbed = any(spec.arm is not None and spec.arm.disturbance for part in parts for spec in part.specs)
+    held = all(
+        set(RATE_FIELDS)
+        <= {field.name for field in sized_schema(part.schema, spec, part.schema_version).sample_fields}
+        for part in parts
+        for spec in part.specs
+    )
+    return RATE_FIELDS if disturbed and held else ()
+
+
+def label_losses(logits: Tensor, batch: Batch[Tensor]) -> Tensor:
+    """Losses (N,) of logits (N, 2): cross-entropy with the label, or with the share of successful trials.
+
+    The latter is the negative log-likelihood of a binomial number of successes, without its constant, for
+    each trial. A candidate without a trial keeps its label.
+    """
+    import torch
+    from torch.nn import functional
+
+    if "trials" not in batch.extra:
+        return functional.cross_entropy(logits, batch.label, reduction="none")
+    trials, successes = (batch.extra[name].to(logits.dtype) for name in RATE_FIELDS)
+    rate = torch.where(trials > 0, successes / trials.clamp(min=1), batch.label.to(logits.dtype))
+    log_p = functional.log_softmax(logits, dim=1)
+    return -(rate * log_p[:, 1] + (1 - rate) * log_p[:, 0])
