@@ -153,7 +153,7 @@ class GraspParams(_Frozen):
 class MotionParams(_Frozen):
     """The kinematic stage: IK, collisions, path, straight approach and lift."""
 
-    ik_seeds: int = Field(default=2, ge=1, le=100)
+    ik_seeds: int = Field(default=4, ge=1, le=100)
     pregrasp_m: float = Field(default=0.08, ge=0, le=0.5)
     lift_m: float = Field(default=0.10, ge=0.01, le=0.5)
     # Largest joint motion between neighbouring points of a straight line.

@@ -192,7 +192,8 @@ def _tried_poses(at: ArmInScene, trial: CandidateTrial, T_world_base: F64) -> tu
         around = surroundings(planning, T_world_base)
         kept = planning.around.kept
         T_base_tcp = np.matmul(inverse(T_world_base), planning.around.T_world_tcp[kept])
-        distance, seeds = planning.moving.table.nearest(T_base_tcp, planning.params.ik_seeds)
+        table = planning.moving.table
+        distance, seeds = table.distance(T_base_tcp), table.seeds(T_base_tcp, planning.params.ik_seeds)
         for k in np.argsort(distance, kind="stable").tolist():
             found = (robot.ik(T_base_tcp[k], seed) for seed in seeds[k])
             q = next((q for q in found if q is not None), None)

@@ -23,7 +23,8 @@ from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.scenes.scene import SettledScene
 
-VERSION = 2
+# 3: four seeds of inverse kinematics a grasp, which differ.
+VERSION = 3
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
 

@@ -79,6 +79,8 @@ def free_grasps(
     free = np.ones(len(T_world_tcp), np.bool_)
 
     def keep(T: F64, still: Placed, margin_m: float) -> None:
+        if len(still) == 0:
+            return
         rows = np.flatnonzero(free)
         free[rows[hits(hand.hulls, hand.poses(T[rows], opening_m[rows]), still, margin_m)]] = False
 

@@ -130,17 +130,17 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
             k, T = rows[start:end], T_base_tcp[start:end]
             near = _is_wrist_within_reach(prepared, T_base_world, T, table.limit_m).all(axis=0)
             k, T = k[near], T[near]
-            distance, seeds = table.nearest(T, prepared.params.ik_seeds)
-            nearest = _nearest_first(prepared, T_base_world, T, distance)
+            nearest = _nearest_first(prepared, T_base_world, T, table.distance(T))
             # The hand's way is looked at for few at a time: most candidates need no more.
             while left > 0 and (some := list(islice(nearest, _FILTERED_AT_ONCE))):
                 free = np.array(some)[prepared.around.is_free(k[some])][:left]
                 left -= len(free)
-                limits = _limits(prepared, T_base_world, T[free])
-                goals = list(map(_Goal, k[free].tolist(), T[free], seeds[free], limits))
-                while goals:
-                    yield goals[:batch]
-                    goals, batch = goals[batch:], min(2 * batch, _LARGEST_BATCH)
+                while len(free):
+                    now, free = np.split(free, [batch])
+                    seeds = table.seeds(T[now], prepared.params.ik_seeds)
+                    limits = _limits(prepared, T_base_world, T[now])
+                    yield list(map(_Goal, k[now].tolist(), T[now], seeds, limits))
+                    batch = min(2 * batch, _LARGEST_BATCH)
 
 
 def _nearest_first(

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from datagen.workers.geometry.mesh import F64
-from datagen.workers.motion.collision import Ints
 from datagen.workers.motion.forward_kinematics import ForwardKinematics
 from datagen.workers.robots.robot import Robot
 
@@ -19,7 +18,10 @@ _PROBES = 2048
 # Poses further from all samples than this share of reachable ones are not asked for.
 _QUANTILE = 0.97
 _LENGTHS_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions, in arm lengths
-_NOT_NEAREST = 0.3  # by how much seeds may be farther than the nearest: halves the time to find them
+_DETOUR = 1.0  # by how much a distance may be larger than that of the nearest: halves the time to find it
+_NOT_NEAREST = 0.3  # the same for seeds
+_PER_SEED = 6  # samples near a pose among which each of its seeds is chosen
+_APART_RAD = 1.0  # seeds with all joints nearer than this often lead to one solution
 _DIGITS = 6  # of an arm's numbers, in its own length: arms that are scaled copies share them
 
 
@@ -53,36 +55,41 @@ class ReachTable:
         """Wrists that are farther than this from all reachable ones are farther than the limit too."""
         return self.samples.limit * self.length_m
 
-    def nearest(self, T_base_tcp: F64, count: int) -> tuple[F64, F64]:
-        """Distances (G,) of the nearest sample, and the nearest `count` as seeds (G, count, A).
+    def distance(self, T_base_tcp: F64) -> F64:
+        """Distances (G,) of poses to a sample that may be `_DETOUR` farther than the nearest, in arm lengths.
 
-        Distances are in arm lengths. Beyond the limit they are infinite and seeds are of no use.
+        They are infinite beyond the limit, where inverse kinematics is not worth asking.
         """
-        distance, row, azimuth = self._query(T_base_tcp, count)
-        found, some = self.samples, np.flatnonzero(np.isfinite(distance[:, 0]))
-        row = np.where(np.isfinite(distance[some]), row[some], row[some, :1])
+        features, _ = self._features(T_base_tcp)
+        found = self.samples
+        return found.tree.query(features, eps=_DETOUR, distance_upper_bound=found.limit)[0]
+
+    def seeds(self, T_base_tcp: F64, count: int) -> F64:
+        """Joints (G, count, A) of samples near each pose that differ from each other.
+
+        The first is the nearest. Each further one is the next of the `_PER_SEED * count` nearest that differs
+        from those before by `_APART_RAD` in some joint, or where there is none the one that differs most.
+        """
+        features, azimuth = self._features(T_base_tcp)
+        found = self.samples
+        row = found.tree.query(features, k=list(range(1, _PER_SEED * count + 1)), eps=_NOT_NEAREST)[1]
         near = found.q_rad[row]
         if found.turns:
-            near[:, :, 0] += azimuth[some, None] - found.azimuth_rad[row]
+            near[:, :, 0] += azimuth[:, None] - found.azimuth_rad[row]
             near[:, :, 0] = (near[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
-        seeds = np.tile(self.lower_rad, (len(T_base_tcp), count, 1))
-        seeds[some] = np.clip(near, self.lower_rad, self.upper_rad)
-        return distance[:, 0], seeds
+        near = np.clip(near, self.lower_rad, self.upper_rad)
+        every, best = np.arange(len(near)), np.zeros(len(near), np.int64)
+        gap = np.full(near.shape[:2], np.inf)
+        seeds = np.empty((len(near), count, near.shape[2]))
+        for k in range(count):
+            seeds[:, k] = near[every, best]
+            gap = np.minimum(gap, np.abs(near - seeds[:, k, None]).max(axis=2))
+            best = np.minimum(gap, _APART_RAD).argmax(axis=1)
+        return seeds
 
-    def distance(self, T_base_tcp: F64) -> F64:
-        """Distances (G,) of the nearest sample alone."""
-        return self._query(T_base_tcp, 1)[0][:, 0]
-
-    def _query(self, T_base_tcp: F64, count: int) -> tuple[F64, Ints, F64]:
-        """Distances and rows (G, count) of the nearest samples, and the azimuth (G,) of each pose."""
-        found = self.samples
+    def _features(self, T_base_tcp: F64) -> tuple[F64, F64]:
         wrist = (T_base_tcp[:, :3, :3] @ self.tcp_wrist_m + T_base_tcp[:, :3, 3]) / self.length_m
-        features, azimuth = _features(wrist, T_base_tcp[:, :3, :3], found.turns)
-        ranks = list(range(1, count + 1))
-        distance, row = found.tree.query(
-            features, k=ranks, eps=_NOT_NEAREST, distance_upper_bound=found.limit
-        )
-        return distance, row, azimuth
+        return _features(wrist, T_base_tcp[:, :3, :3], self.samples.turns)
 
 
 def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:
@@ -131,7 +138,7 @@ def _samples(
     poses = kinematics.tcp(q)
     features, azimuth = _features(poses[:, :3, 3], poses[:, :3, :3], is_upright)
     tree = KDTree(features[:_SAMPLES])
-    gaps, _ = tree.query(features[_SAMPLES:])
+    gaps, _ = tree.query(features[_SAMPLES:], eps=_DETOUR)
     limit = float(np.quantile(gaps, _QUANTILE))
     return _Samples(q[:_SAMPLES], azimuth[:_SAMPLES], tree, is_upright, limit)
 
@@ -144,7 +151,10 @@ def _with_unit(T: F64, length_m: float) -> F64:
 
 
 def _features(p: F64, R: F64, turns: bool) -> tuple[F64, F64]:
-    """Position, approach and closing axis as (G, 9), and the azimuth (G,) they were turned back by."""
+    """Position, approach and closing axis as (G, 9), and the azimuth (G,) they were turned back by.
+
+    With `turns` (G, 8): the position's y is zero.
+    """
     azimuth = np.arctan2(p[:, 1], p[:, 0]) if turns else np.zeros(len(p))
     c, s = np.cos(azimuth), np.sin(azimuth)
     vectors = np.stack(
@@ -154,4 +164,5 @@ def _features(p: F64, R: F64, turns: bool) -> tuple[F64, F64]:
     turned = np.stack(
         [x * c[:, None] + y * s[:, None], y * c[:, None] - x * s[:, None], vectors[..., 2]], axis=2
     )
-    return turned.reshape(len(p), 9), azimuth
+    features = turned.reshape(len(p), 9)
+    return np.delete(features, 1, axis=1) if turns else features, azimuth

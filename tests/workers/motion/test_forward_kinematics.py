@@ -56,11 +56,29 @@ def test_reachable_poses_lie_near_the_table_and_its_seeds_lead_there(robot: Robo
     kinematics = forward_kinematics(robot)
     table = reach_table(robot, kinematics)
     T = kinematics.tcp(joints(robot, 100))
-    distance, seeds = table.nearest(T, 3)
+    distance, seeds = table.distance(T), table.seeds(T, 3)
     assert np.isfinite(distance).mean() > 0.9
     assert ((seeds >= robot.q_lower_rad) & (seeds <= robot.q_upper_rad)).all()
     solved = [any(robot.ik(T[k], s) is not None for s in seeds[k]) for k in range(len(T))]
     assert np.mean(solved) > 0.9
+
+
+def test_seeds_of_a_pose_are_near_it_differ_and_depend_on_no_other_pose(robot: Robot) -> None:
+    kinematics = forward_kinematics(robot)
+    table = reach_table(robot, kinematics)
+    T = kinematics.tcp(joints(robot, 40))
+    seeds = table.seeds(T, 4)
+    alone = np.concatenate([table.seeds(T[k : k + 1], 4) for k in range(len(T))])
+    np.testing.assert_array_equal(seeds, alone)
+    np.testing.assert_array_equal(table.distance(T), [table.distance(T[k : k + 1])[0] for k in range(len(T))])
+    np.testing.assert_array_equal(table.seeds(T, 1)[:, 0], seeds[:, 0])
+    apart = np.abs(seeds[:, :, None] - seeds[:, None]).max(axis=3)[:, *np.triu_indices(4, 1)]
+    assert np.median(apart.min(axis=1)) > 0.5
+    gap_m = np.linalg.norm(
+        kinematics.tcp(seeds.reshape(-1, seeds.shape[2]))[:, :3, 3] - np.repeat(T[:, :3, 3], 4, axis=0),
+        axis=1,
+    )
+    assert np.median(gap_m) < 0.25 * table.length_m
 
 
 def test_the_table_refuses_what_is_far_out_of_reach() -> None:
@@ -68,8 +86,7 @@ def test_the_table_refuses_what_is_far_out_of_reach() -> None:
     table = reach_table(robot, forward_kinematics(robot))
     far = np.tile(np.eye(4), (2, 1, 1))
     far[:, 0, 3] = (1.5, -2.0)
-    distance, _ = table.nearest(far, 1)
-    assert not np.isfinite(distance).any()
+    assert not np.isfinite(table.distance(far)).any()
 
 
 def test_arms_that_are_scaled_copies_share_one_table() -> None:
@@ -86,6 +103,7 @@ def test_seeds_of_a_shared_table_lead_to_the_poses_of_each_arm(reach_m: float) -
     robot = arm(reach_m)
     kinematics = forward_kinematics(robot)
     T = kinematics.tcp(joints(robot, 60))
-    distance, seeds = reach_table(robot, kinematics).nearest(T, 3)
+    table = reach_table(robot, kinematics)
+    distance, seeds = table.distance(T), table.seeds(T, 3)
     near = np.flatnonzero(np.isfinite(distance))
     assert np.mean([any(robot.ik(T[k], s) is not None for s in seeds[k]) for k in near]) > 0.9
