@@ -31,6 +31,7 @@ N_DRAWS = 1000
 WARM_UP_SCENES = 6.0  # T
 _PRIOR_SHARDS = 4.0  # weight of the prior of the noise, in shards
 _WARM_UP, _WARM_UP_DEVIATION = 6.0, 6.0  # prior of a worker's warm-up, in scenes
+_LEAST_SCENE = 0.1  # of the mean cost of the scenes seen
 _MOST_SCHEDULED = 64  # workers whose shards are scheduled one by one
 
 
@@ -159,11 +160,12 @@ class ShardCosts:
         fit = inverse @ target
         left = max(float(self._squares[2, 2] - fit @ target), 0.0)  # sum of squared residuals
         freedom = _PRIOR_SHARDS + self.seen - 1
-        prior = (self.variation.scene * fit[0]) ** 2
+        # A slow start may look as if all were warm-up: a scene costs something.
+        least = max(_LEAST_SCENE * self._sums[2] / self._sums[0], 1e-12)
+        prior = (self.variation.scene * max(fit[0], least)) ** 2
         variance = (_PRIOR_SHARDS * prior + left) / rng.chisquare(freedom, N_DRAWS)
         noise = np.sqrt(variance)
         off = rng.normal(size=(N_DRAWS, 2)) @ np.linalg.cholesky(inverse).T * noise[:, None]
-        least = 0.05 * fit[0]  # a scene costs something
         return np.maximum(fit[0] + off[:, 0], least), fit[1] + off[:, 1], noise, rng
 
     def _of_the_job(self, rng: np.random.Generator) -> Draws:

@@ -79,7 +79,7 @@ def made_shard(commit: Commit) -> MadeShard:
 def earlier_run(out: str, manifest: Manifest) -> tuple[Run, SeenCosts] | None:
     """The newest run of the same kind that this machine has made in the folder of `out`.
 
-    The same kind: the same specification but for its seed, the run with its scenes and the selected candidates.
+    The same kind: the same specification but for its seed, the run with its scenes and the selection.
     """
     if "://" in out:
         return None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from datagen.cluster.run_forecast import MadeShard, RunForecast, SeenCosts, shown_range
 from datagen.cluster.shard_costs import Interval, ShardCosts, Variation, Work, warm_up_share
@@ -82,6 +84,25 @@ def test_fixed_parts_do_not_grow_with_the_shards() -> None:
         cost = Cost(wall_s=5.0, cpu_s=2.0, written_bytes=4400)
         seen.add(MadeShard(4, cost, "w", fixed_bytes=400))
     assert Interval.of(seen.stored.total(Work(10, 32))).middle == pytest.approx(10 * 32_400, rel=0.01)
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=12), st.integers(1, 300), st.integers(1, 100))
+def test_any_costs_give_a_finite_forecast(seen: list[float], shards: int, workers: int) -> None:
+    """Also falling ones, which look as if a scene cost nothing, and zeros."""
+    costs = ShardCosts(Variation(0.55, 0.15))
+    for k, cost in enumerate(seen):
+        costs.add(cost, 2, 2 * k)
+    work = Work(shards, 2, 1.0)
+    for draws in (costs.total(work), costs.makespan(work, workers, running=True)):
+        interval = Interval.of(draws)
+        assert 0 <= interval.low <= interval.middle <= interval.high < np.inf
+
+
+def test_costs_that_fall_are_taken_for_a_warm_up() -> None:
+    costs = ShardCosts(Variation(0.55, 0.0))
+    for k, cost in enumerate([20.0, 4.0, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0]):
+        costs.add(cost, 2, 2 * k)
+    assert Interval.of(costs.total(Work(100, 2))).middle < 200.0  # the mean of all would be 380
 
 
 @pytest.mark.parametrize(
