@@ -12,7 +12,7 @@ from datagen.schemas.run_records import Cost, Host
 BETWEEN_JOBS = {
     "cpu": Variation(0.55, 0.15),
     "wall": Variation(0.55, 0.3),
-    "bytes": Variation(0.05, 0.005, warms_up=False),
+    "bytes": Variation(0.05, 0.008, warms_up=False),
 }
 _WITHIN_JOB = {
     "cpu": Variation(0.55, 0.03),

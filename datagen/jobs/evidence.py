@@ -18,8 +18,6 @@ from datagen.schemas.run_records import Commit, Manifest
 # Fewer commits than this of another run are less than a pilot shows.
 _ENOUGH = 4
 _MOST_READ, _MOST_RUNS = 256, 200
-# Every chunk begins with a header of this size (c-blosc2).
-_CHUNK_HEADER_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -63,16 +61,13 @@ def made_shard(commit: Commit) -> MadeShard:
 
     Writing takes about as long for one scene as for 32, and each array has one file that describes it.
     """
-    files = commit.files
-    described = sum(file.size for file in files if file.path.endswith("zarr.json"))
-    chunks = sum(not file.path.endswith("zarr.json") for file in files)
     return MadeShard(
         commit.scenes,
         commit.cost,
         worker_name(commit.host),
         fixed_cpu_s=commit.cost.stage_cpu_s.get("write", 0.0),
         fixed_wall_s=commit.cost.stage_wall_s.get("write", 0.0),
-        fixed_bytes=described + _CHUNK_HEADER_BYTES * chunks,
+        fixed_bytes=sum(file.size for file in commit.files if file.path.endswith("zarr.json")),
     )
 
 

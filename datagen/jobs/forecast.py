@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from datagen.cluster.shard_costs import Interval
-from datagen.console.printing import print_rows, seconds, size
+from datagen.console.printing import counted, print_rows, seconds, size
 from datagen.reports.prices import Prices
 
 
@@ -53,8 +53,9 @@ class Forecast:
 def print_forecast(path: str, forecast: Forecast) -> None:
     """Print a forecast as a table."""
     kept = forecast.prices.months_kept
+    months = "1 month" if kept == 1 else f"{kept:g} months"
     rows = [
-        ("shards", f"{forecast.shards:,} of {forecast.scenes:,} scenes", ""),
+        ("shards", f"{forecast.shards:,} ({counted(forecast.scenes, 'scene')})", ""),
         ("labels", f"{forecast.labels:,}", ""),
         ("time", *_shown(forecast.wall_s, seconds)),
         ("CPU time", *_shown(forecast.cpu_s, seconds)),
@@ -71,7 +72,7 @@ def print_forecast(path: str, forecast: Forecast) -> None:
         [
             ("from", forecast.evidence),
             ("workers", f"{forecast.workers}, on a machine as busy as it was"),
-            ("money", f"of CPU time and {kept:g} months of storage; --prices FILE has other prices"),
+            ("money", f"of CPU time and {months} of storage; --prices FILE has other prices"),
             ("without", "retries of failed shards"),
         ],
     )

@@ -84,7 +84,7 @@ def test_the_table_names_every_quantity(finished: Path, capsys: pytest.CaptureFi
     extend = ["extend", str(finished), "--n", str(4 * N), "--workers", "0", "--dry-run", "--budget", "1h"]
     assert cli.run(extend) == 0
     out = capsys.readouterr().out
-    for text in ("36 of 36 scenes", "80% interval", "CPU time", "stored", "USD", "1h: enough with 100%"):
+    for text in ("36 (36 scenes)", "80% interval", "CPU time", "stored", "USD", "1h: enough with 100%"):
         assert text in out
 
 
