@@ -43,9 +43,9 @@ class TimeLeft:
     forecast: RunForecast
     workers: Callable[[], int]  # the number that can work at the same time now
 
-    def of(self, totals: JobTotals) -> Interval | None:
-        """The interval; None while too few shards are made."""
-        return self.forecast.left(totals.shards - totals.finished, self.workers())
+    def of(self, totals: JobTotals, workers: int) -> Interval | None:
+        """The interval for this number of workers; None while too few shards are made."""
+        return self.forecast.left(totals.shards - totals.finished, workers)
 
 
 class JobProgress:
@@ -70,16 +70,18 @@ class JobProgress:
     def tick(self, totals: JobTotals) -> None:
         self._pace.see(totals.labels)
         done, of = self._done_before + totals.finished, self._done_before + totals.shards
-        self._shown.update("shards", done, of, lambda: self._figures(totals))
+        # The figures may be shown after the executor is closed, so it is asked here.
+        workers = self._left.workers() if self._left else 0
+        self._shown.update("shards", done, of, lambda: self._figures(totals, workers))
 
     def stopping(self, reason: str) -> None:
         self._note = "  stopping"
         text = f"{reason}: waiting for running attempts; Ctrl-C again stops at once"
         self._shown.say("stopping", {"reason": reason}, text, "yellow")
 
-    def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
+    def _figures(self, totals: JobTotals, workers: int) -> tuple[str, dict[str, object]]:
         rate, left_s = self._pace.per_s(), left_of(totals, self._pace, self._labels_per_shard)
-        interval = self._left.of(totals) if self._left else None
+        interval = self._left.of(totals, workers) if self._left else None
         left = clock_text(left_s) if interval is None else shown_range(interval)
         cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
         # Rare figures are omitted when 0, to fit 80 columns.
@@ -152,7 +154,7 @@ class JobMonitor:
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self.beat_s
             left_s = left_of(totals, self._pace, self.labels_per_shard)
-            interval = self.left.of(totals) if self.left else None
+            interval = self.left.of(totals, self.left.workers()) if self.left else None
             self.board.publish(JobStatus(totals, self._pace.per_s(), left_s, interval, self._reason))
 
     def _handle(self, mode: StopMode | None) -> None:
