@@ -9,6 +9,8 @@ from typing import Literal, Protocol
 
 from datagen.cluster.driver import Events
 from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.run_forecast import RunForecast, shown_range
+from datagen.cluster.shard_costs import Interval
 from datagen.cluster.stop_request import StopRequest
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Pace, Progress, clock_text, whole
@@ -23,6 +25,7 @@ class JobStatus:
     totals: JobTotals
     labels_per_s: float
     left_s: float | None  # None while the rate is not known
+    left_80_s: Interval | None  # None while too few shards are made
     stopping: str  # why nothing new is begun; "" while it is
 
 
@@ -33,15 +36,29 @@ class StatusBoard(Protocol):
     def stop_requested(self) -> StopMode | None: ...
 
 
+@dataclass(frozen=True)
+class TimeLeft:
+    """The time until the last shard, as an interval from the costs of the shards made so far."""
+
+    forecast: RunForecast
+    workers: Callable[[], int]  # the number that can work at the same time now
+
+    def of(self, totals: JobTotals, workers: int) -> Interval | None:
+        """The interval for this number of workers; None while too few shards are made."""
+        return self.forecast.left(totals.shards - totals.finished, workers)
+
+
 class JobProgress:
     """Events that show shards done, rate, time left, retries, quarantined shards and cost so far.
 
-    `done_before` counts the shards of earlier jobs.
+    `done_before` counts the shards of earlier jobs. With `left`, the time left is an interval.
     """
 
-    def __init__(self, shown: Progress, labels_per_shard: int, done_before: int = 0) -> None:
+    def __init__(
+        self, shown: Progress, labels_per_shard: int, done_before: int = 0, left: TimeLeft | None = None
+    ) -> None:
         self._shown, self._pace, self._labels_per_shard = shown, Pace(shown.clock), labels_per_shard
-        self._done_before, self._note = done_before, ""
+        self._done_before, self._note, self._left = done_before, "", left
 
     def ended(self, report: AttemptReport, action: str) -> None:
         if action in ("retry", "quarantine", "abort"):
@@ -53,20 +70,24 @@ class JobProgress:
     def tick(self, totals: JobTotals) -> None:
         self._pace.see(totals.labels)
         done, of = self._done_before + totals.finished, self._done_before + totals.shards
-        self._shown.update("shards", done, of, lambda: self._figures(totals))
+        # The figures may be shown after the executor is closed, so it is asked here.
+        workers = self._left.workers() if self._left else 0
+        self._shown.update("shards", done, of, lambda: self._figures(totals, workers))
 
     def stopping(self, reason: str) -> None:
         self._note = "  stopping"
         text = f"{reason}: waiting for running attempts; Ctrl-C again stops at once"
         self._shown.say("stopping", {"reason": reason}, text, "yellow")
 
-    def _figures(self, totals: JobTotals) -> tuple[str, dict[str, object]]:
+    def _figures(self, totals: JobTotals, workers: int) -> tuple[str, dict[str, object]]:
         rate, left_s = self._pace.per_s(), left_of(totals, self._pace, self._labels_per_shard)
+        interval = self._left.of(totals, workers) if self._left else None
+        left = clock_text(left_s) if interval is None else shown_range(interval)
         cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
         # Rare figures are omitted when 0, to fit 80 columns.
         given_up = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
         text = (
-            f"{rate:,.0f} labels/s  {clock_text(left_s)} left  "
+            f"{rate:,.0f} labels/s  {left} left  "
             f"{totals.retries} retries{given_up}  {cpu_s / 3600:.2f} core-h{self._note}"
         )
         return text, {
@@ -75,6 +96,7 @@ class JobProgress:
             "labels": totals.labels,
             "labels_per_s": round(rate, 1),
             "left_s": whole(left_s),
+            "left_80_s": interval and [whole(interval.low), whole(interval.high)],
             "in_flight": totals.in_flight,
             "retries": totals.retries,
             "quarantined": totals.quarantined,
@@ -100,6 +122,7 @@ class JobMonitor:
     stop: StopRequest
     labels_per_shard: int
     shown: Events
+    left: TimeLeft | None = None
     clock: Callable[[], float] = time.monotonic
     beat_s: float = 10.0
     look_s: float = 3.0
@@ -111,7 +134,9 @@ class JobMonitor:
         self._next_beat_s = self._next_look_s = self.clock()
 
     def ended(self, report: AttemptReport, action: str) -> None:
-        """Each attempt is in the ledger; nothing is added here."""
+        """Learn from the cost of a made shard."""
+        if self.left is not None and report.outcome == "committed" and report.cost is not None:
+            self.left.forecast.add(report.cost, report.host)
         self.shown.ended(report, action)
 
     def stopping(self, reason: str) -> None:
@@ -129,7 +154,8 @@ class JobMonitor:
         if now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self.beat_s
             left_s = left_of(totals, self._pace, self.labels_per_shard)
-            self.board.publish(JobStatus(totals, self._pace.per_s(), left_s, self._reason))
+            interval = self.left.of(totals, self.left.workers()) if self.left else None
+            self.board.publish(JobStatus(totals, self._pace.per_s(), left_s, interval, self._reason))
 
     def _handle(self, mode: StopMode | None) -> None:
         if mode is None or mode in self._heard:

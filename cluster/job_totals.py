@@ -9,7 +9,7 @@ from typing import Literal, get_args
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.run_records import Outcome
 
-End = Literal["complete", "failed", "interrupted", "aborted"]  # each worse than the one before
+End = Literal["complete", "budget", "failed", "interrupted", "aborted"]  # each worse than the one before
 _NAMED = 20  # quarantined shards that the summary lists by number
 
 
@@ -67,9 +67,9 @@ class JobTotals:
 class JobSummary:
     """How a job ended.
 
-    complete: every shard is committed or, within the allowed share, quarantined. interrupted: by a stop
-    request. failed: too many shards are quarantined. aborted: `cause` names an error that no retry can fix,
-    and its fix.
+    complete: every shard is committed or, within the allowed share, quarantined. budget: no further shard
+    fits the budget. interrupted: by a stop request. failed: too many shards are quarantined. aborted: `cause`
+    names an error that no retry can fix, and its fix.
     """
 
     end: End
@@ -84,8 +84,8 @@ class JobSummary:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 0 complete, 1 failed, 2 aborted, 130 interrupted."""
-        return {"complete": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
+        """Exit code of the command line: 0 complete, 1 failed, 2 aborted, 3 budget spent, 130 interrupted."""
+        return {"complete": 0, "failed": 1, "aborted": 2, "budget": 3, "interrupted": 130}[self.end]
 
     def plus(self, later: JobSummary) -> JobSummary:
         """The sum of both, for one job over several runs, with the worse end and its first cause."""

@@ -1,8 +1,8 @@
 """The program `datagen`: its verbs, its one-line errors and its exit codes.
 
-Exit codes: 0 success, 1 finished with failures, findings or differences, 2 bad input, 130 interrupted, 141 if
-the reader of the output closed it. A verb is imported when it is called, so that `datagen --help` does not
-wait for simulators.
+Exit codes: 0 success, 1 finished with failures, findings or differences, 2 bad input, 3 the budget allows no
+further shard, 130 interrupted, 141 if the reader of the output closed it. A verb is imported when it is
+called, so that `datagen --help` does not wait for simulators.
 """
 
 from __future__ import annotations

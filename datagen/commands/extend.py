@@ -9,10 +9,11 @@ from typing import Unpack
 from datagen.configuration.stored_scenes import StoredScenes, refuse_too_few
 from datagen.console.command_lines import prints
 from datagen.console.options import AS_FOUND, RunPlace, Sources, Whole
+from datagen.jobs.dry_run import PlannedRun
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, refuse_odd_n
-from datagen.jobs.start_job import continue_job, source_words
+from datagen.jobs.start_job import continue_job, planned_run, source_words
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
 
@@ -33,7 +34,7 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
     refuse_odd_n(n)
     words = ["extend", absolute_place(run), "--n", str(n), *source_words(given), *job_options.words()]
 
-    def grow(job_runs: Sequence[JobRun]) -> None:
+    def wanted_of(job_runs: Sequence[JobRun]) -> list[int]:
         wanted = longer([job_run.run for job_run in job_runs], n, run)
         for job_run, more in zip(job_runs, wanted, strict=True):
             selection = job_run.run.manifest.spec.selection
@@ -44,10 +45,16 @@ def extend(run: RunPlace, /, *, n: Whole, given: Sources = AS_FOUND, **job: Unpa
             if job_run.scenes_from and selection is None:
                 stored = StoredScenes(Run.open(job_run.scenes_from), job_run.houses, job_run.objects)
                 refuse_too_few(stored, job_run.run.layout, more)
-        for job_run, more in zip(job_runs, wanted, strict=True):
+        return wanted
+
+    def grow(job_runs: Sequence[JobRun]) -> None:
+        for job_run, more in zip(job_runs, wanted_of(job_runs), strict=True):
             job_run.run.grow(more)
 
-    return continue_job(words, run, given, job_options, grow)
+    def planned(job_runs: Sequence[JobRun]) -> list[PlannedRun]:
+        return [planned_run(*each) for each in zip(job_runs, wanted_of(job_runs), strict=True)]
+
+    return continue_job(words, run, given, job_options, grow, planned)
 
 
 def longer(runs: Sequence[Run], n: int, place: str) -> list[int]:

@@ -10,10 +10,11 @@ from typing import Annotated, Unpack
 from datagen.console.command_lines import prints, words_of
 from datagen.console.options import AS_FOUND, RUN, Sources
 from datagen.console.printing import counted
+from datagen.jobs.dry_run import PlannedRun
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import JobKeywords, JobOptions, absolute_place
-from datagen.jobs.start_job import continue_job, source_words
+from datagen.jobs.start_job import continue_job, planned_run, source_words
 from datagen.schemas.quarantine import lift_quarantine
 
 
@@ -36,7 +37,8 @@ def resume(
         run: Folder or s3:// address of a run or of merged runs.
         quarantined: Try quarantined shards again; their records are kept.
         given: New locations of houses, objects and the run with the scenes, where they have moved.
-        job: As of `submit`: `workers`, `address`, `max_quarantined`, `detach`, `json` and `quiet`.
+        job: As of `submit`: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`,
+            `prices`, `json` and `quiet`.
 
     Returns:
         What was done.
@@ -61,4 +63,7 @@ def resume(
             if not job_options.quiet:
                 sys.stderr.write(f"out of quarantine: {counted(lifted, 'shard')}\n")
 
-    return continue_job(words, run, given, job_options, lift)
+    def planned(job_runs: Sequence[JobRun]) -> list[PlannedRun]:
+        return [planned_run(job_run, job_run.run.n, quarantined) for job_run in job_runs]
+
+    return continue_job(words, run, given, job_options, lift, planned)

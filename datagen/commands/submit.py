@@ -21,6 +21,7 @@ from datagen.console.command_lines import prints, words_of
 from datagen.console.options import File, Place, Whole
 from datagen.estimation.selected_candidates import SelectBy, SelectOptions, select_candidates
 from datagen.jobs.detach import detach_job
+from datagen.jobs.dry_run import PlannedRun, dry_run
 from datagen.jobs.job import JobRun
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import (
@@ -31,14 +32,15 @@ from datagen.jobs.options import (
     opening,
     refuse_odd_n,
 )
-from datagen.jobs.start_job import refuse_unusable_engines, start_job
+from datagen.jobs.start_job import planned_run, refuse_unusable_engines, start_job
 from datagen.schemas.cost import StageClock
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED
 from datagen.schemas.progress import Progress
+from datagen.schemas.record_files import refuse_other
 from datagen.schemas.run import Run
-from datagen.schemas.run_records import Layout
-from datagen.schemas.selection import selection_of
+from datagen.schemas.run_records import Layout, Manifest
+from datagen.schemas.selection import Selection, selection_of
 from datagen.schemas.storage import open_storage
 from datagen.workers.houses import open_houses
 from datagen.workers.labels import load_label_source
@@ -118,7 +120,8 @@ def submit(
         renderer: Renderer: embree, sapien or pybullet [embree].
         noise: Add sensor noise to the frame.
         config: TOML file with any field of the specification.
-        job: `workers`, `address`, `max_quarantined`, `detach`, `json`, and `quiet` to report no progress.
+        job: `workers`, `address`, `max_quarantined`, `detach`, `dry_run`, `budget`, `prices`, `json`, and
+            `quiet` to report no progress.
 
     Returns:
         What was done. The call blocks and reports progress on standard error.
@@ -228,15 +231,32 @@ def submit(
         if source_url:
             sources["scenes_from"] = source_url
         manifest = manifest_of(spec, layout, sources, schema_version)
-        run = Run.create_or_open(open_storage(out), manifest, n, selection)
+        planned = _planned(out, manifest, n, selection) if job_options.dry_run else None
+        run = None
+        if planned is None:
+            run = Run.create_or_open(open_storage(out), manifest, n, selection)
     if said["--houses"] is None and not source_url:
         Progress(job_options.json).say("note", {"note": _BUILTIN}, _BUILTIN)
+    if planned is not None:
+        return dry_run(out, [planned], job_options, began_s)
+    assert run is not None
     if job_options.detach:
         return detach_job(words, out, job_options)
     job_run = JobRun(run, sources["houses"], sources["objects"], source_url)
     return start_job(
         run.storage, out, [job_run], job_options, began_s, [*words, *job_options.address_words()]
     )
+
+
+def _planned(out: str, manifest: Manifest, n: int, selection: Selection | None) -> PlannedRun:
+    """The shards that the run at `out`, or a new one, lacks. InputError for another specification there."""
+    sources = manifest.sources
+    places = sources["houses"], sources["objects"], sources.get("scenes_from", "")
+    run = _run_there(out)
+    if run is None:
+        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), *places, selection)
+    refuse_other(run.storage.url, run.manifest, manifest)
+    return planned_run(JobRun(run, *places), max(n, run.n))
 
 
 def _layout_there(out: str) -> Layout | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.table import Table
@@ -17,9 +17,12 @@ from rich.text import Text
 from datagen.schemas.errors import printable
 
 
-def print_json(value: Any, indent: int | None = 2) -> None:
-    """Print one JSON document; ValueError, before any output, for values that JSON cannot hold."""
-    sys.stdout.write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
+def print_json(value: Any, indent: int | None = 2, to: TextIO | None = None) -> None:
+    """Print one JSON document to a stream [standard output].
+
+    ValueError, before any output, for values that JSON cannot hold.
+    """
+    (to or sys.stdout).write(json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
 def print_rows(title: str, rows: Sequence[Sequence[str]], heads: Sequence[str] = ()) -> None:

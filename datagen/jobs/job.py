@@ -11,19 +11,22 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 
 from datagen.cluster.attempt import run_attempt
+from datagen.cluster.budget import BudgetGuard
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.in_process_executor import InProcessExecutor
-from datagen.cluster.job_progress import JobMonitor, JobProgress, JobStatus, StopMode
+from datagen.cluster.job_progress import JobMonitor, JobProgress, JobStatus, StopMode, TimeLeft
 from datagen.cluster.job_totals import End, JobSummary, JobTotals, empty_summary
 from datagen.cluster.post_mortem import notes_of_a_job
 from datagen.cluster.preflight import refuse_unfit_machines
 from datagen.cluster.ray_cluster import RaySettings
 from datagen.cluster.ray_executor import RayExecutor, ray_executor
 from datagen.cluster.retry_policy import RetryPolicy, too_many_quarantined
+from datagen.cluster.run_forecast import RunForecast
 from datagen.cluster.run_recorder import RunRecorder, close_lost_attempts
 from datagen.cluster.stop_request import StopRequest, stop_on_signals
 from datagen.cluster.task import Executor, ShardTask
 from datagen.console.command_lines import command_line
+from datagen.jobs.evidence import made_here
 from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JOBS_API, SUBMISSION, JobOptions
 from datagen.reports.specification_summary import made_from
@@ -115,6 +118,7 @@ def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
     """Drive one run after the other on one set of workers; return the summary."""
     missing = [job_run.run.missing() for job_run in plan.runs]
     job_options, stop = plan.options, StopRequest()
+    budget = None if job_options.limit is None else BudgetGuard(job_options.limit, plan.began_s)
     policy = RetryPolicy(max_quarantined_share=job_options.max_quarantined)
     whole = empty_summary()
     with ExitStack() as stack:
@@ -123,10 +127,12 @@ def make_missing(plan: JobPlan, recorder: JobRecorder) -> JobSummary:
         executor = _executor(job_options, sum(map(len, missing)), stack, shown)
         stack.enter_context(stop_on_signals(stop, interrupt=job_options.workers == 0))
         for job_run, shards in zip(plan.runs, missing, strict=True):
-            if whole.end in ("interrupted", "aborted"):
+            if whole.end in ("interrupted", "aborted", "budget"):
                 whole = replace(whole, totals=whole.totals.plus(JobTotals(len(shards))))
             elif shards:
-                whole = whole.plus(_drive(job_run, shards, executor, policy, recorder, stop, shown, notes))
+                whole = whole.plus(
+                    _drive(job_run, shards, executor, policy, recorder, stop, shown, notes, budget)
+                )
                 recorder.add(whole.totals)
         whole = replace(whole, start_s=time.monotonic() - plan.began_s - whole.elapsed_s)
     for job_run in plan.runs:
@@ -144,6 +150,7 @@ def _drive(
     stop: StopRequest,
     shown: Progress,
     notes: str,
+    budget: BudgetGuard | None,
 ) -> JobSummary:
     run = job_run.run
     layout, spec = run.layout, run.manifest.spec
@@ -168,8 +175,13 @@ def _drive(
         refuse_unfit_machines(executor.others.ask, run, probe)
     done, per_shard = len(run.planned()) - len(shards), layout.samples_per_shard
     shown.phase("making labels")
-    events = JobMonitor(recorder, stop, per_shard, JobProgress(shown, per_shard, done))
-    return drive(shards, make_task, executor, RunRecorder(run), policy, events, stop)
+    forecast = RunForecast(layout.scenes_per_shard, made_here(run))
+    left = TimeLeft(forecast, lambda: executor.slots)
+    if budget is not None:
+        budget.use(forecast)
+    events = JobMonitor(recorder, stop, per_shard, JobProgress(shown, per_shard, done, left), left)
+    recorder_of_run = RunRecorder(run)
+    return drive(shards, make_task, executor, recorder_of_run, policy, events, stop, budget=budget)
 
 
 def _judged(plan: JobPlan, summary: JobSummary) -> JobSummary:
@@ -210,7 +222,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
     if summary.end == "aborted":
         fix = f"Then resume: {command_line(plan.resume)}"
         raise _CannotContinue(plan.path, "", f"the job cannot continue: {summary.cause}", fix)
-    does_seal = summary.end != "interrupted" and any(run.committed() for run in runs)
+    does_seal = summary.end not in ("interrupted", "budget") and any(run.committed() for run in runs)
     return JobResult(
         path=plan.path,
         end=summary.end,
@@ -225,6 +237,7 @@ def _finish(plan: JobPlan, summary: JobSummary) -> JobResult:
         start_s=summary.start_s,
         elapsed_s=summary.elapsed_s,
         store=seal(plan.storage) if does_seal else "",
+        budget=plan.options.budget or "",
         cause=summary.cause or (causes.most_common(1)[0][0] if causes else ""),
         resume=tuple(plan.resume),
     )
@@ -252,7 +265,7 @@ class JobRecorder:
         self._before = totals
 
     def publish(self, status: JobStatus) -> None:
-        totals = self._before.plus(status.totals)
+        totals, interval = self._before.plus(status.totals), status.left_80_s
         self._put(
             self._last.model_copy(
                 update={
@@ -261,6 +274,7 @@ class JobRecorder:
                     "phase": "making",
                     "labels_per_s": status.labels_per_s,
                     "left_s": status.left_s,
+                    "left_80_s": interval and (interval.low, interval.high),
                     "stopping": status.stopping,
                 }
             )
@@ -286,6 +300,7 @@ class JobRecorder:
             "cause": cause,
             "in_flight": 0,
             "left_s": None,
+            "left_80_s": None,
         }
         if summary is not None:
             rate = summary.totals.labels / summary.elapsed_s if summary.elapsed_s > 0 else 0.0

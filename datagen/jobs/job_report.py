@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from datagen.console.command_lines import command_line, say_interrupted
-from datagen.console.printing import counted, listed, print_rows, seconds
+from datagen.cluster.run_forecast import shown_range
+from datagen.cluster.shard_costs import Interval
+from datagen.console.command_lines import command_line, resume_with, say_interrupted
+from datagen.console.printing import counted, listed, print_json, print_rows, seconds
+from datagen.jobs.forecast import Forecast, print_forecast
 from datagen.schemas.errors import one_line
 from datagen.schemas.jobs import StoredJob
+
+_EXIT_CODES = {
+    **{"complete": 0, "detached": 0, "dry-run": 0},
+    **{"failed": 1, "aborted": 2, "budget": 3, "interrupted": 130},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,8 +26,9 @@ class JobResult:
     """What a job did, and what its run holds now. Quarantined shards are those that failed repeatedly."""
 
     path: str  # the run, as the user wrote it
-    # detached: Ray makes the labels. failed: more shards are quarantined than allowed.
-    end: Literal["complete", "failed", "interrupted", "aborted", "detached"]
+    # detached: Ray makes the labels. failed: more shards are quarantined than allowed. budget: it allows no
+    # further shard. dry-run: nothing was made.
+    end: Literal["complete", "budget", "failed", "interrupted", "aborted", "detached", "dry-run"]
     n: int = 0  # labels wanted
     made_from: str = ""  # houses, objects and robot
     labels: int = 0  # made by this job
@@ -32,6 +42,8 @@ class JobResult:
     store: str = ""  # the sealed store, which zarr and xarray open
     cause: str = ""  # of an aborted job, and the most frequent one of a failed job
     resume: tuple[str, ...] = ()  # the words of the command that continues
+    budget: str = ""  # as given
+    forecast: Forecast | None = None  # of a dry run
 
     @property
     def complete(self) -> bool:
@@ -40,8 +52,8 @@ class JobResult:
 
     @property
     def exit_code(self) -> int:
-        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 130 stopped."""
-        return {"complete": 0, "detached": 0, "failed": 1, "aborted": 2, "interrupted": 130}[self.end]
+        """The command line's exit status: 0 good, 1 too many failures, 2 bad place, 3 budget, 130 stopped."""
+        return _EXIT_CODES[self.end]
 
 
 def job_report(job: StoredJob) -> dict[str, Any]:
@@ -71,6 +83,9 @@ def health_line(job: StoredJob) -> str:
     if state is None or state.phase == "starting":
         return f"{'silent' if health == 'silent' else 'starting'}, {heard} ({where})"
     left = "?" if state.left_s is None else seconds(state.left_s)
+    if state.left_80_s is not None:
+        low_s, high_s = state.left_80_s
+        left = shown_range(Interval(low_s, (low_s + high_s) / 2, high_s))
     doing = "sealing" if state.phase == "sealing" else f"{state.labels_per_s:,.1f} labels/s, {left} left"
     if state.stopping:
         doing = f"stopping, {state.in_flight} running"
@@ -80,11 +95,29 @@ def health_line(job: StoredJob) -> str:
     return f"{silent}{state.done} of {counted(state.shards, 'shard')}, {doing}, {heard} ({where})"
 
 
-def print_job(result: JobResult, **_: Any) -> int:
-    """Print the summary of a job and return the exit code."""
-    if result.end != "detached":  # what to do next is printed when it is detached
+def print_job(result: JobResult, *, job: Mapping[str, Any] | None = None, **_: Any) -> int:
+    """Print the summary of a job and return the exit code. `job` has the options of the job."""
+    as_json = bool((job or {}).get("json"))
+    if result.forecast is not None and as_json:
+        print_json({"run": result.path, **result.forecast.record()})
+    elif result.forecast is not None:
+        print_forecast(result.path, result.forecast)
+    elif result.end != "detached":  # what to do next is printed when it is detached
         _print(result)
+        if result.end == "budget":
+            _say_budget(result, as_json)
     return result.exit_code
+
+
+def _say_budget(result: JobResult, as_json: bool) -> None:
+    """Say on standard error that the budget is spent, and how to continue with another one."""
+    if as_json:
+        again = {"remaining": result.remaining, "exit_code": result.exit_code, "resume": list(result.resume)}
+        values = {"event": "budget", "budget": result.budget, "labels": result.labels, **again}
+        print_json(values, indent=None, to=sys.stderr)
+        return
+    left = counted(result.remaining, "shard")
+    sys.stderr.write(f"budget of {result.budget} spent; {left} left. {resume_with(result.resume)}\n")
 
 
 def _print(result: JobResult) -> None:

@@ -13,9 +13,12 @@ from typing import Annotated, TypedDict
 from cyclopts import Parameter
 from rich.console import Console
 
+from datagen.cluster.budget import Budget
 from datagen.cluster.ray_cluster import refuse_unusable
 from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import Whole
+from datagen.jobs.budget_option import parse_budget
+from datagen.reports.prices import read_prices
 from datagen.schemas.errors import InputError, refuse_not_utf8
 from datagen.schemas.progress import Progress
 from datagen.workers.extras import refuse_missing
@@ -40,6 +43,17 @@ class JobKeywords(TypedDict, total=False):
         float, Parameter(help="Largest quarantined share of the run's shards in a successful job [0.01].")
     ]
     detach: Annotated[bool, Parameter(help=_DETACH)]
+    dry_run: Annotated[
+        bool,
+        Parameter(help="Make nothing: print shards, time, CPU time, bytes and money with 80% intervals."),
+    ]
+    budget: Annotated[
+        str | None,
+        Parameter(help="End before the first shard beyond a time (2h), CPU time (5cpu-h) or money (3usd)."),
+    ]
+    prices: Annotated[
+        str | None, Parameter(help="TOML file with prices of core-hours and stored bytes [list prices].")
+    ]
     json: Annotated[bool, Parameter(help="Print progress as JSON lines to standard error.")]
     quiet: Annotated[bool, Parameter(parse=False)]  # the command line always reports progress
 
@@ -52,6 +66,9 @@ class JobOptions:
     address: str = "local"
     max_quarantined: float = DEFAULT_SHARE
     detach: bool = False
+    dry_run: bool = False
+    budget: str | None = None
+    prices: str | None = None
     json: bool = False
     quiet: bool = False
 
@@ -63,19 +80,30 @@ class JobOptions:
         if not 0 <= self.max_quarantined <= 1:
             given = str(self.max_quarantined)
             raise InputError("--max-quarantined", given, "is not a share", "Give 0.01 for one in a hundred")
+        if self.dry_run and self.detach:
+            raise InputError("--dry-run", "--detach", "a forecast is made in this shell", "Omit one of them")
+        read_prices(self.prices)
+        _ = self.limit
         if self.workers != 0 or self.detach:
             refuse_missing("cluster", "" if self.detach else "or work in this process: --workers 0")
         if self.workers != 0 and not self.detach:
             refuse_unusable(self.address)
+
+    @property
+    def limit(self) -> Budget | None:
+        """The budget; None without one. InputError for another text than `parse_budget` accepts."""
+        return None if self.budget is None else parse_budget(self.budget, self.prices)
 
     def display(self) -> Progress:
         """What reports progress on standard error."""
         return Progress(self.json, console=Console(file=io.StringIO()) if self.quiet else None)
 
     def words(self) -> list[str]:
-        """The words of these options, without --detach and --address."""
+        """The words of these options, without --detach, --address and --dry-run."""
         share = None if self.max_quarantined == DEFAULT_SHARE else self.max_quarantined
-        return words_of({"--workers": self.workers, "--max-quarantined": share, "--json": self.json})
+        prices = self.prices and str(Path(self.prices).expanduser().absolute())
+        words = {"--workers": self.workers, "--max-quarantined": share, "--budget": self.budget}
+        return words_of(words | {"--prices": prices, "--json": self.json})
 
     def address_words(self) -> list[str]:
         """The words of --address, where it is not `local`."""

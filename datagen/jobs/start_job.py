@@ -12,6 +12,7 @@ from datagen.console.options import AS_FOUND, Sources
 from datagen.console.printing import counted
 from datagen.doctor.engines import probe_render_device
 from datagen.jobs.detach import detach_job, detached_words
+from datagen.jobs.dry_run import PlannedRun, dry_run
 from datagen.jobs.job import JobPlan, JobRun, run_job
 from datagen.jobs.job_report import JobResult
 from datagen.jobs.options import JobOptions, absolute_place, absolute_source, opening
@@ -20,6 +21,8 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.record_files import different_fields
 from datagen.schemas.run import Run
+from datagen.schemas.selection import selection_of
+from datagen.schemas.shard_ranges import ShardRanges
 from datagen.schemas.specification import Specification
 from datagen.schemas.storage import Storage, open_storage
 from datagen.workers.extras import missing_library
@@ -68,21 +71,36 @@ def continue_job(
     given: Sources,
     job_options: JobOptions,
     prepare: Callable[[Sequence[JobRun]], None],
+    planned: Callable[[Sequence[JobRun]], Sequence[PlannedRun]],
 ) -> JobResult:
     """Open the run, or merged runs, at `path`, let `prepare` change them, and make the missing shards.
+
+    A dry run forecasts the shards of `planned` instead.
 
     `words` are those of the command itself: a detached job is given them, and repeats `prepare`.
     """
     if job_options.detach and job_options.address != "local":
         return detach_job(words, path, job_options)
     with opening(words, job_options) as began_s:
-        storage = open_storage(path, create=False)
+        storage = open_storage(path, probe=not job_options.dry_run, create=False)
         job_runs = [open_job_run(run, given, job_options.address) for run in open_runs(storage)]
-        prepare(job_runs)
+        if not job_options.dry_run:
+            prepare(job_runs)
+    if job_options.dry_run:
+        return dry_run(path, planned(job_runs), job_options, began_s)
     if job_options.detach:
         return detach_job(words, path, job_options)
     command = [*words, *job_options.address_words()]
     return start_job(storage, path, job_runs, job_options, began_s, command, given)
+
+
+def planned_run(job_run: JobRun, n: int, quarantined: bool = False) -> PlannedRun:
+    """The shards that a run of n labels lacks; with `quarantined`, also those in quarantine."""
+    run = job_run.run
+    decided = run.committed() if quarantined else run.committed() | run.quarantined()
+    shards = len(ShardRanges.of(range(run.layout.shards_for(n))).without(ShardRanges.of(decided)))
+    sources = job_run.houses, job_run.objects, job_run.scenes_from
+    return PlannedRun(run.manifest, run, n, shards, *sources, selection_of(run))
 
 
 def start_job(

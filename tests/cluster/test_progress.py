@@ -7,10 +7,12 @@ import json
 
 from rich.console import Console
 
-from datagen.cluster.job_progress import JobProgress
+from datagen.cluster.job_progress import JobProgress, TimeLeft
 from datagen.cluster.job_totals import JobTotals
+from datagen.cluster.run_forecast import RunForecast
 from datagen.cluster.task import AttemptReport
 from datagen.schemas.progress import Progress
+from datagen.schemas.run_records import Cost
 from tests.cluster.simulated import FakeClock
 
 CRASH = AttemptReport("a", 5, "crashed", cause="Fatal Python error: Segmentation fault")
@@ -79,3 +81,25 @@ def test_a_usual_terminal_shows_all_figures() -> None:
     last = [line for line in out.getvalue().splitlines() if "1400/3000" in line][-1]
     assert "2,100 labels/s  0:00:46 left  3 retries  2.00 core-h" in last
     assert "\u2026" not in last
+
+
+def test_the_time_left_is_an_interval_also_after_the_executor_is_closed() -> None:
+    """The last figures are shown when the job has ended: then Ray does not answer any more."""
+    clock, out, is_open = FakeClock(), io.StringIO(), True
+
+    def workers() -> int:
+        assert is_open
+        return 2
+
+    shown, forecast = Progress(True, clock, Console(file=out)), RunForecast(32)
+    events, totals = JobProgress(shown, 60, left=TimeLeft(forecast, workers)), JobTotals(100)
+    for second in range(1, 15):
+        clock.now_s = second
+        totals.committed, totals.labels = second, 60 * second
+        forecast.add(Cost(wall_s=2.0, cpu_s=2.0), None)
+        events.tick(totals)
+    is_open = False
+    shown.close()
+    said = [json.loads(line) for line in out.getvalue().splitlines()]
+    low_s, high_s = said[-1]["left_80_s"]
+    assert said[-1]["shards_done"] == 14 and 60 < low_s < 86 < high_s < 110
