@@ -22,7 +22,7 @@ class Stream(IntEnum):
     PATH = 5
     DISTURBANCE = 6
     SELECTION = 7
-    FORECAST = 9  # of no sample: draws of what a job will cost
+    FORECAST = 8  # of no sample: draws of what a job will cost
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:
