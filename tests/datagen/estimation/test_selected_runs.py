@@ -143,3 +143,12 @@ def test_what_cannot_be_selected_is_refused(folder: Path, capsys: pytest.Capture
     ):
         refused(words(*more), capsys, told)
     assert not (folder / "no").exists()
+
+
+def test_a_dry_run_forecasts_the_selected_candidates(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "apart").mkdir()
+    forecast = json_of(capsys, [*select_words(folder, "apart/new"), "--dry-run"])
+    assert (forecast["labels"], forecast["scenes"]) == (N, N // EACH)
+    assert forecast["evidence"].startswith("a pilot of") and not (folder / "apart" / "new").exists()
