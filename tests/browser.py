@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_PATIENCE_MS = 120_000  # a busy machine draws slowly
 
 
 @cache
@@ -57,7 +58,7 @@ def browser() -> Iterator[Any]:
     with sync_playwright() as driver:
         # Without the sandbox, which root and containers lack: pages of tests alone are opened.
         opened = driver.chromium.launch(
-            executable_path=path, args=["--no-sandbox", "--disable-dev-shm-usage"]
+            executable_path=path, args=["--no-sandbox", "--disable-dev-shm-usage"], timeout=_PATIENCE_MS
         )
         try:
             yield opened
@@ -68,6 +69,7 @@ def browser() -> Iterator[Any]:
 def open_page(opened: Any, file: Path, **options: Any) -> tuple[Any, Watched]:
     """A page with a file, and what happens in it."""
     page = opened.new_page(**options)
+    page.set_default_timeout(_PATIENCE_MS)
     watched = Watched(page, file.as_uri())
     page.goto(file.as_uri())
     return page, watched
