@@ -13,8 +13,8 @@ FIDELITY = ("heuristic", "plan", "sim")
 CHEAP = "heuristic"
 # Small and fast: half the width of `datagen train`'s default, and half the tokens.
 MODEL_CONFIG = {"width": 32, "embedding": 64, "tokens": (8, 16, 16)}
-# Epochs show so many labels in all, within bounds: small sets need many passes, or the curve would measure
-# the number of steps, and large sets few.
+# Epochs show this number of labels in all, within bounds. Without that a small set would have few steps, and
+# the curve would measure steps.
 _LABELS_SHOWN, _LEAST_EPOCHS, _MOST_EPOCHS = 200_000, 3, 40
 
 

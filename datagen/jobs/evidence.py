@@ -57,7 +57,7 @@ def costs_of(run: Run) -> SeenCosts:
 
 
 def made_shard(commit: Commit) -> MadeShard:
-    """What a commit tells of its shard's cost.
+    """What a commit says about its shard's cost.
 
     Writing takes about as long for one scene as for 32, and each array has one file that describes it.
     """

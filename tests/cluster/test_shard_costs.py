@@ -61,11 +61,14 @@ def test_the_makespan_is_that_of_shards_given_to_free_workers(shards: int, worke
 
 
 def test_the_interval_of_a_run_narrows_as_it_goes_on() -> None:
-    rng, forecast, host = (
-        np.random.default_rng(2),
-        RunForecast(16),
-        Host(name="h", cpu="c", cores=2, memory_bytes=1),
-    )
+    """Relative to what is left: the noise of the rest grows as the rate gets known."""
+    narrowed = np.array([narrowing(np.random.default_rng(seed)) for seed in range(12)])
+    assert (narrowed < 0.9).all() and narrowed.mean() < 0.8
+
+
+def narrowing(rng: np.random.Generator) -> float:
+    """The width of the interval after 60 of 100 shards, divided by that of the first interval."""
+    forecast, host = RunForecast(16), Host(name="h", cpu="c", cores=2, memory_bytes=1)
     widths: list[float] = []
     for made in range(1, 61):
         cost = shard_cost(rng, 16, 1000)
@@ -75,7 +78,7 @@ def test_the_interval_of_a_run_narrows_as_it_goes_on() -> None:
         if left is not None:
             widths.append((left.high - left.low) / left.middle)
             assert left.low < 16.3 * (100 - made) * 1.3
-    assert widths[-1] < 0.8 * widths[0]
+    return widths[-1] / widths[0]
 
 
 def test_fixed_parts_do_not_grow_with_the_shards() -> None:

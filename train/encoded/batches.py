@@ -10,7 +10,7 @@ import numpy as np
 from datagen.train.encoded.runs import EncodedRuns
 from datagen.train.inputs import I64, Array, Batch, Bools
 
-# One house of so many is held out where a training has no validation runs.
+# One house of this number is held out where a training has no validation runs.
 _HELD_OUT = 10
 
 

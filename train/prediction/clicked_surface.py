@@ -11,7 +11,7 @@ from datagen.train.prediction.ground import depth_error_m
 
 _NEAR_PX = 6  # around the click, for the plane through it
 _SECTORS = 8  # of directions in the plane, in which it is followed
-# A plane that goes as far in so many of them is a surface of the room: at a corner of a table, in a quarter.
+# A plane that goes as far in that many of them is a surface of the room; at the corner of a table, a quarter.
 _FAR_SHARE, _LEAST_SECTORS = 0.8, 3
 _LEAST_FILLED = 0.5  # share of each such sector's ring in which it must be
 _LEVEL, _UPRIGHT = 0.9, 0.3  # of the normal's z
