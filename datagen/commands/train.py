@@ -95,6 +95,7 @@ def train_model(
     seed: Whole = 0,
     patience: Whole = 8,
     augment: str | None = None,
+    encoded: Place | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     processes: Whole | None = None,
     threads: Whole | None = None,
@@ -129,6 +130,7 @@ def train_model(
         seed: Seed of weights, order and dropout.
         patience: Epochs without a lower validation loss before training stops.
         augment: noise, holes, dropout, colour, rotation, comma-separated; or a TOML file.
+        encoded: Folder for inputs of `shared`, which are made there once; later trainings take them from it.
         device: Device of the model.
         processes: Training processes [one per GPU; one on CPUs].
         threads: Threads per process [cores / processes].
@@ -192,6 +194,7 @@ def train_model(
         json_lines=json,
         allow_incomplete=allow_incomplete,
         allow_mixed_labels=allow_mixed_labels,
+        encoded=None if encoded is None else str(encoded),
     )
     if not _train(job, n_processes):
         head = read_checkpoint(out).head if Path(out).exists() else None

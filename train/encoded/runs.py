@@ -23,18 +23,18 @@ import torch
 from datagen.schemas.errors import InputError
 from datagen.schemas.identity import digest_of
 from datagen.train.dataset import SampleStream
-from datagen.train.inputs import F32, I64, U8, Array, Batch, Bools, CandidateInputs, RobotInputs
-from datagen.train.models.encoded_clouds import EncodedClouds, pack, packed_width
+from datagen.train.inputs import F32, I64, U8, Array, Batch, Bools, RobotInputs
+from datagen.train.models.encoded_clouds import EncodedCandidates, EncodedClouds, pack, packed_width
 from datagen.train.models.shared import SharedModel
 from datagen.train.models.tokens import token_sizes
 from datagen.train.tensors import to_torch
 from datagen.workers.bases.candidate_sets import in_set
 
 # Raise it when the same run would give other tokens or columns.
-_VERSION = 1
+_VERSION = 2
 EXTRA = ("house_id", "base_is_clear", "mount_distance_m")
 # Fields of a model's configuration that decide its tokens.
-_DECISIVE = ("n_points", "tokens", "near_m", "scales_m")
+_DECISIVE = ("n_points", "tokens", "near_m", "scales_m", "camera", "observed_visibility", "hand_poses")
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 
@@ -92,11 +92,12 @@ class EncodedRuns:
                 target_radius_m=c["target_radius_m"][scenes],
                 tokens=np.asarray(self.tokens[robots]),
                 targets=c["targets"][robots],
+                hand_poses=c["hand_poses"][scenes],
             ),
             robots=RobotInputs(
                 cloud_row, c["camera_height_m"][robots], c["base_height_m"][robots], c["arm_reach_m"][robots]
             ),
-            candidates=CandidateInputs(robot_row, c["base_xy_m"][rows]),
+            candidates=EncodedCandidates(robot_row, c["base_xy_m"][rows], c["visible_share"][rows]),
             label=c["label"][rows].astype(np.int64),
             sample_id=c["sample_id"][rows],
         )
@@ -152,9 +153,20 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
         for batch in stream.epoch(0):
             given = to_torch(batch, "cpu")
             with torch.inference_mode():
-                tokens, targets = pack(model.encode(given.clouds, given.robots))
+                made = model.encode(given.clouds, given.robots)
+                tokens, targets = pack(made)
+                share = np.zeros(len(batch), np.float32)
+                if model.sizes.observed_visibility:
+                    seen_by = (made, given.clouds, given.candidates, given.robots)
+                    share = model.visible_share(*seen_by).numpy()
             file.write(tokens.numpy().tobytes())
-            parts.append(_columns(batch, targets.numpy(), scenes, robots))
+            poses = made.hand_poses if made.hand_poses is not None else torch.zeros(len(batch.clouds), 0, 0)
+            parts.append(_columns(batch, scenes, robots))
+            parts[-1] |= {
+                "targets": targets.numpy(),
+                "visible_share": share,
+                "hand_poses": poses.half().numpy(),
+            }
             scenes, robots = scenes + len(batch.clouds), robots + len(batch.robots)
             seen(scenes, stream.n_scenes)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -164,7 +176,7 @@ def _write(stream: SampleStream, model: SharedModel, place: Path, seen: Callable
     np.savez(place / _COLUMNS, **cast(Any, columns))
 
 
-def _columns(batch: Batch[Array], targets: F32, scenes: int, robots: int) -> dict[str, Array]:
+def _columns(batch: Batch[Array], scenes: int, robots: int) -> dict[str, Array]:
     owner = batch.candidates.robot_row
     reach_m: F32 = batch.robots.arm_reach_m[owner]
     clear: U8 = batch.extra["base_is_clear"]
@@ -176,7 +188,6 @@ def _columns(batch: Batch[Array], targets: F32, scenes: int, robots: int) -> dic
         "camera_height_m": batch.robots.camera_height_m,
         "base_height_m": batch.robots.base_height_m,
         "arm_reach_m": batch.robots.arm_reach_m,
-        "targets": targets,
         "robot_of_candidate": robots + owner,
         "base_xy_m": batch.candidates.base_xy_m,
         "label": batch.label.astype(np.uint8),

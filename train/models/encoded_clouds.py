@@ -1,4 +1,4 @@
-"""Clouds whose tokens are already made, packed into two arrays, so that they can be cached."""
+"""Clouds and candidates whose inputs are already made, packed into arrays, so that they can be cached."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from datagen.train.inputs import Clouds
+from datagen.train.inputs import CandidateInputs, Clouds
 from datagen.train.models.tokens import (
     TARGET_NUMBERS,
     TARGET_TENSORS,
@@ -33,10 +33,18 @@ class EncodedClouds(Clouds[A]):
 
     tokens: A  # (R, J, F) float16: centre, valid, numbers, vectors, tensors
     targets: A  # (R, TARGET_WIDTH) float32: numbers, vectors, tensors, radius, rise
+    hand_poses: A  # (S, K, HAND_WIDTH) float16
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedCandidates(CandidateInputs[A]):
+    """N base positions with the estimated visibility of the target."""
+
+    visible_share: A  # (N,) float32
 
 
 def pack(tokens: Tokens) -> tuple[Tensor, Tensor]:
-    """`EncodedClouds.tokens` and `EncodedClouds.targets` of these tokens."""
+    """`EncodedClouds.tokens` and `EncodedClouds.targets` of these tokens; hand poses are packed already."""
     of_tokens = [
         tokens.centres_m,
         tokens.valid[..., None].to(tokens.numbers.dtype),
@@ -70,4 +78,5 @@ def unpack(clouds: EncodedClouds[Tensor], sizes: TokenSizes) -> Tokens:
         target_tensors=t_tensors.unflatten(1, (-1, 2)),
         target_radius_m=radius[:, 0],
         target_rise_m=rise[:, 0],
+        hand_poses=clouds.hand_poses.float(),
     )

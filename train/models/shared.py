@@ -9,13 +9,15 @@ product with (cos, sin, cos 2, sin 2) of the frame's angle:
     token_kj = relu(A f_j + turn_k(V f_j) + B g_kj + C s_k)
 
 then a small layer, and the maximum and the mean over each kind of token, joined with the candidate's
-scalars s_k. The logits do not change when cloud and candidates rotate together about the vertical, nor, if
-`mirrored`, when the scene is mirrored at a candidate's line to the target: the mean over both sides is taken.
+scalars s_k and with what the arm can do with poses of a hand at the target (`hand_pooling.py`). The logits
+do not change when cloud and candidates rotate together about the vertical, nor, if `mirrored`, when the scene
+is mirrored at a candidate's line to the target: the mean over both sides is taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,8 +26,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from datagen.train.inputs import CandidateInputs, Clouds, RobotInputs
-from datagen.train.models.crop import Crop, crop_clouds
-from datagen.train.models.encoded_clouds import EncodedClouds, unpack
+from datagen.train.models.crop import crop_clouds
+from datagen.train.models.encoded_clouds import EncodedCandidates, EncodedClouds, unpack
 from datagen.train.models.frames import (
     N_PAIR_FEATURES,
     N_SCALARS,
@@ -35,6 +37,8 @@ from datagen.train.models.frames import (
     target_features,
 )
 from datagen.train.models.grouping import take_rows
+from datagen.train.models.hand_pooling import HandPooling
+from datagen.train.models.hand_poses import poses_of_clouds
 from datagen.train.models.model import Model, ModelConfig, read_config
 from datagen.train.models.tokens import (
     N_KINDS,
@@ -66,8 +70,8 @@ class SharedConfig(ModelConfig):
     """Sizes and inputs of the shared model.
 
     `camera`: "given", or "unknown" as for `paper`, which has the height of the mount and not of the camera.
-    `observed_visibility`: add rho, estimated on the CPU from the robot's crop. `mirrored`: treat left and
-    right alike.
+    `observed_visibility`: add rho, estimated on the CPU from the robot's crop. `hand_poses`: number of poses
+    of a hand at the target (`hand_poses.py`); 0 for none. `mirrored`: treat left and right alike.
     """
 
     n_points: int = Field(default=1024, ge=1, le=65_536)
@@ -79,7 +83,8 @@ class SharedConfig(ModelConfig):
     head: tuple[Width, ...] = Field(default=(128, 64), max_length=8)
     dropout: float = Field(default=0.4, ge=0, lt=1)
     camera: Literal["given", "unknown"] = "given"
-    observed_visibility: bool = False
+    observed_visibility: bool = True
+    hand_poses: int = Field(default=64, ge=0, le=104)  # at the target, that the cloud leaves room for
     mirrored: bool = True
 
 
@@ -125,11 +130,15 @@ class SharedModel(Model):
             nn.Linear(2 * N_KINDS * width, embedding), nn.LayerNorm(embedding), nn.ReLU()
         )
         self.scalars = nn.Sequential(nn.Linear(n_scalars, 64), nn.ReLU(), nn.Linear(64, embedding))
+        joined = 2 * embedding
+        if self.sizes.hand_poses:
+            self.hands = HandPooling(n_scalars, width)
+            joined += 3 * width
         self.head = nn.Sequential(
-            nn.LayerNorm(2 * embedding),
+            nn.LayerNorm(joined),
             nn.ReLU(),
             nn.Dropout(self.sizes.dropout),
-            mlp(2 * embedding, self.sizes.head, 2),
+            mlp(joined, self.sizes.head, 2),
         )
 
     def forward(
@@ -149,7 +158,12 @@ class SharedModel(Model):
             return unpack(clouds, token_sizes(len(self.sizes.scales_m)))
         with torch.no_grad(), torch.autocast(clouds.points_m.device.type, enabled=False):
             crop = crop_clouds(clouds, robots, self.sizes.n_points)
-            return tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
+            tokens = tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
+        if not self.sizes.hand_poses:
+            return tokens
+        given = (t.cpu().numpy() for t in (clouds.points_m, clouds.target_mask, clouds.n_points))
+        poses = torch.from_numpy(poses_of_clouds(*given, self.sizes.hand_poses))
+        return replace(tokens, hand_poses=poses.to(clouds.points_m.device))
 
     def score_tokens(
         self,
@@ -164,8 +178,7 @@ class SharedModel(Model):
             target, target_left = target_features(frames, tokens, candidates.robot_row)
             parts = [frames.scalars(), target]
             if self.sizes.observed_visibility:
-                crop = crop_clouds(clouds, robots, _VISIBILITY_POINTS)
-                parts.append(_visibility(frames, tokens, crop, candidates))
+                parts.append(stretched(self.visible_share(tokens, clouds, candidates, robots)))
             scalars = torch.cat(parts, dim=1)
         same, left = self._steered(tokens)
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
@@ -184,8 +197,28 @@ class SharedModel(Model):
         ]
         rows = torch.cat([rows.flatten() for _, rows in cut])
         sides = torch.cat([p.flatten(0, 1) for p in pooled])[torch.argsort(rows)]  # (N, 1 or 2, F)
-        seen = self.pooled(sides).mean(1)
-        return self.head(torch.cat([seen, self.scalars(scalars)], dim=1)).float()
+        joined = [self.pooled(sides).mean(1), self.scalars(scalars)]
+        if tokens.hand_poses is not None and self.sizes.hand_poses:
+            cloud_row = robots.cloud_row[candidates.robot_row]
+            joined.append(self.hands(tokens.hand_poses, cloud_row, frames, scalars))
+        return self.head(torch.cat(joined, dim=1)).float()
+
+    def visible_share(
+        self,
+        tokens: Tokens,
+        clouds: Clouds[Tensor],
+        candidates: CandidateInputs[Tensor],
+        robots: RobotInputs[Tensor],
+    ) -> Tensor:
+        """Estimated rho (N,), on the CPU from the robots' crops; that of `EncodedCandidates` as it is."""
+        if isinstance(candidates, EncodedCandidates):
+            return candidates.visible_share
+        crop = crop_clouds(clouds, robots, _VISIBILITY_POINTS)
+        camera_rise_m = self._frames(tokens, clouds, candidates, robots).camera_rise_m
+        eyes_m = torch.cat([candidates.base_xy_m, camera_rise_m[:, None]], dim=1)
+        inputs = (target_frame_points(crop), crop.target_mask, crop.valid, tokens.target_radius_m)
+        rho = visible_shares(*(t.cpu().numpy() for t in (*inputs, candidates.robot_row, eyes_m)))
+        return torch.from_numpy(rho.astype(np.float32)).to(candidates.base_xy_m.device)
 
     def _frames(
         self,
@@ -283,10 +316,6 @@ def _product(steering: Tensor, of_tokens: Tensor) -> Tensor:
     return torch.bmm(steering, of_tokens.flatten(2)).unflatten(2, of_tokens.shape[2:])
 
 
-def _visibility(frames: Frames, tokens: Tokens, crop: Crop, candidates: CandidateInputs[Tensor]) -> Tensor:
-    """(N, 3): estimated rho, and rho stretched near 0 and near 1, where the paper's score is steep."""
-    eyes_m = torch.cat([candidates.base_xy_m, frames.camera_rise_m[:, None]], dim=1)
-    inputs = (target_frame_points(crop), crop.target_mask, crop.valid, tokens.target_radius_m)
-    rho = visible_shares(*(t.cpu().numpy() for t in (*inputs, candidates.robot_row, eyes_m)))
-    share = torch.from_numpy(rho.astype(np.float32)).to(candidates.base_xy_m.device)
+def stretched(share: Tensor) -> Tensor:
+    """(N, 3): rho (N,), and rho stretched near 0 and near 1, where the paper's score is steep."""
     return torch.stack([share, (share / 0.04).clamp(max=1), (share - 0.8).clamp(min=0) / 0.2], dim=1)

@@ -43,6 +43,7 @@ class Tokens:
     target_tensors: Tensor  # (R, 1, 2)
     target_radius_m: Tensor  # (R,) of the sphere around the target's centre that holds its points
     target_rise_m: Tensor  # (R,) of the target's centre above the mount
+    hand_poses: Tensor | None = None  # (S, K, HAND_WIDTH) of the clouds, of `hand_poses`
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,8 @@ _UNSIGNED = b"0" * 64  # in place of the checksum where the checksum is taken
 _NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 _MAX_TEXT = 4096
 _FIX = "Name a checkpoint of `datagen train`, or train it again"
+# Fields that a model's configuration did not have at first, with what models without them are.
+_OLDER_CONFIGS: dict[str, dict[str, Any]] = {"shared": {"hand_poses": 0}}
 
 
 class EpochRecord(ValidationMetrics):
@@ -133,6 +135,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         where = ".".join(str(part) for part in first["loc"]) if first else "head"
         problem = first["msg"].lower() if first else f"incomplete ({e})"
         raise InputError(place, where, problem, _FIX) from None
+    head = replace(head, model_config={**_OLDER_CONFIGS.get(head.model, {}), **head.model_config})
     _refuse_not_finite(place, tensors, _FIX)
     return Checkpoint(head, below("weights/", tensors), below("resume/", tensors), loop)
 

@@ -17,8 +17,11 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.progress import Progress
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
+from datagen.train.encoded.batches import EncodedBatches
+from datagen.train.encoded.runs import encode_runs, encoded_stream
 from datagen.train.label_versions import refuse_mixed_labels
 from datagen.train.models import Model, build_model
+from datagen.train.models.shared import SharedModel
 from datagen.train.rates import rate_fields
 from datagen.train.run_parts import open_parts
 from datagen.train.splits import HouseShare, refuse_one_class, refuse_shared_houses, split_by_house
@@ -57,6 +60,7 @@ class TrainingJob:
     json_lines: bool = False  # as progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
     allow_mixed_labels: bool = False  # labels of one source in different versions
+    encoded: str | None = None  # folder of `encode_runs`: clouds are encoded once, into it
 
 
 def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
@@ -88,6 +92,7 @@ def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, Checkpoi
         _refuse_known_houses(job, began.head, val)
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
+    batches = (train, val) if job.encoded is None else _encoded(job, ranks, model, train, val)
     optimiser = make_optimiser(model, options.lr, options.weight_decay)
     head = _head(job, model, train, val, began.head if began else None)
     position = Position()
@@ -96,7 +101,7 @@ def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, Checkpoi
         refuse_other_training(job.out, there.head, head)
         position = _resume_position(job.out, there, model, optimiser)
     weights = class_weights.to(model.device)
-    return Training(options, model, optimiser, train, val, weights, position, ranks), head
+    return Training(options, model, optimiser, *batches, weights, position, ranks), head
 
 
 def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None:
@@ -165,6 +170,32 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
     if val.n_scenes >= ranks.world:
         val.use_rank(ranks.rank, ranks.world)
     return train, val
+
+
+def _encoded(
+    job: TrainingJob, ranks: Ranks, model: Model, train: SampleStream, val: SampleStream
+) -> tuple[EncodedBatches, EncodedBatches]:
+    """Batches of the streams' scenes from clouds that are encoded once. InputError where that cannot be."""
+    options, folder = job.options, Path(job.encoded or "")
+    cannot = {
+        "--model": not isinstance(model, SharedModel),
+        "--augment": job.augment is not None,
+        "--candidates-per-robot": options.candidates_per_robot is not None,
+        "--processes": ranks.world > 1,
+        "--perturb": bool(_rate_fields(job, job.runs)),
+    }
+    for option, given in cannot.items():
+        if given:
+            problem = f"does not go with {option}: clouds are encoded once, for one `shared` model"
+            raise InputError("datagen train", "--encoded", problem, "Omit one of them")
+    assert isinstance(model, SharedModel)
+    made: list[EncodedBatches] = []
+    for stream, runs, seed in ((train, job.runs, options.seed), (val, job.val_runs or job.runs, None)):
+        clouds = encoded_stream(runs, job.allow_incomplete)
+        encoded = encode_runs(clouds, model, folder, lambda done, of: None)
+        scenes = np.flatnonzero(np.isin(encoded.houses, sorted(stream.house_ids())))
+        made.append(EncodedBatches(encoded, scenes, options.batch_scenes, seed))
+    return made[0], made[1]
 
 
 def _rate_fields(job: TrainingJob, runs: tuple[str, ...]) -> tuple[str, ...]:

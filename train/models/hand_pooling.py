@@ -1,0 +1,67 @@
+"""What an arm at a candidate can do with the hand poses at the target: reach is learned, room is measured.
+
+Each pose of `hand_poses` is seen from the candidate's mount: where TCP and wrist are, in units of the arm's
+reach, at the grasp, before it and above it. Poses to the right of the line to the target are mirrored to its
+left, so the result does not change in a mirror.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from datagen.train.models.frames import Frames
+from datagen.train.models.hand_poses import N_MEASURES
+from datagen.train.models.tokens import turned
+
+_WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up
+_NEAR = 0.05  # of the reach: nearer to the mount a direction is noise
+N_SEEN_FROM_MOUNT = 24
+
+
+class HandPooling(nn.Module):
+    """(N, 3 width) from the poses (S, K, HAND_WIDTH) of clouds: maximum, mean and attention over K."""
+
+    def __init__(self, n_scalars: int, width: int) -> None:
+        super().__init__()
+        self.room = nn.Sequential(nn.Linear(N_MEASURES, width), nn.ReLU(), nn.Linear(width, width))
+        self.seen = nn.Linear(N_SEEN_FROM_MOUNT, width)
+        self.condition = nn.Linear(n_scalars, width)
+        self.joined = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+        )
+        self.attention = nn.Linear(width, 1)
+
+    def forward(self, poses: Tensor, cloud_row: Tensor, frames: Frames, scalars: Tensor) -> Tensor:
+        """`cloud_row` (N,) has the candidates' clouds, `scalars` (N, n_scalars) their features."""
+        measures, axes = poses[..., :N_MEASURES], poses[..., N_MEASURES:]
+        room = self.room(measures)[cloud_row]
+        seen = from_mount(axes.unflatten(2, (3, 3))[cloud_row], frames)
+        hidden = self.joined(room + self.seen(seen) + self.condition(scalars)[:, None])
+        share = torch.softmax(self.attention(hidden), dim=1)
+        return torch.cat([hidden.amax(1), hidden.mean(1), (share * hidden).sum(1)], dim=1)
+
+
+def from_mount(axes: Tensor, frames: Frames) -> Tensor:
+    """Features (N, K, N_SEEN_FROM_MOUNT) of TCP, approach and closing axis (N, K, 3, 3), target frame."""
+    forward = frames.forward[:, None, None]
+    level = turned(axes[..., :2], forward.expand(*axes.shape[:3], 2))
+    # Left or right: by the approach, or by the place where the hand comes along the line.
+    side = torch.where(level[..., 1, 1] < 0, -1.0, 1.0)[..., None]
+    level = torch.stack([level[..., 0], level[..., 1] * side], dim=-1)
+    tcp, approach, closing = torch.cat([level, axes[..., 2:]], dim=-1).unbind(2)
+    closing = closing * torch.where(closing[..., :1] < 0, -1.0, 1.0)  # both fingers are alike
+    reach = frames.arm_reach_m[:, None, None]
+    away = torch.stack([frames.planar_m, torch.zeros_like(frames.planar_m), frames.target_rise_m], dim=-1)
+    tip = (tcp + away[:, None]) / reach
+    wrist = tip - approach * (_WRIST_M / reach)
+    before = wrist - approach * (_WAY_M / reach)
+    above = torch.cat([wrist[..., :2], wrist[..., 2:] + _WAY_M / reach], dim=-1)
+    lengths = [torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (tip, wrist, before, above)]
+    planar = torch.linalg.vector_norm(wrist[..., :2], dim=-1, keepdim=True)
+    outward = (approach * wrist).sum(-1, keepdim=True) / (lengths[1] + _NEAR)
+    return torch.cat([tip, approach, closing, wrist, before, above, *lengths, planar, outward], dim=-1)

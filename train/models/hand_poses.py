@@ -1,0 +1,282 @@
+"""Poses of a parallel hand at the target, and how much room the observed cloud leaves them.
+
+A label is good where an arm reaches a grasp that is free in the scene. Which grasps are free can be seen
+without an arm: this module lays a grid of approach and closing directions over the target, moves the hand to
+where it would grip, and measures clearances there, on the way in and on the way up. Whether an arm reaches a
+pose from a base is left to the model (`hand_features.py`).
+
+The target's unobserved back is a copy of its observed points, turned by half a turn about the vertical
+through its centre, as in `observed_visibility`. Directions begin at the side from which the target was seen,
+so that poses turn with the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import pi
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from datagen.train.inputs import F32, F64, Bools, Ints
+
+# The Franka Hand's collision shapes (robots' files in workers/robots): other parallel hands are alike.
+_STROKE_M = 0.08
+_PAD_M = 0.011  # half the width of a finger
+_TIP_M = 0.0095  # from the TCP to the fingertips, along the approach
+_FINGER_M = 0.015  # thickness of a finger, along the closing axis
+_PALM_M = (0.033, 0.105)  # half sizes of the palm across the approach
+_PALM_NEAR_M, _PALM_FAR_M = -0.0364, -0.13  # along the approach
+# Spheres that stand for the parts, along the approach and, of the palm, along the closing axis.
+_FINGER_Z_M = (-0.045, -0.03, -0.015, 0.0)
+_PALM_YZ_M = tuple((y, z) for z in (-0.066, -0.1) for y in (-0.08, -0.04, 0.0, 0.04, 0.08))
+_WRIST_Z_M = (-0.17, -0.22, -0.28)
+_FINGER_RADIUS_M, _PALM_RADIUS_M, _WRIST_RADIUS_M = 0.009, 0.03, 0.05
+_WAYS_M = (0.05, 0.1)  # back along the approach, and up
+
+# Tilts of the approach from straight down, azimuths, and turns of the hand about it.
+_DIRECTIONS = ((0, 1, 8), (20, 4, 4), (45, 8, 4), (70, 8, 4), (95, 8, 2))
+_GRIPS = 6  # places along the closing axis (middle, both walls) at two depths
+_OPENS_M = 0.02  # how much wider than the target the hand opens
+_SUPPORT_GAP_M = 0.004  # what is kept from the plane that the target stands on
+_TARGET_POINTS, _SHAPE_POINTS = 128, 256
+_NEIGHBOURS = 9
+
+# Distances to the nearest observed point, on grids around the target.
+_AROUND_M, _CELL_M = 0.32, 0.01
+_TARGET_AROUND_M, _TARGET_CELL_M = 0.12, 0.005
+_BEYOND_M = 0.1  # clearance outside of a grid
+
+N_MEASURES = 25
+HAND_WIDTH = N_MEASURES + 9
+
+
+@dataclass(frozen=True, eq=False)
+class _Hands:
+    """Hands at P poses in the frame in which the target was seen from +x."""
+
+    tcp_m: F64  # (P, 3)
+    approach: F64  # (P, 3)
+    closing: F64  # (P, 3)
+    opening_m: F64  # (P,)
+
+    @property
+    def across(self) -> F64:
+        """The third axis (P, 3), along the pads' width."""
+        return np.cross(self.closing, self.approach)
+
+    def fingers(self) -> F64:
+        """Spheres (P, 2, 4, 3) of both fingers."""
+        side = (self.opening_m / 2 + _FINGER_M / 2)[:, None, None, None] * np.array([1.0, -1.0])[
+            :, None, None
+        ]
+        z = np.array(_FINGER_Z_M)[:, None] * self.approach[:, None, None]
+        return self.tcp_m[:, None, None] + side * self.closing[:, None, None] + z
+
+    def palm(self) -> F64:
+        """Spheres (P, 10, 3) of the palm."""
+        y, z = np.array(_PALM_YZ_M).T[..., None]
+        return self.tcp_m[:, None] + y * self.closing[:, None] + z * self.approach[:, None]
+
+    def wrist(self) -> F64:
+        """Spheres (P, 3, 3) of what carries the hand."""
+        return self.tcp_m[:, None] + np.array(_WRIST_Z_M)[:, None] * self.approach[:, None]
+
+
+def poses_of_clouds(points_m: F32, target_mask: Bools, n_points: Ints, count: int) -> F32:
+    """`hand_poses` (S, count, HAND_WIDTH) of clouds (S, P, 3) of which the first `n_points` (S,) count."""
+    found = np.zeros((len(n_points), count, HAND_WIDTH), np.float32)
+    for row, n in enumerate(n_points):
+        cloud_m, mask = points_m[row, :n], target_mask[row, :n]
+        found[row] = hand_poses(cloud_m[~mask], cloud_m[mask], count)
+    return found
+
+
+def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
+    """The `count` most promising poses (count, HAND_WIDTH), best first: measures, TCP, approach, closing.
+
+    Points of other objects (M, 3) and of the target (T, 3) are in the target's frame, as are the poses. Rows
+    are zero where no point of the target was observed, and beyond the number of directions.
+    """
+    found = np.zeros((count, HAND_WIDTH), np.float32)
+    others_m = others_m[np.isfinite(others_m).all(1)].astype(np.float64)
+    target_m = target_m[np.isfinite(target_m).all(1)].astype(np.float64)[:_SHAPE_POINTS]
+    if not len(target_m):
+        return found
+    seen_from = target_m[:_TARGET_POINTS, :2].mean(0)
+    angle = float(np.arctan2(seen_from[1], seen_from[0])) if np.hypot(*seen_from) > 1e-4 else 0.0
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # from the frame that is seen from +x
+    measures, penalty, hands = _measured(others_m @ R, target_m @ R)
+    best = np.argsort(penalty, kind="stable")[:count]
+    axes = [v[best] @ R.T for v in (hands.tcp_m, hands.approach, hands.closing)]
+    found[: len(best)] = np.concatenate([measures[best], *axes], axis=1)
+    return found
+
+
+def _measured(others_m: F64, target_m: F64) -> tuple[F64, F64, _Hands]:
+    """Measures (D, N_MEASURES), penalties (D,) and poses of the best grip of each direction."""
+    turned = np.array([-1.0, -1.0, 1.0])
+    half = target_m[:_TARGET_POINTS]
+    points, whole = np.concatenate([half, half * turned]), np.concatenate([target_m, target_m * turned])
+    normals = _normals(half)
+    normals = np.concatenate([normals, normals * turned])
+    support_m = float(whole[:, 2].min())
+    frames = _frames()  # (D, 3 axes, 3)
+    local = np.einsum("dij,nj->din", frames, points)
+    facing = np.abs(frames[:, 1] @ normals.T)
+    grips, low, high = _grips(local, frames[:, :, 2], support_m)
+
+    offset = local[:, None] - grips[..., None]  # (D, 6, 3, N)
+    x, y, z = offset[:, :, 0], offset[:, :, 1], offset[:, :, 2]
+    between = (np.abs(x) < _PAD_M) & (z > -0.014) & (z < _PAD_M) & (np.abs(y) < 0.043)
+    held = between.sum(-1)
+    spread = (np.abs(y) * between).max(-1) * 2
+    width = np.maximum(np.where(between, y, -9).max(-1) - np.where(between, y, 9).min(-1), 0)
+    wall = between & (np.abs(y) > spread[..., None] / 2 - 0.006)
+    squareness = (facing[:, None] * wall).sum(-1) / np.maximum(wall.sum(-1), 1)
+    depth = (z * between).sum(-1) / np.maximum(held, 1)
+
+    tcp = np.einsum("dij,dki->dkj", frames, grips).reshape(-1, 3)
+    axes = np.repeat(frames, _GRIPS, axis=0)
+    opening = np.minimum(spread + _OPENS_M, _STROKE_M).ravel()
+    hands = _Hands(tcp, axes[:, 2], axes[:, 1], opening)
+    clear, own = _clearances(hands, others_m, whole)
+    tips, palm = (h - support_m for h in _lowest(tcp[:, 2], axes[:, :, 2], opening))
+
+    extent = np.repeat(high - low, _GRIPS, axis=0)  # (P, 3)
+    numbers = [np.log1p(held.ravel()) / 3, 10 * width.ravel(), 10 * opening]
+    numbers += [squareness.ravel(), 20 * depth.ravel()]
+    numbers += [np.clip(20 * gap, -1, 1) for gap in clear] + [np.clip(40 * gap, -1, 1) for gap in own]
+    numbers += [np.clip(40 * tips, -2, 2), np.clip(20 * palm, -2, 2), tips < 0.002]
+    numbers += [10 * extent[:, 2], 10 * extent[:, 1], 20 * (tcp[:, 2] - support_m)]
+    numbers += [20 * np.hypot(tcp[:, 0], tcp[:, 1])]
+    numbers += [20 * (np.einsum("pi,pi->p", tcp, hands.approach) - np.repeat(low[:, 2], _GRIPS))]
+
+    def short(gap: F64) -> F64:
+        return np.maximum(0.005 - gap, 0) * 40
+
+    penalty = 2.0 * (held.ravel() < 3) + 3.0 * (width.ravel() > 0.078) + 1 - squareness.ravel()
+    weights = (1.5, 1.5, 1.5, 0.5, 0.7, 0.7, 0.7, 0.7, 0.4, 0.4)
+    penalty += sum(w * short(gap) for w, gap in zip(weights, clear, strict=True))
+    penalty += short(own[0] + 0.004) + short(own[1]) + 2 * short(tips + 0.002) + 2 * short(palm + 0.002)
+    best = np.arange(len(frames)) * _GRIPS + penalty.reshape(-1, _GRIPS).argmin(1)
+    chosen = _Hands(hands.tcp_m[best], hands.approach[best], hands.closing[best], opening[best])
+    return np.stack(numbers, axis=1)[best], penalty[best], chosen
+
+
+@cache
+def _frames() -> F64:
+    """Axes (D, 3, 3) of the hand in every direction: across, closing, approach."""
+    frames: list[F64] = []
+    for tilt_deg, azimuths, turns in _DIRECTIONS:
+        tilt, shift = np.deg2rad(tilt_deg), 0.5 if tilt_deg == 20 else 0.0
+        for k in range(azimuths):
+            a = 2 * pi * (k + shift) / azimuths
+            approach = -np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)])
+            level = np.array([-np.sin(a), np.cos(a), 0.0])
+            for turn in np.arange(turns) * pi / turns:
+                closing = np.cos(turn) * level + np.sin(turn) * np.cross(approach, level)
+                frames.append(np.stack([np.cross(closing, approach), closing, approach]))
+    return np.array(frames)
+
+
+def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
+    """TCPs (D, 6, 3) in each direction's own axes, and the target's bounds (D, 3) there.
+
+    `local` (D, 3, N) are the target's points, `rise` (D, 3) is the height gained along each axis. At the
+    middle and at both walls, shallow and deep; where the hand would touch the support it is drawn back, or
+    moved up along the pads' width.
+    """
+    low, high = local.min(2), local.max(2)
+    places = np.stack([(low[:, 1] + high[:, 1]) / 2, low[:, 1] + 0.004, high[:, 1] - 0.004], axis=1)
+    across, up = rise[:, :1], rise[:, 2:]
+    opening = np.minimum(high[:, 1:2] - low[:, 1:2] + _OPENS_M, _STROKE_M)
+    deep = np.minimum(low[:, 2] + 0.032, (low[:, 2] + high[:, 2]) / 2 + 0.004)
+    grips: list[F64] = []
+    for depth in (low[:, 2] + 0.008, deep):
+        z = np.repeat(depth[:, None], 3, axis=1)
+        x = np.repeat(np.median(local[:, 0], axis=1)[:, None], 3, axis=1)
+
+        def missing(x: F64, z: F64) -> F64:
+            height = across * x + rise[:, 1:2] * places + up * z
+            lowest = np.minimum(*_lowest(height, rise[:, None], opening))
+            return np.maximum(_SUPPORT_GAP_M - (lowest - support_m), 0)
+
+        back = np.where(up < -0.3, missing(x, z) / np.maximum(-up, 0.3), 0)
+        z = z - np.minimum(back, np.maximum(z - low[:, 2:] + 0.004, 0))
+        aside = missing(x, z) / np.maximum(np.abs(across), 0.3) * np.sign(across)
+        x = np.clip(
+            x + np.where(np.abs(across) > 0.3, aside, 0),
+            low[:, :1] + 0.004,
+            np.maximum(high, low + 0.008)[:, :1] - 0.004,
+        )
+        grips.append(np.stack([x, places, z], axis=2))
+    return np.concatenate(grips, axis=1), low, high
+
+
+def _lowest(tcp_height_m: F64, rise: F64, opening_m: F64) -> tuple[F64, F64]:
+    """Heights of the lowest corner of the fingertips and of the palm; `rise` (..., 3) as in `_grips`."""
+    across, closing = np.abs(rise[..., 0]), np.abs(rise[..., 1])
+    approach = rise[..., 2]
+    tips = tcp_height_m - np.maximum(-approach * _TIP_M, 0) - across * 0.009
+    tips = tips - closing * (opening_m / 2 + _FINGER_M)
+    palm = tcp_height_m + np.minimum(approach * _PALM_NEAR_M, approach * _PALM_FAR_M)
+    return tips, palm - across * _PALM_M[0] - closing * _PALM_M[1]
+
+
+def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64], list[F64]]:
+    """Clearances (P,) from other objects: nearer finger, other finger, palm, wrist; fingers and palm on two
+    places of the way in; all on two of the way up. From the target: fingers, palm.
+    """
+    fingers, palm, wrist = hands.fingers(), hands.palm(), hands.wrist()
+    others = _DistanceGrid(others_m, _AROUND_M, _CELL_M)
+    own = _DistanceGrid(target_m, _TARGET_AROUND_M, _TARGET_CELL_M)
+    each = others(fingers).min(2) - _FINGER_RADIUS_M
+    clear = [each.min(1), each.max(1), others(palm).min(1) - _PALM_RADIUS_M]
+    clear.append(others(wrist).min(1) - _WRIST_RADIUS_M)
+    both, up = fingers.reshape(len(palm), -1, 3), np.array([0.0, 0.0, 1.0])
+    for way in _WAYS_M:
+        back = -way * hands.approach[:, None]
+        clear.append(others(both + back).min(1) - _FINGER_RADIUS_M)
+        clear.append(others(palm + back).min(1) - _PALM_RADIUS_M)
+    for way in _WAYS_M:
+        raised = others(both + way * up).min(1) - _FINGER_RADIUS_M
+        clear.append(np.minimum(raised, others(palm + way * up).min(1) - _PALM_RADIUS_M))
+    return clear, [own(both).min(1) - _FINGER_RADIUS_M, own(palm).min(1) - _PALM_RADIUS_M]
+
+
+class _DistanceGrid:
+    """Distances to the nearest of some points, in cells of a cube around the origin."""
+
+    def __init__(self, points_m: F64, half_m: float, cell_m: float) -> None:
+        self._half_m, self._cell_m, self._n = half_m, cell_m, round(2 * half_m / cell_m)
+        free = np.ones((self._n,) * 3, np.bool_)
+        cell, inside = self._cells(points_m)
+        free[tuple(cell[inside].T)] = False
+        if free.all():
+            distance = np.full(free.shape, half_m)
+        else:
+            distance = ndimage.distance_transform_edt(free, cell_m)
+        self._distance_m = np.asarray(distance, np.float32).ravel()
+
+    def __call__(self, points_m: F64) -> F64:
+        """Distances (...) of points (..., 3)."""
+        cell, inside = self._cells(points_m)
+        row = (cell[..., 0] * self._n + cell[..., 1]) * self._n + cell[..., 2]
+        return np.where(inside, self._distance_m[np.where(inside, row, 0)], _BEYOND_M)
+
+    def _cells(self, points_m: F64) -> tuple[np.ndarray, Bools]:
+        cell = np.floor((points_m + self._half_m) / self._cell_m).astype(np.int32)
+        return cell, ((cell >= 0) & (cell < self._n)).all(-1)
+
+
+def _normals(points_m: F64) -> F64:
+    """Normals (N, 3), of either sign, of the planes of their neighbours; zero for fewer than four points."""
+    if len(points_m) < 4:
+        return np.zeros_like(points_m)
+    _, row = KDTree(points_m).query(points_m, min(_NEIGHBOURS, len(points_m)))
+    around = points_m[row] - points_m[row].mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
