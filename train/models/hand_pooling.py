@@ -16,7 +16,7 @@ from datagen.train.models.tokens import turned
 
 _WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up
 _NEAR = 0.05  # of the reach: nearer to the mount a direction is noise
-N_SEEN_FROM_MOUNT = 24
+N_SEEN_FROM_MOUNT = 26
 
 
 class HandPooling(nn.Module):
@@ -50,11 +50,14 @@ def from_mount(axes: Tensor, frames: Frames) -> Tensor:
     """Features (N, K, N_SEEN_FROM_MOUNT) of TCP, approach and closing axis (N, K, 3, 3), target frame."""
     forward = frames.forward[:, None, None]
     level = turned(axes[..., :2], forward.expand(*axes.shape[:3], 2))
-    # Left or right: by the approach, or by the place where the hand comes along the line.
-    side = torch.where(level[..., 1, 1] < 0, -1.0, 1.0)[..., None]
-    level = torch.stack([level[..., 0], level[..., 1] * side], dim=-1)
+    left = level[..., 1]  # of TCP, approach and closing axis; a mirror changes the sign of each
+    x, z = level[:, :, 2, 0], axes[:, :, 2, 2]
+    # By the approach; where the hand comes along the line, by its place or by how it is turned.
+    side = left[..., 1] + 0.1 * left[..., 0] + 0.01 * left[..., 2] * (x + z)
+    level = torch.stack([level[..., 0], left * torch.where(side < 0, -1.0, 1.0)[..., None]], dim=-1)
     tcp, approach, closing = torch.cat([level, axes[..., 2:]], dim=-1).unbind(2)
-    closing = closing * torch.where(closing[..., :1] < 0, -1.0, 1.0)  # both fingers are alike
+    x, y, z = closing.unbind(-1)
+    closing = torch.stack([x * x, y * y, x * y, x * z, y * z], dim=-1)  # both fingers are alike
     reach = frames.arm_reach_m[:, None, None]
     away = torch.stack([frames.planar_m, torch.zeros_like(frames.planar_m), frames.target_rise_m], dim=-1)
     tip = (tcp + away[:, None]) / reach

@@ -45,7 +45,7 @@ _TARGET_POINTS, _SHAPE_POINTS = 128, 256
 _NEIGHBOURS = 9
 
 # Distances to the nearest observed point, on grids around the target.
-_AROUND_M, _CELL_M = 0.32, 0.01
+_AROUND_M, _CELL_M = 0.3, 0.01  # no arm is shorter: farther points are in no robot's crop
 _TARGET_AROUND_M, _TARGET_CELL_M = 0.12, 0.005
 _BEYOND_M = 0.1  # clearance outside of a grid
 
@@ -101,8 +101,9 @@ def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
     are zero where no point of the target was observed, and beyond the number of directions.
     """
     found = np.zeros((count, HAND_WIDTH), np.float32)
-    others_m = others_m[np.isfinite(others_m).all(1)].astype(np.float64)
-    target_m = target_m[np.isfinite(target_m).all(1)].astype(np.float64)[:_SHAPE_POINTS]
+    # NaN fails the comparisons.
+    others_m = others_m[np.linalg.norm(others_m, axis=1) <= _AROUND_M].astype(np.float64)
+    target_m = target_m[np.linalg.norm(target_m, axis=1) <= _AROUND_M].astype(np.float64)[:_SHAPE_POINTS]
     if not len(target_m):
         return found
     seen_from = target_m[:_TARGET_POINTS, :2].mean(0)

@@ -28,7 +28,8 @@ def turned_about_z(tables: Tables, angle: float) -> Tables:
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return small_model("shared", width=32, embedding=32)
+    """Without hand poses, whose clearances are measured in cells: they change a little when the scene turns."""
+    return small_model("shared", width=32, embedding=32, hand_poses=0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -43,7 +44,7 @@ def test_rotating_cloud_and_candidates_together_changes_nothing(model: Model, an
 @pytest.mark.parametrize("mirrored", [True, False])
 @torch.no_grad()
 def test_only_mirrored_models_are_invariant_to_a_mirror(mirrored: bool):
-    model = small_model("shared", mirrored=mirrored)
+    model = small_model("shared", mirrored=mirrored, hand_poses=0)
     clouds, candidates, robots = drawn_tables(4)
     flip = torch.tensor([1.0, -1.0, 1.0])
     before = model.score(clouds, candidates, robots)

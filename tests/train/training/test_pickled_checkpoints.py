@@ -44,12 +44,14 @@ def test_a_training_of_the_previous_version_resumes(tmp_path: Path):
     """It ends as one that was never interrupted."""
     unpack(GOLDEN / "run-format-2-schema-2.zip", tmp_path)
     val = tmp_path / "merged/parts/7dd3e367e63166c1"
+    as_it_was = {**TINY, "hand_poses": 0, "observed_visibility": False}  # the defaults of its time
     ends: list[Path] = []
     for name in ("resumed", "whole"):
         out = tmp_path / name
         if name == "resumed":
             shutil.copy(OLD, out)
-        assert train_until(job_of(tmp_path / "run", out, val, epochs=3, batch_scenes=1))[0]
+        job = job_of(tmp_path / "run", out, val, epochs=3, batch_scenes=1, model_config=as_it_was)
+        assert train_until(job)[0]
         ends.append(out)
     resumed, whole = map(read_checkpoint, ends)
     assert resumed.head.step == whole.head.step == 6
