@@ -102,15 +102,17 @@ def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
     """
     found = np.zeros((count, HAND_WIDTH), np.float32)
     # NaN fails the comparisons.
-    others_m = others_m[np.linalg.norm(others_m, axis=1) <= _AROUND_M].astype(np.float64)
-    target_m = target_m[np.linalg.norm(target_m, axis=1) <= _AROUND_M].astype(np.float64)[:_SHAPE_POINTS]
-    if not len(target_m):
+    others, target = (
+        m[np.linalg.norm(m, axis=1) <= _AROUND_M].astype(np.float64) for m in (others_m, target_m)
+    )
+    target = target[:_SHAPE_POINTS]
+    if not len(target):
         return found
-    seen_from = target_m[:_TARGET_POINTS, :2].mean(0)
+    seen_from = target[:_TARGET_POINTS, :2].mean(0)
     angle = float(np.arctan2(seen_from[1], seen_from[0])) if np.hypot(*seen_from) > 1e-4 else 0.0
     c, s = np.cos(angle), np.sin(angle)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # from the frame that is seen from +x
-    measures, penalty, hands = _measured(others_m @ R, target_m @ R)
+    measures, penalty, hands = _measured(others @ R, target @ R)
     best = np.argsort(penalty, kind="stable")[:count]
     axes = [v[best] @ R.T for v in (hands.tcp_m, hands.approach, hands.closing)]
     found[: len(best)] = np.concatenate([measures[best], *axes], axis=1)
@@ -271,7 +273,7 @@ class _DistanceGrid:
 
     def _cells(self, points_m: F64) -> tuple[np.ndarray, Bools]:
         cell = np.floor((points_m + self._half_m) / self._cell_m).astype(np.int32)
-        return cell, ((cell >= 0) & (cell < self._n)).all(-1)
+        return cell, np.asarray(((cell >= 0) & (cell < self._n)).all(-1), np.bool_)
 
 
 def _normals(points_m: F64) -> F64:

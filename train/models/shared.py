@@ -161,8 +161,10 @@ class SharedModel(Model):
             tokens = tokens_of(crop, self.sizes.tokens, self.sizes.near_m, self.sizes.scales_m)
         if not self.sizes.hand_poses:
             return tokens
-        given = (t.cpu().numpy() for t in (clouds.points_m, clouds.target_mask, clouds.n_points))
-        poses = torch.from_numpy(poses_of_clouds(*given, self.sizes.hand_poses))
+        points, mask, count = (
+            t.cpu().numpy() for t in (clouds.points_m, clouds.target_mask, clouds.n_points)
+        )
+        poses = torch.from_numpy(poses_of_clouds(points, mask, count, self.sizes.hand_poses))
         return replace(tokens, hand_poses=poses.to(clouds.points_m.device))
 
     def score_tokens(

@@ -28,7 +28,7 @@ def turned_about_z(tables: Tables, angle: float) -> Tables:
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    """Without hand poses, whose clearances are measured in cells: they change a little when the scene turns."""
+    """Without hand poses, whose clearances are in cells: they change a little when the scene turns."""
     return small_model("shared", width=32, embedding=32, hand_poses=0)
 
 
