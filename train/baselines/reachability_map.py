@@ -38,7 +38,7 @@ class ReachabilityMap:
     of 1 / `_CELLS_PER_REACH` of the reach. A direction's azimuth is 0 where it points away from the robot.
     """
 
-    reachable: F32  # (D, H, LEVELS, AZIMUTHS), 0 or 1
+    reachable: F32  # (D, H, LEVELS, AZIMUTHS), 0 to 1
     lowest: float  # in units of the reach
     gripper: Gripper
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,8 +37,7 @@ def turned_about_z(batch: Batch[Any], angle: float) -> Batch[Any]:
 
 def test_the_map_ends_at_the_reach_and_holds_both_ways_to_a_point_beside_the_mount() -> None:
     found = reachability_map("panda-scaled", REACH_M)
-    assert set(np.unique(found.reachable)) <= {0.0, 1.0} or found.reachable.min() >= 0
-    assert found.reachable.max() <= 1 + 1e-6
+    assert found.reachable.min() >= 0 and found.reachable.max() <= 1 + 1e-6
     far = found.at(np.array([1.05, 0.0, 0.5]), np.array([0.3, 1.5, -1.2]))
     assert (far == 0).all()
     (near,) = found.at(np.array([0.5]), np.array([0.3]))
@@ -74,7 +74,7 @@ def test_more_points_never_free_a_direction() -> None:
     gripper = reachability_map("panda-scaled", REACH_M).gripper
     points = np.random.default_rng(0).uniform(-0.25, 0.25, (40, 3)).astype(np.float32)
     free = [free_approaches(points[:n], part_directions(), gripper) for n in (0, 3, 10, 40)]
-    for fewer, more in zip(free, free[1:], strict=False):
+    for fewer, more in pairwise(free):
         assert not (more & ~fewer).any()
     assert free[1].sum() < free[0].sum()
 
@@ -99,7 +99,7 @@ def test_an_arm_is_known_by_its_reach() -> None:
     xarm = batch_of_one_arm(2, reach_m=0.863)
     assert np.array_equal(Reachability().score(xarm), Reachability(("xarm7",)).score(xarm))
     assert not np.array_equal(Reachability().score(xarm), Reachability(("panda-scaled",)).score(xarm))
-    with pytest.raises(InputError, match="none of xarm7 has the reach 0.800"):
+    with pytest.raises(InputError, match=r"none of xarm7 has the reach 0\.800"):
         Reachability(("xarm7",)).score(batch_of_one_arm())
 
 

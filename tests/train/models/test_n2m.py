@@ -1,4 +1,4 @@
-"""The mixture of base positions: the same for every direction of the scene, and probabilities that sum to 1."""
+"""The mixture of base positions: the same for every direction of the scene, with probabilities."""
 
 from __future__ import annotations
 
