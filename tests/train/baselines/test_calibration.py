@@ -47,9 +47,8 @@ def test_two_scores_get_the_shares_of_good_ones_among_clear_candidates() -> None
     batch = make_batch(1)
     clear = is_clear(batch)
     score = np.where(np.arange(len(batch)) % 2 == 0, 7.0, -3.0)
-    label = np.where(score == 7, np.arange(len(batch)) % 3 > 0, np.arange(len(batch)) % 5 == 0).astype(
-        np.int64
-    )
+    k = np.arange(len(batch))
+    label = np.where(score == 7, k % 3 > 0, k % 5 == 0).astype(np.int64)
     chances = calibrate(Given(score), [replace(batch, label=label)])
     for value in (-3.0, 7.0):
         share = label[clear & (score == value)].mean()
@@ -59,6 +58,4 @@ def test_two_scores_get_the_shares_of_good_ones_among_clear_candidates() -> None
 def test_equal_labels_cannot_be_calibrated() -> None:
     batch = make_batch(0)
     with pytest.raises(InputError, match="labels are equal"):
-        calibrate(
-            Given(np.arange(len(batch), dtype=float)), [replace(batch, label=np.ones_like(batch.label))]
-        )
+        calibrate(Given(np.zeros(len(batch))), [replace(batch, label=np.ones_like(batch.label))])
