@@ -107,5 +107,6 @@ def _turned(free: Bools, heading_rad: F64) -> F32:
     part: F32 = (shift - whole).astype(np.float32)[:, None, None]
     column = (np.arange(AZIMUTHS) + whole[:, None]) % AZIMUTHS
     table = free.astype(np.float32).T
-    lower, upper = (table[c % AZIMUTHS].transpose(0, 2, 1) for c in (column, column + 1))
-    return lower + part * (upper - lower)
+    lower: F32 = table[column].transpose(0, 2, 1)
+    upper: F32 = table[(column + 1) % AZIMUTHS].transpose(0, 2, 1)
+    return np.asarray(lower + part * (upper - lower), np.float32)
