@@ -84,7 +84,7 @@ def train_model(
     out: File,
     val: Places | None = None,
     init: File | None = None,
-    model: Literal["paper", "shared"] | None = None,
+    model: Literal["paper", "shared", "n2m"] | None = None,
     model_config: Sequence[str] | None = None,
     epochs: Whole | None = None,
     batch_scenes: Whole = 16,

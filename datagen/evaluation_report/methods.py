@@ -14,15 +14,18 @@ from pydantic import ValidationError
 from datagen.configuration.specify import first_of, read_toml
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
 from datagen.schemas.errors import InputError
+from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import steps
 from datagen.schemas.specification import HeuristicParams
-from datagen.train.baselines import BASELINES, FIELDS, Baseline, fit_baselines, make_baselines
+from datagen.train.baselines import BASELINES, FIELDS, fit_baselines, make_baselines
+from datagen.train.baselines.calibration import Calibration, calibrate
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.dataset import SampleStream
 from datagen.train.evaluation.comparisons import NO_TRAINING, TrainedBy
 from datagen.train.evaluation.evaluation import Method
 from datagen.train.scorers import ModelScorer, Scorer
 from datagen.train.splits import refuse_shared_houses
+from datagen.workers.extras import EXTRAS, how_to_get
 
 if TYPE_CHECKING:
     from datagen.train.training.checkpoints import CheckpointHead
@@ -36,8 +39,8 @@ REGIMES = {"stage1": "stage1", "sim-only": "sim-only", "stage2": "two-stage"}
 class EvaluatedMethod:
     """One method and its origin.
 
-    Models have a path and a checkpoint, baselines their fitted numbers. `note` is printed wherever the method
-    is named.
+    Models have a path and a checkpoint, baselines their fitted numbers, and where they were fitted a
+    calibration. `note` is printed wherever the method is named.
     """
 
     name: str
@@ -46,6 +49,7 @@ class EvaluatedMethod:
     head: CheckpointHead | None = None
     state: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""
+    calibration: Calibration | None = None
 
     @property
     def regime(self) -> str:
@@ -63,7 +67,7 @@ class EvaluatedMethod:
     def method(self) -> Method:
         """The method for the metrics."""
         is_probability = self.head is not None or isinstance(self.scorer, Scalars)
-        return Method(self.name, self.scorer.threshold, self.origin, is_probability)
+        return Method(self.name, self.scorer.threshold, self.origin, is_probability, self.calibration)
 
     @property
     def houses(self) -> frozenset[str]:
@@ -149,8 +153,15 @@ def baseline_methods(
             raise InputError("--baselines", NONE, "is given with others", "Give only none, or omit it")
         return BaselineMethods((), {}, frozenset())
     names = list(dict.fromkeys(asked or BASELINES))
-    made = make_baselines(names, detector, heuristic, seed)
     left_out: dict[str, str] = {}
+    if not asked and EXTRAS["sim"].missing():
+        names.remove("reachability")
+        left_out["reachability"] = f"needs the robots' files. {how_to_get('sim')}"
+    specs = [spec for run in runs for spec in run.specs]
+    specs += [run.manifest.spec for place in fit for run in open_runs(place)]
+    robots = tuple(dict.fromkeys(spec.arm.robot for spec in specs if spec.arm is not None))
+    made = make_baselines(names, detector, heuristic, seed, robots)
+    calibrations: dict[str, Calibration] = {}
     houses: frozenset[str] = frozenset()
     if fit:
         for place in fit:
@@ -167,23 +178,28 @@ def baseline_methods(
                 refuse_shared_houses(stream, run.stream)
         houses = frozenset(stream.house_ids())
         batches = list(stream.epoch(0))
-        fitted: list[Baseline] = []
         with steps("baselines fitted", len(made), json) as step:
-            for baseline in made:
-                fitted += fit_baselines([baseline], batches)
+            for k, baseline in enumerate(made):
+                (made[k],) = fit_baselines([baseline], batches)
+                calibrations[made[k].name] = calibrate(made[k], batches)
                 step()
-        made = fitted
     else:
         why = "needs runs to fit its parameters on (--fit)"
-        left_out = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
-        if asked and left_out:
-            name = next(iter(left_out))
+        unfitted = {name: why for name, b in zip(names, made, strict=True) if b.needs_fit}
+        left_out |= unfitted
+        if asked and unfitted:
+            name = next(iter(unfitted))
             raise InputError("--baselines", name, why, "Name runs in validation houses with --fit")
         made = [b for b in made if not b.needs_fit]
     # The note of a method follows its name in brackets.
     told = [(b, *b.name.partition(" (")[::2]) for b in made]
     return BaselineMethods(
-        tuple(EvaluatedMethod(name, b, state=b.state(), note=note.rstrip(")")) for b, name, note in told),
+        tuple(
+            EvaluatedMethod(
+                name, b, state=b.state(), note=note.rstrip(")"), calibration=calibrations.get(b.name)
+            )
+            for b, name, note in told
+        ),
         left_out,
         houses,
     )

@@ -208,7 +208,7 @@ def test_baselines_stand_beside_models_and_are_fitted_in_other_houses_alone(
     words = ["evaluate", str(grids), "--bootstrap", "20", "--candidates", "grid"]
     report = json_of(capsys, words)
     names = [method["name"] for method in report["methods"]]
-    assert names == ["proximity", "threshold", "threshold-visibility", "analytic"]
+    assert names == ["proximity", "threshold", "threshold-visibility", "analytic", "reachability"]
     assert set(report["left_out"]) == {"distance", "scalars"}
     assert all("--fit" in why for why in report["left_out"].values())
     stored = arrays_of(grids)

@@ -11,9 +11,11 @@ from datagen.train.baselines.baseline import FIELDS, Baseline
 from datagen.train.baselines.detection import ThresholdDetector
 from datagen.train.baselines.detector import ZeroShotDetector
 from datagen.train.baselines.distance import DistanceBand
+from datagen.train.baselines.reachability import Reachability
 from datagen.train.baselines.rules import Analytic, Proximity, Threshold
 from datagen.train.baselines.scalars import Scalars
 from datagen.train.inputs import Array, Batch
+from datagen.workers.robots import ROBOTS
 
 # By the name on the command line. `threshold-detector` uses estimated visibility without --detector.
 BASELINES: dict[str, Callable[[], Baseline]] = {
@@ -22,6 +24,7 @@ BASELINES: dict[str, Callable[[], Baseline]] = {
     "threshold-detector": ThresholdDetector,
     "distance": DistanceBand,
     "analytic": Analytic,
+    "reachability": Reachability,
     "scalars": Scalars,
 }
 
@@ -31,8 +34,12 @@ def make_baselines(
     detector: str | Path | None = None,
     heuristic: HeuristicParams | None = None,
     seed: int = 0,
+    robots: Sequence[str] = tuple(ROBOTS),
 ) -> list[Baseline]:
-    """Return unfitted baselines; `detector` is a folder, `seed` for `scalars`. InputError for other names."""
+    """Return unfitted baselines. InputError for other names.
+
+    `detector` is a folder, `seed` is for `scalars`, and `robots` names those that `reachability` has to know.
+    """
     for name in names:
         if name not in BASELINES:
             raise InputError("--baselines", name, "is not a baseline", choices(BASELINES, name))
@@ -44,6 +51,8 @@ def make_baselines(
             made.append(Analytic(heuristic))
         elif name == "scalars":
             made.append(Scalars(seed))
+        elif name == "reachability":
+            made.append(Reachability(tuple(robots)))
         else:
             made.append(BASELINES[name]())
     return made

@@ -56,8 +56,9 @@ def arrival_table(
     """For each arrival error, `DISTANCES_M` and the `given` one, the success of every method's picks.
 
     Over grids with a good clear cell. A nominal pick is the cell with the best score; a smoothed one that
-    with the best mean of the score over this error, cells that are not clear counting as failures. Scores
-    that are no probabilities enter by their rank among a scene's clear cells. `best` is the highest success
+    with the best mean chance over this error, cells that are not clear counting as failures. Chances are
+    the scores, where these are probabilities; else what a calibration makes of them, or without one their
+    rank among a scene's clear cells. `best` is the highest success
     that any clear cell has, `any` the mean over them. Empty without such grids.
     """
     maps = grid_maps(columns)
@@ -66,16 +67,17 @@ def arrival_table(
     some = np.flatnonzero((maps.truth * maps.is_clear).any(axis=(1, 2)))
     if not len(some):
         return []
-    scores = {m.name: _values(columns.scores[m.name][maps.order], maps, m) for m in methods}
+    raw = {m.name: columns.scores[m.name][maps.order] for m in methods}
+    chances = {m.name: _values(raw[m.name], maps, m) for m in methods}
     found: list[dict[str, Any]] = []
     for arrival in [*map(ring_arrival, DISTANCES_M), *([given] if given else [])]:
         truth = _smoothed(maps.truth, maps.step_m, arrival)
         per_scene = {
             name: {
-                "nominal": _picked(score, truth, maps.is_clear),
-                "smoothed": _picked(_smoothed(score, maps.step_m, arrival), truth, maps.is_clear),
+                "nominal": _picked(raw[name], truth, maps.is_clear),
+                "smoothed": _picked(_smoothed(chance, maps.step_m, arrival), truth, maps.is_clear),
             }
-            for name, score in scores.items()
+            for name, chance in chances.items()
         }
         offered = np.where(maps.is_clear, truth, np.nan)
         found.append(
@@ -93,9 +95,11 @@ def arrival_table(
 
 
 def _values(score: F64, maps: GridMaps, method: Method) -> F64:
-    """Scores (S, Y, X) as values in [0, 1]: probabilities, or ranks among the clear cells; 0 elsewhere."""
+    """Scores (S, Y, X) as chances in [0, 1], or ranks among the clear cells; 0 elsewhere."""
     if method.says_probabilities:
         return stands(score, maps.is_clear)
+    if method.chances is not None:
+        return stands(method.chances(score), maps.is_clear)
     value = np.zeros(score.shape)
     for k, clear in enumerate(maps.is_clear):
         _, rank = np.unique(score[k][clear], return_inverse=True)

@@ -44,12 +44,16 @@ _RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its name among the scores, its threshold and its training."""
+    """A method: its name among the scores, its threshold and its training.
+
+    `chances` makes probabilities of scores that are none.
+    """
 
     name: str
     threshold: float
     origin: TrainedBy = NO_TRAINING
     says_probabilities: bool = False
+    chances: Callable[[F64], F64] | None = None
 
     @property
     def only_picks(self) -> bool:

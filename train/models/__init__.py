@@ -7,10 +7,15 @@ from typing import Any
 
 from datagen.schemas.errors import InputError, choices
 from datagen.train.models.model import Model, fast
+from datagen.train.models.n2m import N2mModel
 from datagen.train.models.paper import PaperModel
 from datagen.train.models.shared import SharedModel
 
-MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"paper": PaperModel, "shared": SharedModel}
+MODELS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "paper": PaperModel,
+    "shared": SharedModel,
+    "n2m": N2mModel,
+}
 
 
 def build_model(name: str, config: Mapping[str, Any]) -> Model:

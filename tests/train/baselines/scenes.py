@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.train.inputs import Batch, CandidateInputs, Clouds, RobotInputs
 
-PER_CANDIDATE = ("base_is_clear", "base_clearance_m")
+PER_CANDIDATE = ("base_is_clear",)
 
 
 def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: int = 96) -> Batch[Any]:
@@ -46,9 +46,7 @@ def make_batch(seed: int = 0, n_scenes: int = 3, per_robot: int = 20, points: in
         sample_id=rng.integers(0, 256, (n, 16)).astype(np.uint8),
         extra={
             "base_is_clear": clear,
-            "base_clearance_m": np.where(clear, rng.uniform(0, 1, n), rng.uniform(-0.3, 0, n)).astype(
-                np.float32
-            ),
+            "house_id": np.array([f"house {seed} {k}" for k in range(n_scenes)], object),
             "object_name": np.array([["003_cracker_box"] * 7] * n_scenes, object),
         },
     )

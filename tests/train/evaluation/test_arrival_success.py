@@ -63,3 +63,21 @@ def test_a_given_error_is_added_and_other_scores_enter_by_rank() -> None:
 def test_cells_that_are_no_whole_grid_have_no_table() -> None:
     columns = make_columns(np.random.default_rng(0), 3, 20)
     assert arrival_table(columns, [Method("random", 0.5)], weights_for(columns, 10, 0)) == []
+
+
+def test_calibrated_scores_are_smoothed_as_chances_and_picked_as_they_are() -> None:
+    # A lonely best cell, and a wide region of the same chance.
+    label = np.zeros((SIDE, SIDE))
+    label[2, 2] = 1
+    label[6:11, 6:11] = 1
+    score = np.where(label == 1, -1.0, -5.0)
+    score[2, 2] = 0.0
+    columns = grids(label, score)
+    method = Method("model", -2.0, chances=lambda s: np.interp(s, [-5, -1], [0.0, 1.0]))
+    found = {
+        row["arrival"]: row["methods"]["model"]
+        for row in arrival_table(columns, [method], weights_for(columns, 20, 0))
+    }
+    assert found["0 m off"]["nominal"]["value"] == 1
+    assert found["0.1 m off"]["nominal"]["value"] < 0.6  # of the highest score, though others have its chance
+    assert found["0.1 m off"]["smoothed"]["value"] > 0.999

@@ -1,0 +1,39 @@
+"""Room around a base as the observed cloud shows it, in place of the true map, which no robot has."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from datagen.train.inputs import F64, Array, Batch
+
+# Lower points are floor, as far as a depth camera can say.
+_FLOOR_M = 0.05
+# Clearances are capped here: the cloud ends a metre around the target.
+FAR_M = 1.0
+_BASE_RADIUS_M, _RADIUS_PER_REACH = 0.25, 0.29  # the narrower of both, as `datagen predict` has it
+
+
+def observed_clearance_m(batch: Batch[Array]) -> F64:
+    """Horizontal distance (N,) from each base to the nearest observed obstacle (m), at most `FAR_M`.
+
+    Negative where a point lies inside the base. Obstacles are points above the floor and below the arm's
+    mount; what no point shows is free.
+    """
+    clouds, robots = batch.clouds, batch.robots
+    clearance = np.full(len(batch), FAR_M)
+    order = np.argsort(batch.candidates.robot_row, kind="stable")
+    ends = np.searchsorted(batch.candidates.robot_row[order], np.arange(len(robots) + 1))
+    for robot in np.flatnonzero(np.diff(ends)):
+        rows, cloud = order[ends[robot] : ends[robot + 1]], int(robots.cloud_row[robot])
+        points_m = clouds.points_m[cloud, : int(clouds.n_points[cloud])].astype(np.float64)
+        height_m = points_m[:, 2] + clouds.target_height_m[cloud]
+        low = (height_m > _FLOOR_M) & (
+            height_m < robots.base_height_m[robot]
+        )  # also drops what is not finite
+        if not low.any():
+            continue
+        radius_m = min(_BASE_RADIUS_M, _RADIUS_PER_REACH * float(robots.arm_reach_m[robot]))
+        away_m, _ = KDTree(points_m[low, :2]).query(batch.candidates.base_xy_m[rows].astype(np.float64))
+        clearance[rows] = np.minimum(away_m - radius_m, FAR_M)
+    return clearance

@@ -1,0 +1,129 @@
+"""Reachability map of an arm: from which directions its hand gets to a point at some distance and height.
+
+Zacharias et al. 2007, "Capturing robot workspace structure: representing robot capabilities" (IROS), divide
+an arm's workspace into cells, and directions of approach into parts of a sphere. Here cells are rings around
+the vertical through the mount: the base may turn, so that only distance, height and the approach's direction
+relative to the target's count (Vahrenkamp et al. 2013, "Robot placement based on reachability inversion").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from datagen.train.inputs import F32, F64
+from datagen.workers.motion.forward_kinematics import forward_kinematics
+from datagen.workers.robots import open_robot, robot_limits
+from datagen.workers.robots.gripper import Gripper
+
+# Over which the hand comes in a straight line, as `motion.pregrasp_m` has it by default.
+PREGRASP_M = 0.08
+# Parts of the sphere of approach directions, all of one area: by their z, and by their azimuth.
+LEVELS, AZIMUTHS = 8, 16
+_SAMPLES, _AT_ONCE = 1 << 18, 1 << 15
+_CELLS_PER_REACH = 16
+_SEED = 0x3EAC
+# Scaled arms share the map of the next tenth of a metre, with their reach as unit.
+_STEP_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ReachabilityMap:
+    """Whether the hand gets to a position from a pregrasp, by ring of positions and part of directions.
+
+    Distances from the vertical through the mount begin at 0, heights at `lowest` below it; both are in cells
+    of 1 / `_CELLS_PER_REACH` of the reach. A direction's azimuth is 0 where it points away from the robot.
+    """
+
+    reachable: F32  # (D, H, LEVELS, AZIMUTHS), 0 to 1
+    lowest: float  # in units of the reach
+    gripper: Gripper
+
+    def at(self, distance: F64, height: F64) -> F32:
+        """Reachability (N, LEVELS, AZIMUTHS) at distances and heights (N,), in units of the reach.
+
+        Between the cells' centres it is bilinear, beyond the map 0.
+        """
+        row = distance * _CELLS_PER_REACH - 0.5
+        column = (height - self.lowest) * _CELLS_PER_REACH - 0.5
+        found = np.zeros((len(row), LEVELS, AZIMUTHS), np.float32)
+        rings, heights = self.reachable.shape[:2]
+        for i in (np.floor(row), np.floor(row) + 1):
+            for j in (np.floor(column), np.floor(column) + 1):
+                weight = np.maximum(1 - np.abs(row - i), 0) * np.maximum(1 - np.abs(column - j), 0)
+                inside = (i < rings) & (j >= 0) & (j < heights)
+                # Nearer than half a cell to the vertical there is nothing but the first ring.
+                cells = self.reachable[np.clip(i[inside], 0, None).astype(int), j[inside].astype(int)]
+                found[inside] += weight[inside, None, None].astype(np.float32) * cells
+        return found
+
+
+def reachability_map(robot: str, reach_m: float) -> ReachabilityMap:
+    """The map of a robot of the registry with that reach (m). InputError where its files are missing."""
+    low, high = robot_limits(robot).reach_m
+    if low == high:
+        return _map(robot, None)
+    return _map(robot, float(np.clip(np.ceil(reach_m / _STEP_M - 0.01) * _STEP_M, low, high)))
+
+
+@lru_cache(maxsize=32)
+def _map(name: str, reach_m: float | None) -> ReachabilityMap:
+    heights = robot_limits(name).base_height_m
+    robot = open_robot(name, reach_m, heights[0] if heights else 0.0)
+    kinematics = forward_kinematics(robot)
+    lower, upper = np.maximum(robot.q_lower_rad, -np.pi), np.minimum(robot.q_upper_rad, np.pi)
+    rng = np.random.default_rng(_SEED)
+    lowest = float(robot.shoulder_m[2]) / robot.reach_m - 1
+    size = (_CELLS_PER_REACH, 2 * _CELLS_PER_REACH, LEVELS, AZIMUTHS)
+    count = np.zeros(size, np.int64)
+    for _ in range(_SAMPLES // _AT_ONCE):
+        T = kinematics.tcp(rng.uniform(lower, upper, (_AT_ONCE, len(lower))))
+        x, y, z = (T[:, k, 3] / robot.reach_m for k in range(3))
+        ring = np.hypot(x, y) * _CELLS_PER_REACH
+        level, azimuth = direction_parts(T[:, :3, 2], np.arctan2(y, x))
+        cells = (ring, (z - lowest) * _CELLS_PER_REACH, level, azimuth)
+        cells = tuple(np.clip(c.astype(np.int64), 0, n - 1) for c, n in zip(cells, size, strict=True))
+        np.add.at(count, cells, 1)
+    poses = ReachabilityMap((count > 0).astype(np.float32), lowest, robot.gripper)
+    return replace(poses, reachable=poses.reachable * _backed(poses, PREGRASP_M / robot.reach_m))
+
+
+def _backed(poses: ReachabilityMap, back: float) -> F32:
+    """Reachability (D, H, LEVELS, AZIMUTHS) of the pose that lies `back` behind each one of the map."""
+    rings, heights = poses.reachable.shape[:2]
+    distance = np.repeat((np.arange(rings) + 0.5) / _CELLS_PER_REACH, heights)
+    height = np.tile((np.arange(heights) + 0.5) / _CELLS_PER_REACH + poses.lowest, rings)
+    found = np.empty((rings * heights, LEVELS, AZIMUTHS), np.float32)
+    for (level, azimuth), (x, y, z) in _by_part(part_directions()):
+        # The hand comes along a line: behind it the direction is the same, the azimuth from the mount is not.
+        behind = np.hypot(distance - back * x, back * y)
+        turn = np.arctan2(-back * y, distance - back * x) / (2 * np.pi) * AZIMUTHS
+        seen = (azimuth - np.round(turn).astype(int)) % AZIMUTHS
+        found[:, level, azimuth] = poses.at(behind, height - back * z)[np.arange(len(seen)), level, seen]
+    return found.reshape(poses.reachable.shape)
+
+
+def _by_part(directions: F64) -> Iterator[tuple[tuple[int, int], F64]]:
+    for level, azimuth in np.ndindex(*directions.shape[:2]):
+        yield (level, azimuth), directions[level, azimuth]
+
+
+def direction_parts(directions: F64, ahead_rad: F64 | float = 0.0) -> tuple[F64, F64]:
+    """Parts (N,) of unit vectors (N, 3), by level and azimuth, counted from the azimuth `ahead_rad`.
+
+    Whole numbers are the parts' lower edges.
+    """
+    azimuth = (np.arctan2(directions[:, 1], directions[:, 0]) - ahead_rad) / (2 * np.pi) % 1
+    return (directions[:, 2] + 1) / 2 * LEVELS, azimuth * AZIMUTHS
+
+
+def part_directions() -> F64:
+    """Unit vectors (LEVELS, AZIMUTHS, 3) in the middle of each part."""
+    z = (np.arange(LEVELS) + 0.5) / LEVELS * 2 - 1
+    azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * 2 * np.pi
+    flat = np.sqrt(1 - z**2)[:, None]
+    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
+    return np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=2)
