@@ -66,14 +66,14 @@ def arrival_table(
     some = np.flatnonzero((maps.truth * maps.is_clear).any(axis=(1, 2)))
     if not len(some):
         return []
-    scores = {m.name: _values(columns.scores[m.name][maps.order], maps, m) for m in methods}
+    scores = {m.name: method_values(columns.scores[m.name][maps.order], maps, m) for m in methods}
     found: list[dict[str, Any]] = []
     for arrival in [*map(ring_arrival, DISTANCES_M), *([given] if given else [])]:
-        truth = _smoothed(maps.truth, maps.step_m, arrival)
+        truth = smoothed(maps.truth, maps.step_m, arrival)
         per_scene = {
             name: {
                 "nominal": _picked(score, truth, maps.is_clear),
-                "smoothed": _picked(_smoothed(score, maps.step_m, arrival), truth, maps.is_clear),
+                "smoothed": _picked(smoothed(score, maps.step_m, arrival), truth, maps.is_clear),
             }
             for name, score in scores.items()
         }
@@ -92,7 +92,7 @@ def arrival_table(
     return found
 
 
-def _values(score: F64, maps: GridMaps, method: Method) -> F64:
+def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
     """Scores (S, Y, X) as values in [0, 1]: probabilities, or ranks among the clear cells; 0 elsewhere."""
     if method.says_probabilities:
         return stands(score, maps.is_clear)
@@ -103,7 +103,8 @@ def _values(score: F64, maps: GridMaps, method: Method) -> F64:
     return value
 
 
-def _smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
+def smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
+    """Maps (S, Y, X) of the mean value over where a robot arrives that is sent to each cell."""
     return np.stack([expected_success(each, step_m, arrival) for each in value])
 
 
