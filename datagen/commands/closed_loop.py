@@ -101,6 +101,10 @@ def closed_loop(
     folder = None if detector is None else Path(detector)
     plain = baseline_methods(baselines, fit_on, folder, rule, seed, runs, False, json=json)
     methods = [*plain.baselines, *models]
+    if not methods:
+        raise InputError(
+            _VERB, "PATH", "no model or baseline given", "Name a checkpoint, or omit --baselines"
+        )
     columns = score_runs(runs, methods, seed, json).columns
     loop = plan_loop(
         columns, runs, given, methods, errors, arrivals, scenes, mode, seed, str(out / "arrivals")
