@@ -18,7 +18,7 @@ from datagen.schemas.errors import InputError
 from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
-_MOST_ARRIVALS, _MOST_WORKERS = 1000, 256
+_MOST_REPEATS, _MOST_WORKERS = 1000, 256
 _VERB = "datagen closed-loop"
 
 
@@ -28,8 +28,8 @@ def closed_loop(
     *,
     out: Path,
     mode: Literal["plan", "sim"] = "sim",
-    arrival: Sequence[str] = (),
-    arrivals: Whole = 3,
+    arrival: Sequence[str] | None = None,
+    repeats: Whole = 3,
     scenes: Whole | None = None,
     fit: Places | None = None,
     baselines: Sequence[str] | None = None,
@@ -54,9 +54,9 @@ def closed_loop(
     Args:
         paths: Checkpoints of `datagen train`, and runs of plan or sim labels with whole grids.
         out: Folder for arrivals, closed-loop.json and closed-loop.svg.
-        mode: End with the plan, or execute it too; sim takes five times as long.
+        mode: End with the plan, or execute it too, which takes most of the time.
         arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv; repeat for more [0 to 25 cm].
-        arrivals: Arrivals for each scene, error and pick.
+        repeats: Arrivals for each scene, error and pick.
         scenes: Scenes to use, the first that have a good base pose [all].
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more [all].
@@ -68,7 +68,7 @@ def closed_loop(
     """
     refuse_odd_draws(bootstrap, seed)
     for option, value, least, most in (
-        ("--arrivals", arrivals, 1, _MOST_ARRIVALS),
+        ("--repeats", repeats, 1, _MOST_REPEATS),
         ("--scenes", scenes, 1, 10**9),
         ("--workers", workers, 0, _MOST_WORKERS),
     ):
@@ -93,7 +93,7 @@ def closed_loop(
 
     refuse_missing_packages(mode)
     fit_on = [str(path) for path in fit or ()]
-    errors = arrivals_of([read_arrival(text) for text in arrival])
+    errors = arrivals_of([read_arrival(text) for text in arrival or ()])
     checkpoints, places = split_paths(paths)
     runs, models = open_evaluated_runs(places), open_models(checkpoints)
     refuse_seen_houses(runs, models)
@@ -107,7 +107,7 @@ def closed_loop(
         )
     columns = score_runs(runs, methods, seed, json).columns
     loop = plan_loop(
-        columns, runs, given, methods, errors, arrivals, scenes, mode, seed, str(out / "arrivals")
+        columns, runs, given, methods, errors, repeats, scenes, mode, seed, str(out / "arrivals")
     )
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     with interruptible() as stopping, counting("arrivals", json) as seen:

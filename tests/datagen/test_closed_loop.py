@@ -33,7 +33,7 @@ arm_reach_m = {{low = 0.9, high = 1.0}}
 per_object = 40
 per_scene = 10
 """
-QUICK = ("--bootstrap", "30", "--baselines", "proximity", "--baselines", "analytic", "--arrivals", "2")
+QUICK = ("--bootstrap", "30", "--baselines", "proximity", "--baselines", "analytic", "--repeats", "2")
 NEAR, FAR = "disc:0", "normal:0.1,3deg"
 
 
@@ -165,6 +165,20 @@ def test_trials_differ_between_worlds_and_name_their_causes(
     assert cli.run(arguments) == 0
     told = capfd.readouterr().out
     assert "executes in a disturbed world" in told and "random in reach" in told
+
+
+def test_scenes_of_merged_runs_are_found(
+    grids: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other, merged = tmp_path / "other", tmp_path / "merged"
+    where = ["--out", str(other), "--config", str(grids.parent / "grid.toml"), "--workers", "0"]
+    n = str(2 * SIDE**2)
+    assert cli.run(["submit", "plan", "--n", n, "--candidates-per-scene", "grid", "--seed", "5", *where]) == 0
+    assert cli.run(["merge", str(grids), str(other), "--out", str(merged)]) == 0
+    some = ["--arrival", NEAR, *QUICK, "--mode", "plan", "--workers", "0"]
+    report = json_of(capfd, ["closed-loop", str(merged), "--out", str(tmp_path / "out"), *some])
+    assert report["parts"][0]["scenes"] + report["scenes_without_good"] == SCENES + 2
+    assert report["agreement"][0]["agree_with_nearest"] == 1
 
 
 def test_odd_calls_are_refused(
