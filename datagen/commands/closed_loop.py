@@ -74,6 +74,8 @@ def closed_loop(
     ):
         if value is not None and not least <= value <= most:
             raise InputError(_VERB, option, f"{value} is not from {least} to {most:,}", "Give another number")
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "", "is not a folder", "Give another --out")
     # Imported here, so that other verbs do not wait for them and for torch.
     from datagen.closed_loop.arrivals_of_scene import make_arrivals
     from datagen.closed_loop.loop import arrivals_of, loop_record, plan_loop

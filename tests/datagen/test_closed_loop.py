@@ -191,6 +191,8 @@ def test_odd_calls_are_refused(
         (("--arrival", "ring:1"), "--arrival"),
     ):
         refused(["closed-loop", str(grids), "--out", str(tmp_path), *QUICK, *more], capfd, told)
+    file = grids.parent / "grid.toml"
+    refused(["closed-loop", str(grids), "--out", str(file), *QUICK], capfd, "is not a folder")
     none = ["--baselines", "none", "--bootstrap", "30"]
     refused(["closed-loop", str(grids), "--out", str(tmp_path), *none], capfd, "no model or baseline given")
     (grids.parent / "near.toml").write_text(CONFIG + GRID)
