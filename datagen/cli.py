@@ -61,6 +61,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
     "train": ("datagen.commands.train:train_model", "Train a model on labels."),
     "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
+    "closed-loop": (
+        "datagen.commands.closed_loop:closed_loop",
+        "Execute methods' picks where robots park off them.",
+    ),
     "frontier": ("datagen.commands.frontier:frontier", "Show which labels pay, and which to buy next."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
@@ -71,12 +75,14 @@ _HEADINGS = {
     "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
     "Look at runs": ("status", "logs", "show", "audit", "report", "estimate"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
-    "Models": ("train", "evaluate", "frontier", "predict", "calibrate"),
+    "Models": ("train", "evaluate", "closed-loop", "frontier", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
 }
 
 # The extra to name where a library that a verb lacks comes with several.
-_EXTRA_OF: dict[str, str] = dict.fromkeys(("train", "evaluate", "frontier", "predict", "calibrate"), "train")
+_EXTRA_OF: dict[str, str] = dict.fromkeys(
+    ("train", "evaluate", "closed-loop", "frontier", "predict", "calibrate"), "train"
+)
 
 
 def build_app(called: str = "") -> App:

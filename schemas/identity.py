@@ -23,6 +23,7 @@ class Stream(IntEnum):
     DISTURBANCE = 6
     SELECTION = 7
     FORECAST = 8  # of no sample: draws of what a job will cost
+    ARRIVAL = 9  # of no sample: where robots arrive in a closed loop
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:

@@ -44,6 +44,19 @@ class Arrival:
         """Root mean square of the yaw errors."""
         return float(np.sqrt(np.mean(self.offsets[:, 2] ** 2)))
 
+    @property
+    def distance_m(self) -> float:
+        """Root mean square distance of the arrivals from the goal."""
+        return float(np.sqrt(np.mean((self.offsets[:, :2] ** 2).sum(axis=1))))
+
+    def drawn(self, n: int, rng: np.random.Generator) -> F64:
+        """`n` of the errors (n, 3), spread evenly over them from a random start: few are not all alike.
+
+        Generators of one state draw like directions from rings of any size.
+        """
+        share = (rng.random() + np.arange(n)) / n % 1.0
+        return self.offsets[np.floor(share * len(self.offsets)).astype(np.int64)]
+
 
 def normal_arrival(std_m: float, yaw_std_rad: float = 0.0) -> Arrival:
     """Normal errors, with one standard deviation along x and y."""
@@ -59,9 +72,10 @@ def disc_arrival(radius_m: float, yaw_rad: float = 0.0) -> Arrival:
     return Arrival(text, _round(radius_m * np.sqrt(_shares()), yaw_rad * (2 * _yaw_shares() - 1)), True)
 
 
-def ring_arrival(distance_m: float) -> Arrival:
-    """Errors of exactly this distance in all directions."""
-    return Arrival(f"{distance_m:g} m off", _round(np.array([distance_m]), np.zeros(_ANGLES)), True)
+def ring_arrival(distance_m: float, yaw_std_rad: float = 0.0) -> Arrival:
+    """Errors of exactly this distance in all directions, and normal yaw errors."""
+    yaw_rad = yaw_std_rad * ndtri(_yaw_shares())
+    return Arrival(f"{distance_m:g} m off", _round(np.array([distance_m]), yaw_rad), True)
 
 
 def read_arrival(given: str) -> Arrival:

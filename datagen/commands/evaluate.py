@@ -20,7 +20,6 @@ from datagen.console.options import (
 )
 from datagen.console.printing import print_json, print_rows
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 
@@ -96,8 +95,6 @@ def evaluate(
         (2, ['in-range'])
     """
     # Imported here, so that other verbs do not wait for them and for torch.
-    import numpy as np
-
     from datagen.evaluation_report.evaluated_runs import (
         candidate_sets_of,
         open_evaluated_runs,
@@ -106,8 +103,8 @@ def evaluate(
     )
     from datagen.evaluation_report.methods import baseline_methods, open_models, read_heuristic
     from datagen.evaluation_report.report import evaluation_report
+    from datagen.evaluation_report.scoring import score_runs
     from datagen.train.arrivals import arrival_of
-    from datagen.train.evaluation.columns import gather
 
     fit = [str(path) for path in fit or ()]
     detector, heuristic, html = (None if p is None else Path(p) for p in (detector, heuristic, html))
@@ -135,17 +132,7 @@ def evaluate(
     if not evaluated:
         fix = "Name a checkpoint, or omit --baselines"
         raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
-    with counting("scenes", json) as seen:
-        total, done = sum(place.stream.n_scenes for place in opened), 0
-
-        def step(scenes: int) -> None:
-            nonlocal done
-            done += scenes
-            seen(done, total)
-
-        batches = [(place.cells, place.stream.epoch(0)) for place in opened]
-        rng = np.random.default_rng([seed, 0])
-        gathered = gather(batches, {c.name: c.scorer for c in evaluated}, rng, seen=step)
+    gathered = score_runs(opened, evaluated, seed, json)
     report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed, error)
     if html is not None:
         from datagen.evaluation_report.page import page_of

@@ -68,14 +68,14 @@ def arrival_table(
     if not len(some):
         return []
     raw = {m.name: columns.scores[m.name][maps.order] for m in methods}
-    chances = {m.name: _values(raw[m.name], maps, m) for m in methods}
+    chances = {m.name: method_values(raw[m.name], maps, m) for m in methods}
     found: list[dict[str, Any]] = []
     for arrival in [*map(ring_arrival, DISTANCES_M), *([given] if given else [])]:
-        truth = _smoothed(maps.truth, maps.step_m, arrival)
+        truth = smoothed(maps.truth, maps.step_m, arrival)
         per_scene = {
             name: {
                 "nominal": _picked(raw[name], truth, maps.is_clear),
-                "smoothed": _picked(_smoothed(chance, maps.step_m, arrival), truth, maps.is_clear),
+                "smoothed": _picked(smoothed(chance, maps.step_m, arrival), truth, maps.is_clear),
             }
             for name, chance in chances.items()
         }
@@ -94,7 +94,7 @@ def arrival_table(
     return found
 
 
-def _values(score: F64, maps: GridMaps, method: Method) -> F64:
+def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
     """Scores (S, Y, X) as chances in [0, 1], or ranks among the clear cells; 0 elsewhere."""
     if method.says_probabilities:
         return stands(score, maps.is_clear)
@@ -107,7 +107,8 @@ def _values(score: F64, maps: GridMaps, method: Method) -> F64:
     return value
 
 
-def _smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
+def smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
+    """Maps (S, Y, X) of the mean value over where a robot arrives that is sent to each cell."""
     return np.stack([expected_success(each, step_m, arrival) for each in value])
 
 

@@ -8,6 +8,7 @@ base clear -> within reach -> a grasp free of the scene -> arm, path, approach, 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -153,7 +154,7 @@ def try_candidate(
     if report.plan is None:
         return CandidateTrial(report.outcome, report)
     if disturbances:
-        fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
+        fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
         return _repeat(at, T_world_base, report, disturbances, fits, rng, record)
     return _attempt(at, T_world_base, report, report.plan, rng, record)
 
@@ -176,7 +177,7 @@ def _plan_arrivals(
         return CandidateTrial(
             report.outcome, report, report.plan, successes=int(report.plan is not None), trials=1
         )
-    fits = _fits(at, T_world_base, disturbances, candidates, row, spec)
+    fits = fits_at(at, [T_world_base @ d.T_base_moved for d in disturbances], candidates, row, spec)
     successes = 0
     with at.clock.stage("plan"):
         for disturbance, does_fit in zip(disturbances, fits.tolist(), strict=True):
@@ -261,16 +262,15 @@ def _repeat(
     return CandidateTrial(outcome, report, report.plan, tuple(results), tuple(bases), successes, len(ends))
 
 
-def _fits(
+def fits_at(
     at: ArmInScene,
-    T_world_base: F64,
-    disturbances: list[Disturbance],
+    T_arrived: Sequence[F64],
     candidates: SceneCandidates,
     row: int,
     spec: Specification,
 ) -> Bools:
-    """Whether the robot's body fits (K,) where each disturbance lets it arrive."""
-    xy = np.array([(T_world_base @ d.T_base_moved)[:2, 3] for d in disturbances], np.float32)
+    """Whether the body of candidate `row`'s robot fits (K,) with its mount at these world poses (4, 4)."""
+    xy = np.array([T[:2, 3] for T in T_arrived], np.float32)
     height_m, camera_m = (
         np.repeat(column[row], len(xy)) for column in (candidates.base_height_m, candidates.camera_height_m)
     )

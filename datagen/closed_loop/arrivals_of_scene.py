@@ -1,0 +1,159 @@
+"""Arrivals in one scene: planned, executed, and kept in a file, so that each is done once.
+
+An arrival is known by the candidate, the error, and the world that it is executed in. Its outcome depends on
+nothing else, so methods with the same pick share it, and no order or number of processes changes it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from datagen.configuration.specify import label_engines
+from datagen.schemas.cost import StageClock
+from datagen.schemas.errors import InputError
+from datagen.schemas.identity import Stream, digest_of, generator
+from datagen.schemas.outcomes import OUTCOMES
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scene
+from datagen.schemas.specification import Specification
+from datagen.schemas.untrusted_files import read_regular
+from datagen.schemas.whole_files import whole_file
+from datagen.workers.labels.arm_labelling import arm_in_scene, draw_disturbances
+from datagen.workers.labels.arrival_trial import arrival_specification, try_arrival
+from datagen.workers.scenes.reconstruct import reconstruct_candidates, reconstruct_scene
+from datagen.workers.trials.trial import Disturbance
+from datagen.workers.world import World, open_world
+
+# Raise it when the same arrival would have another outcome for a reason that `engines` does not name.
+_VERSION = 1
+_MOST_BYTES = 64 << 20
+_WORLDS = 2  # purposes 0 and 1 of a scene's generators are picks and arrivals
+PLAN, SIM = "plan", "sim"
+
+
+class Arrived(NamedTuple):
+    """Where a robot that was sent to a candidate arrived, and the number of the world that it executes in.
+
+    The world of plans alone is 0.
+    """
+
+    candidate: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    world: int
+
+    @property
+    def key(self) -> str:
+        """Its name in the file of the scene."""
+        return f"{self.candidate} {self.x_m:.6f} {self.y_m:.6f} {self.yaw_rad:.6f} {self.world}"
+
+
+@dataclass(frozen=True)
+class SceneTask:
+    """The arrivals wanted in scene `scene` of a run, with plans alone or in physics."""
+
+    run: str
+    spec: Specification
+    houses: str
+    objects: str
+    scene: int
+    mode: str
+    seed: int
+    folder: str
+    arrivals: tuple[Arrived, ...]
+
+    @cached_property
+    def path(self) -> Path:
+        """The file of outcomes: named by all that decides them, but the arrivals."""
+        arm = arrival_specification(self.spec, self.mode == SIM).arm
+        assert arm is not None
+        key = {
+            "version": _VERSION,
+            "spec": self.spec.hash(),
+            "scene": self.scene,
+            "arm": arm.model_dump(mode="json"),
+            "seed": self.seed if self.mode == SIM else None,
+            "engines": label_engines(self.mode),
+        }
+        return Path(self.folder, f"{digest_of(key)}.json")
+
+    def missing(self) -> list[Arrived]:
+        """The arrivals without an outcome. InputError where the file is damaged."""
+        known = read_outcomes(self.path)
+        return [arrived for arrived in self.arrivals if arrived.key not in known]
+
+
+def scene_generator(seed: int, spec_hash: str, scene: int, purpose: int) -> np.random.Generator:
+    """The generator of a closed loop for one scene: of picks, arrivals or worlds."""
+    return generator(seed, Stream.ARRIVAL, int(spec_hash[:16], 16), scene, purpose)
+
+
+def read_outcomes(path: Path) -> dict[str, str]:
+    """The outcomes by key of `Arrived`; none without a file. InputError where it is damaged."""
+    if not path.exists():
+        return {}
+    fix = "Remove this file; its arrivals are made again"
+    data = read_regular(path, _MOST_BYTES, fix)
+    try:
+        known = json.loads(data)["outcomes"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(path, "outcomes", f"is damaged ({error!s:.100})", fix) from error
+    if not isinstance(known, dict) or any(outcome not in OUTCOMES for outcome in known.values()):
+        raise InputError(path, "outcomes", "holds what is no outcome", fix)
+    return known
+
+
+def make_arrivals(task: SceneTask, stopping: Callable[[], bool], step: Callable[[], None]) -> bool:
+    """Make the outcomes that are missing and write the file; False where it was stopped before the last."""
+    missing = task.missing()
+    if not missing:
+        return True
+    run, world = _opened(task.run, task.spec.hash(), task.houses, task.objects)
+    spec = arrival_specification(task.spec, task.mode == SIM)
+    stored = read_scene(run, task.scene)
+    scene = reconstruct_scene(world, stored.record)
+    candidates = reconstruct_candidates(stored.samples, scene)
+    at = arm_in_scene(scene, candidates, 0, spec, StageClock())
+    worlds: list[Disturbance] = []
+    if spec.arm is not None and spec.arm.disturbance is not None:
+        repeats = {"repeats": 1 + max(arrived.world for arrived in task.arrivals)}
+        drawn = spec.arm.disturbance.model_copy(update=repeats)
+        rng = scene_generator(task.seed, task.spec.hash(), task.scene, _WORLDS)
+        worlds = draw_disturbances(drawn, scene.T_world_object[0], rng)
+    outcomes = read_outcomes(task.path)
+    done = 0
+    try:
+        for arrived in missing:
+            if stopping():
+                break
+            offset = (arrived.x_m, arrived.y_m, arrived.yaw_rad)
+            in_world = worlds[arrived.world] if worlds else None
+            outcomes[arrived.key] = try_arrival(at, candidates, arrived.candidate, offset, in_world, spec)
+            done += 1
+            step()
+    finally:
+        if done:
+            write_outcomes(task.path, outcomes)
+    return done == len(missing)
+
+
+def write_outcomes(path: Path, outcomes: Mapping[str, str]) -> None:
+    """Write the file of a scene, in the order of its keys."""
+    with whole_file(path) as file:
+        file.write(json.dumps({"outcomes": dict(sorted(outcomes.items()))}, indent=0).encode())
+
+
+@lru_cache(maxsize=1)
+def _opened(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+    run = Run.open(place)
+    if run.manifest.spec_hash != spec_hash:
+        raise InputError(place, "spec_hash", "the run now has another specification", "Start it again")
+    return run, open_world(run.manifest.spec, houses, objects)

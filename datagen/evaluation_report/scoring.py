@@ -1,0 +1,29 @@
+"""Score every candidate of the runs by every method, with progress."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.evaluation_report.evaluated_runs import EvaluatedRun
+from datagen.evaluation_report.methods import EvaluatedMethod
+from datagen.schemas.progress import counting
+from datagen.train.evaluation.columns import Gathered, gather
+
+
+def score_runs(
+    runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], seed: int, json: bool
+) -> Gathered:
+    """The columns of all runs in stored order; `seed` draws the example scenes."""
+    with counting("scenes", json) as seen:
+        total, done = sum(run.stream.n_scenes for run in runs), 0
+
+        def step(scenes: int) -> None:
+            nonlocal done
+            done += scenes
+            seen(done, total)
+
+        batches = [(run.cells, run.stream.epoch(0)) for run in runs]
+        rng = np.random.default_rng([seed, 0])
+        return gather(batches, {m.name: m.scorer for m in methods}, rng, seen=step)
