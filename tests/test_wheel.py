@@ -11,20 +11,16 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.linked_environments import build_wheel, install_wheel, link_libraries
+from tests.linked_environments import install_wheel, link_libraries, wheel
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
+__all__ = ["wheel"]
 # The subpackages, which were import names of their own once, and names that every library has.
 OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
 FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,12 @@ import os
 import subprocess
 from pathlib import Path
 
-import pytest
-
-from tests.linked_environments import build_wheel, install_wheel, link_libraries
+from tests.linked_environments import install_wheel, link_libraries, wheel
 from tests.small_runs import PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
+__all__ = ["wheel"]
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
 
 
@@ -46,11 +45,6 @@ class Installed:
     def lacks(self, extra: str, *words: str | Path) -> None:
         """A command says that this extra is missing, and how the wheel that is installed brings it."""
         assert f"Install the extra {extra}: pip install '{self.wheel}[{extra}]'" in self.refused(*words)
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_wheel(tmp_path_factory.mktemp("wheel with spaces"))
 
 
 def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, tmp_path: Path) -> None:
