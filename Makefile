@@ -1,8 +1,8 @@
 # `make demo` and `make test` are all the set-up there is; both are incremental.
 PYTHON ?= python3
-# Test workers, one more than the two cores they are made for: tests of Ray and S3 wait more than they compute.
-# 1 runs all in one process.
-JOBS ?= 3
+# Test workers, two more than the two cores they are made for: tests of Ray and S3 wait more than they compute.
+# Each imports every test (15 s of a core) and has up to 1.5 GB. 1 runs all in one process.
+JOBS ?= 4
 
 BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.s3_servers import environment, make_bucket, moto_server
 
+if TYPE_CHECKING:
+    from datagen.workers.objects import ObjectSource
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # How long an example takes says how busy the machine is, and no more.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
+
+
+def once(folder: Path, make: Callable[[], object]) -> Path:
+    """The folder, made by the first who comes; the others wait for it."""
+    with open(f"{folder}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = Path(f"{folder}.done")
+        if not done.exists():
+            make()
+            done.touch()
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -27,6 +43,43 @@ def assets() -> Path:
     if not (folder / "ycb" / "objects.json").is_file():
         pytest.skip(f"no real assets at {folder}: set DATAGEN_ASSETS to a folder with ycb/ and procthor/")
     return folder
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all workers of this test session share."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if base.name.startswith("popen-") else base) / "shared"
+    shared.mkdir(exist_ok=True)
+    return shared
+
+
+@pytest.fixture(autouse=True, scope="session")
+def session_cache(shared_folder: Path) -> Iterator[Path]:
+    """A cache that all workers and their programs share, instead of the user's: real objects are decomposed,
+    and grasps scored, once a session."""
+    cache = shared_folder / "cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DATAGEN_CACHE", str(cache))
+        yield cache
+
+
+@pytest.fixture(scope="session")
+def ycb(assets: Path, shared_folder: Path, session_cache: Path) -> ObjectSource:
+    """The real objects, all of them loaded, whatever cache a test has of its own."""
+    from datagen.workers.objects import open_objects
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DATAGEN_CACHE", str(session_cache))
+
+        def load() -> ObjectSource:
+            source = open_objects(f"ycb:{assets / 'ycb'}")
+            for name in source.names():
+                source.load(name)
+            return source
+
+        once(shared_folder / "ycb", load)
+        return load()
 
 
 @pytest.fixture(autouse=True, scope="module")

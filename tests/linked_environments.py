@@ -11,18 +11,29 @@ from collections.abc import Iterator
 from importlib.metadata import distribution
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 
 from datagen.workers.extras import DISTRIBUTION
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, once
 
 PACKAGES = ("cluster", "datagen", "schemas", "train", "workers")
 
 
-def build_wheel(folder: Path) -> Path:
-    """The wheel of this checkout, built from a copy of the sources, because a build leaves files there."""
+@pytest.fixture(scope="session")
+def wheel(shared_folder: Path) -> Path:
+    """The wheel of this checkout, built once, in a folder whose name a shell would split."""
+    folder = once(
+        shared_folder / "wheel with spaces", lambda: build_wheel(shared_folder / "wheel with spaces")
+    )
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def build_wheel(folder: Path) -> None:
+    """Build the wheel of this checkout from a copy of the sources, because a build leaves files there."""
     source = folder / "source"
-    source.mkdir()
+    source.mkdir(parents=True)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, source)
     ignore = shutil.ignore_patterns("__pycache__")
@@ -31,8 +42,6 @@ def build_wheel(folder: Path) -> Path:
     options = ["-q", "--no-deps", "--no-build-isolation", "-w", str(folder)]
     command = [sys.executable, "-m", "pip", "wheel", *options, str(source)]
     subprocess.run(command, check=True, env={**os.environ, "PIP_NO_INDEX": "1"})
-    (built,) = folder.glob("*.whl")
-    return built
 
 
 def install_wheel(wheel: Path, folder: Path) -> Path:

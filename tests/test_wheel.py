@@ -11,20 +11,16 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.linked_environments import build_wheel, install_wheel, link_libraries
+from tests.linked_environments import install_wheel, link_libraries, wheel
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
+__all__ = ["wheel"]
 # The subpackages, which were import names of their own once, and names that every library has.
 OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
 FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +69,8 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     (folder / "plan.toml").write_text(CONFIG + FEW_GRASPS)
     small = ("--n", "48", "--candidates-per-scene", "8")
     datagen("submit", "heuristic", "--out", "run", "--split", "train", "--config", "small.toml", *small)
-    datagen("submit", "heuristic", "--out", "val", "--split", "val", "--config", "small.toml", *small)
+    here = ("--workers", "0")
+    datagen("submit", "heuristic", "--out", "val", "--split", "val", "--config", "small.toml", *small, *here)
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
     datagen("submit", "plan", "--out", "plan", *plan, *small)
     datagen("show", "run", "--scene", "0", "--out", "scene.png")

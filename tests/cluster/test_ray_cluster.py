@@ -165,6 +165,7 @@ def test_a_cluster_that_does_not_start_is_one_line_and_leaves_nothing(
     from ray._private import services
 
     monkeypatch.setattr(services, "RAYLET_EXECUTABLE", "/bin/false")
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "1")  # Ray's wait for a node, which is 30 s
     monkeypatch.setattr(ray_cluster_module, "_SILENT_START_S", 0.0)
     said = pytest.raises(InputError, match=r"^ray: does not start: .* --workers 0.* --address")
     with said, ray_cluster(RaySettings(workers=1)):

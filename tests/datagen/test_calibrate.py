@@ -17,7 +17,7 @@ from datagen.workers.labels.distance_visibility_score import heuristic
 from tests.made_runs import make_run, small_spec
 from tests.refusals import refused
 from tests.small_runs import arrays_of, json_of, submit_arguments
-from tests.train.conftest import heuristic_run, shared_folder, sim_run  # noqa: F401 (fixtures)
+from tests.train.conftest import heuristic_run, sim_run  # noqa: F401 (fixtures)
 
 N = 300
 QUICK = ("--bootstrap", "50")

@@ -23,11 +23,11 @@ from datagen.cluster.task import AttemptResult, ShardTask
 from datagen.jobs import job
 from datagen.sources import Registry
 from tests.small_runs import CONFIG, make_small_run
-from tests.train.conftest import shared_folder, sim_run
+from tests.train.conftest import sim_run
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import MODEL, draw_seen, write_frame
 
-__all__ = ["shared_folder", "sim_run"]
+__all__ = ["sim_run"]
 
 FUNCTIONS = [n for n in datagen.__all__ if callable(getattr(datagen, n)) and n.islower()]
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from datagen import cli
+from tests.conftest import once
 from tests.refusals import refused
 from tests.sim_extra import SIM_INSTALLED, needs_sim
 from tests.small_runs import CONFIG, json_of, make_small_run
-from tests.train.conftest import ARM, heuristic_run, once, shared_folder
+from tests.train.conftest import ARM, heuristic_run
 
-__all__ = ["heuristic_run", "shared_folder"]
+__all__ = ["heuristic_run"]
 SHARES = ("--shares", "0.5", "--shares", "1")
 
 

@@ -2,18 +2,47 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
-
-from tests.linked_environments import build_wheel, install_wheel, link_libraries
+from tests.linked_environments import install_wheel, link_libraries, wheel
 from tests.small_runs import PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
+__all__ = ["wheel"]
+Command = Sequence[str | Path]
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
+
+
+# Several commands in one process, which imports its libraries once: code and outputs of each.
+PROGRAM = """
+import contextlib, io, json, sys
+from datagen import cli
+
+done = []
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        try:
+            code = cli.run(words)
+        except SystemExit as end:
+            code = end.code
+    done.append([code, out.getvalue(), err.getvalue()])
+print(json.dumps(done))
+"""
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
 
 
 class Installed:
@@ -23,70 +52,87 @@ class Installed:
         self.wheel, self.folder = wheel, folder
         link_libraries(install_wheel(wheel, folder / "venv"), *extras)
 
-    def run(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
+    def run(self, *commands: Command) -> list[Done]:
+        """Do commands one after another; the first by the program itself, as a user does."""
+        first, *rest = ([*map(str, words)] for words in commands)
+        program = self._start(self.folder / "venv" / "bin" / "datagen", *first)
+        done = [Done(program.returncode, program.stdout, program.stderr)]
+        if rest:
+            python = self._start(
+                self.folder / "venv" / "bin" / "python", "-I", "-c", PROGRAM, json.dumps(rest)
+            )
+            assert python.returncode == 0, python.stderr
+            done += [Done(*one) for one in json.loads(python.stdout)]
+        return done
+
+    def _start(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
-        command = [self.folder / "venv" / "bin" / "datagen", *map(str, words)]
         return subprocess.run(
             command, cwd=self.folder, capture_output=True, text=True, check=False, timeout=250,
             env=environment | {"OMP_NUM_THREADS": "1"},
         )  # fmt: skip
 
-    def succeed(self, *words: str | Path) -> None:
-        done = self.run(*words)
-        assert done.returncode == 0, done.stderr
+    def succeed(self, *commands: Command) -> None:
+        for words, done in zip(commands, self.run(*commands), strict=True):
+            assert done.code == 0, f"{words}: {done.err}"
 
-    def refused(self, *words: str | Path) -> str:
-        """The one line of error of a command that lacks a library; what it began with may stand before it."""
-        done = self.run(*words)
-        assert done.returncode == 2 and done.stdout == "", done.stdout + done.stderr
-        *before, line = done.stderr.splitlines()
-        assert line.startswith("error: ") and all(text.startswith("opening ") for text in before), done.stderr
-        return line
-
-    def lacks(self, extra: str, *words: str | Path) -> None:
-        """A command says that this extra is missing, and how the wheel that is installed brings it."""
-        assert f"Install the extra {extra}: pip install '{self.wheel}[{extra}]'" in self.refused(*words)
+    def lacks(self, extra: str, *commands: Command) -> None:
+        """Each command says that this extra is missing, and how the wheel that is installed brings it."""
+        for words, done in zip(commands, self.run(*commands), strict=True):
+            line = refused_line(done)
+            assert f"Install the extra {extra}: pip install '{self.wheel}[{extra}]'" in line, words
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_wheel(tmp_path_factory.mktemp("wheel with spaces"))
+def refused_line(done: Done) -> str:
+    """The one line of error of a command that lacks a library; what it began with may stand before it."""
+    assert done.code == 2 and done.out == "", done
+    *before, line = done.err.splitlines()
+    assert line.startswith("error: ") and all(text.startswith("opening ") for text in before), done.err
+    return line
 
 
 def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, tmp_path: Path) -> None:
     base = Installed(wheel, tmp_path)
-    for words in (["--help"], ["doctor", "--help"], ["assets", "list"]):
-        base.succeed(*words)
-    for verb in ("verify", "audit", "status", "logs", "seal", "unseal", "repair", "gc", "cancel"):
-        base.succeed(verb, copied)
-    base.succeed("merge", copied, "--out", tmp_path / "merged")
-    doctor = base.run("doctor")
-    assert doctor.returncode == 1 and "Traceback" not in doctor.stderr and "[labels]" in doctor.stdout
+    verbs = ("verify", "audit", "status", "logs", "seal", "unseal", "repair", "gc", "cancel")
+    base.succeed(
+        ["--help"], ["doctor", "--help"], ["assets", "list"], *([verb, copied] for verb in verbs),
+        ["merge", copied, "--out", tmp_path / "merged"],
+    )  # fmt: skip
+    (doctor,) = base.run(["doctor"])
+    assert doctor.code == 1 and "Traceback" not in doctor.err
+    assert "[labels]" in "".join(doctor.out.split())  # whatever the width of its table
     out = tmp_path / "out"
-    base.lacks("labels", *submit_arguments(out, PER_SCENE))
-    base.lacks("labels", "submit", "sim", "--n", "48", "--out", out)
-    base.lacks("labels", "resume", copied)
-    base.lacks("labels", "show", copied, "--scene", "0", "--out", out)
-    base.lacks("labels", "replay", copied, "0")
-    base.lacks("labels", "verify", copied, "--deep", "1")
-    base.lacks("train", "train", "stage1", copied, "--out", out)
-    base.lacks("train", "evaluate", "model.ckpt", copied)
+    base.lacks(
+        "labels",
+        submit_arguments(out, PER_SCENE),
+        ["submit", "sim", "--n", "48", "--out", out],
+        ["resume", copied],
+        ["show", copied, "--scene", "0", "--out", out],
+        ["replay", copied, "0"],
+        ["verify", copied, "--deep", "1"],
+    )
+    base.lacks("train", ["train", "stage1", copied, "--out", out], ["evaluate", "model.ckpt", copied])
     assert not out.exists()
 
 
 def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: Path) -> None:
     labels, run, other = Installed(wheel, tmp_path, "labels"), tmp_path / "run", tmp_path / "other"
-    labels.succeed(*submit_arguments(run, PER_SCENE))
-    labels.succeed("show", run, "--scene", "0", "--out", tmp_path / "scene.png")
-    labels.succeed("verify", run, "--deep", "1")
-    labels.succeed("relabel", run, "--mu", "0.9", "--out", tmp_path / "relabelled")
-    line = labels.refused(*submit_arguments(other, PER_SCENE, workers=1))
+    labels.succeed(
+        submit_arguments(run, PER_SCENE),
+        ["show", run, "--scene", "0", "--out", tmp_path / "scene.png"],
+        ["verify", run, "--deep", "1"],
+        ["relabel", run, "--mu", "0.9", "--out", tmp_path / "relabelled"],
+    )
+    line = refused_line(labels.run(submit_arguments(other, PER_SCENE, workers=1))[0])
     assert line.startswith("error: ray: is not installed. Install the extra cluster: ")
     assert "or work in this process: --workers 0" in line
-    labels.lacks("cluster", "resume", run, "--detach")
-    labels.lacks("sim", "submit", "plan", "--n", "48", "--workers", "0", "--out", other)
-    labels.lacks("pybullet", *submit_arguments(other, PER_SCENE, "--settler", "pybullet"))
-    labels.lacks("pybullet", *submit_arguments(other, PER_SCENE, "--renderer", "pybullet"))
+    labels.lacks("cluster", ["resume", run, "--detach"])
+    labels.lacks("sim", ["submit", "plan", "--n", "48", "--workers", "0", "--out", other])
+    labels.lacks(
+        "pybullet",
+        submit_arguments(other, PER_SCENE, "--settler", "pybullet"),
+        submit_arguments(other, PER_SCENE, "--renderer", "pybullet"),
+    )
     assert not other.exists()
 
 
@@ -94,12 +140,12 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
     train = Installed(wheel, tmp_path, "train")
     for split in ("train", "val"):
         make_small_run(tmp_path / split, 48, "--split", split)
-    train.succeed("train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL)
+    words = ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL]
+    train.succeed(words)
     write_untrained(tmp_path / "model.ckpt", {})
     write_frame(tmp_path / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
-    done = train.run(
-        "predict", "model.ckpt", "--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"
-    )
-    assert done.returncode in (0, 1), done.stderr  # 1 where a model without training finds no good base
+    given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
+    (done,) = train.run(["predict", "model.ckpt", *given])
+    assert done.code in (0, 1), done.err  # 1 where a model without training finds no good base
     assert (tmp_path / "heat.png").is_file() and (tmp_path / "a.html").is_file()

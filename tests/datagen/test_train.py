@@ -21,10 +21,10 @@ from datagen.train.training.checkpoints import load_model, read_checkpoint
 from datagen.train.training.launching import choose_device
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.train.conftest import heuristic_run, shared_folder, sim_run
+from tests.train.conftest import heuristic_run, sim_run
 from tests.train.training.small import TINY, equal
 
-__all__ = ["heuristic_run", "shared_folder", "sim_run"]
+__all__ = ["heuristic_run", "sim_run"]
 HERE = ("--threads", "1", "--device", "cpu", "--batch-scenes", "4")
 
 

@@ -12,11 +12,11 @@ import pytest
 
 from tests.sim_extra import needs_sim
 from tests.small_runs import PER_SCENE, submit_arguments
-from tests.train.conftest import shared_folder, sim_run
+from tests.train.conftest import sim_run
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
-__all__ = ["shared_folder", "sim_run"]
+__all__ = ["sim_run"]
 
 # As if none of these were installed.
 WITHOUT = """

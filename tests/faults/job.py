@@ -1,6 +1,8 @@
 """A small job as a program of its own, for tests that interrupt or kill it.
 
-python -m tests.faults.job RUN SECONDS_PER_SHARD [ADDRESS]
+python -m tests.faults.job RUN SECONDS_PER_SHARD [ADDRESS [PATIENCE_S]]
+
+PATIENCE_S: how long a server of the cluster at ADDRESS may be silent, instead of 20 s.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 
+from datagen.cluster import ray_nodes
 from datagen.cluster.attempt_guard import Meter
 from datagen.cluster.driver import AttemptOrder, drive
 from datagen.cluster.job_progress import JobProgress
@@ -48,7 +51,9 @@ def make_rows(task: RandomRows, meter: Meter) -> AttemptResult:
 
 def main() -> int:
     """Run the missing shards; print the summary as JSON."""
-    place, seconds, address = sys.argv[1], float(sys.argv[2]), (*sys.argv[3:], "local")[0]
+    place, seconds, address = sys.argv[1], float(sys.argv[2]), (*sys.argv[3:4], "local")[0]
+    if patience := sys.argv[4:]:
+        ray_nodes._PATIENCE_S = float(patience[0])
     run, settings = Run.open(place), RaySettings(address=address, workers=2)
     missing = run.missing()
     with (

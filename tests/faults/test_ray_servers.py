@@ -20,6 +20,9 @@ from tests.faults.server_campaign import check_bytes_and_ledger, kill_servers
 from tests.faults.test_ray_processes import REPOSITORY, kill_machine, ray_start
 from tests.made_runs import make_run
 
+# Two slots that take a second a shard are at work for longer than a server may be silent.
+SHARDS, PATIENCE_S = 24, "3"
+
 
 @pytest.mark.parametrize("kind", ["raylet", "gcs_server"])
 def test_a_local_cluster_that_dies_is_started_anew(tmp_path: Path, kind: str) -> None:
@@ -31,7 +34,7 @@ def test_a_local_cluster_that_dies_is_started_anew(tmp_path: Path, kind: str) ->
 def test_a_cluster_of_others_that_dies_ends_the_job_and_leaves_its_shards_open(
     tmp_path: Path, kind: str
 ) -> None:
-    run = make_run(tmp_path / "run", n=60 * 10, shards=())
+    run = make_run(tmp_path / "run", n=SHARDS * 10, shards=())
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {
         "PYTHONPATH": str(REPOSITORY),
         "RAY_AUTH_MODE": "token",
@@ -44,7 +47,7 @@ def test_a_cluster_of_others_that_dies_ends_the_job_and_leaves_its_shards_open(
         address = (session / "ray_current_cluster").read_text().strip()
         command = [sys.executable, "-m", "tests.faults.job", run.storage.url]
         job = subprocess.Popen(
-            [*command, "1.0", address], cwd=REPOSITORY, env=environment,
+            [*command, "1.0", address, PATIENCE_S], cwd=REPOSITORY, env=environment,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         while len(run.committed()) < 3:

@@ -56,7 +56,7 @@ from tests.properties.state_model import (
 
 SHARDS_AT_MOST = 5
 PLACES_AT_MOST = 5
-EXAMPLES, STEPS = 30, 40
+EXAMPLES, STEPS = 15, 40
 
 
 def findings(place: Place) -> list[Any]:

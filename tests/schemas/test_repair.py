@@ -15,10 +15,7 @@ from datagen.schemas.keys import commit_copy_key, commit_key
 from datagen.schemas.record_files import MAX_RECORD_BYTES, encode_record
 from datagen.schemas.run_records import Cost, LedgerEntry
 from tests.made_runs import make_run, write
-
-
-def never(*_: Any) -> dict[str, bytes]:
-    raise AssertionError("no shard is bad")
+from tests.schemas.checked import no_shard_is_bad
 
 
 def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
@@ -37,7 +34,7 @@ def test_a_guess_gives_way_to_the_account_of_whoever_is_still_at_work(
             yield finding
 
     monkeypatch.setattr(repair, "check_runs", and_the_driver_goes_on)
-    repaired = repair_runs(run.storage, never)
+    repaired = repair_runs(run.storage, no_shard_is_bad)
     assert (repaired.records, repaired.left) == (["ledger/lost.json"], [])
     assert run.ledger.end_of("slow") == account
     end = run.ledger.end_of("lost")
@@ -59,7 +56,7 @@ def test_files_that_others_change_meanwhile_are_named(tmp_path: Path) -> None:
         run.storage.put("new.txt", b"1")
         run.storage.delete(["gone.txt"])
 
-    repaired = repair_runs(run.storage, never, 1, others)
+    repaired = repair_runs(run.storage, no_shard_is_bad, 1, others)
     assert repaired.records == [] and sorted(repaired.changed) == ["gone.txt", "other.txt"]
     assert repaired.untouched == files - 2
 
@@ -70,6 +67,6 @@ def test_of_several_copies_the_one_of_the_ledgers_winner_restores_a_commit(tmp_p
         run.storage.put(commit_copy_key(1, name), encode_record(write(run, 1, name)))
     whole = run.storage.get(commit_key(1), MAX_RECORD_BYTES)
     run.storage.delete([commit_key(1)])
-    repaired = repair_runs(run.storage, never)
+    repaired = repair_runs(run.storage, no_shard_is_bad)
     assert (repaired.records, repaired.left) == ([commit_key(1)], [])
     assert run.storage.get(commit_key(1), MAX_RECORD_BYTES) == whole

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from datagen.schemas.checking.finding import Restore
+from datagen.schemas.checking.repair import repair_runs
 from datagen.schemas.errors import InputError
 from datagen.schemas.keys import MERGED, commit_copy_key, commit_key, part_folder
 from datagen.schemas.record_files import encode_record, signed_json
@@ -20,7 +21,7 @@ from datagen.schemas.sealing import seal
 from datagen.schemas.storage import open_storage
 from tests.faults.damage_campaign import fewer_arrays
 from tests.made_runs import attempt, make_run, small_spec
-from tests.schemas.checked import check, edit, folder_of, found, sealed_run
+from tests.schemas.checked import check, edit, folder_of, found, no_shard_is_bad, sealed_run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -259,6 +260,19 @@ def test_a_sealed_store_that_says_other_things_than_sealing_would(sealed: Run):
         assert kinds and set(kinds) <= {"sealed"}, change
     path.write_text("[]")
     assert ("sealed", "data.zarr/zarr.json") in found(folder_of(sealed))
+
+
+def test_a_sealed_root_with_an_empty_list_of_parts_is_found_and_sealed_again(merged: Path, sealed: Run):
+    for folder in (folder_of(sealed), merged):
+        path = folder / "data.zarr/zarr.json"
+        whole = json.loads(path.read_text())
+        path.chmod(0o644)
+        path.write_text(json.dumps(whole | {"attributes": whole["attributes"] | {"parts": []}}))
+        (finding,), checked = check(folder)
+        assert (finding.kind, finding.key) == ("sealed", "data.zarr/zarr.json")
+        assert finding.problem == "names rows that no plan wants" and not checked.is_sealed
+        assert repair_runs(open_storage(folder), no_shard_is_bad).left == []
+        assert json.loads(path.read_text()) == whole and found(folder) == []
 
 
 # Merged places -----------------------------------------------------------------------------------

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from datagen import cli
+from tests.conftest import once
 from tests.sim_extra import SIM_INSTALLED
 from tests.small_runs import CONFIG, make_small_run
 
@@ -24,26 +23,6 @@ arm_reach_m = {low = 0.6, high = 1.0}
 [arm.grasps]
 per_scene = 8
 """
-
-
-@pytest.fixture(scope="session")
-def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all workers of this test session share."""
-    base = tmp_path_factory.getbasetemp()
-    shared = (base.parent if base.name.startswith("popen-") else base) / "train-runs"
-    shared.mkdir(exist_ok=True)
-    return shared
-
-
-def once(folder: Path, make: Callable[[], object]) -> Path:
-    """The folder, made by the first who comes; the others wait for it."""
-    with open(f"{folder}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        done = Path(f"{folder}.done")
-        if not done.exists():
-            make()
-            done.touch()
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -14,10 +14,10 @@ from datagen.schemas.merging import merge_runs, plan_merge
 from datagen.schemas.sealing import seal
 from datagen.schemas.shard_reading import ShardPlace
 from datagen.workers.houses.split import split_of
-from tests.train.conftest import shared_folder, sim_run
+from tests.train.conftest import sim_run
 from tests.train.stream_runs import make_stream_run
 
-__all__ = ["shared_folder", "sim_run"]
+__all__ = ["sim_run"]
 
 
 @pytest.fixture(scope="module")

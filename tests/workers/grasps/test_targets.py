@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.targets import Targets, graspability
-from datagen.workers.objects import open_objects
+from datagen.workers.objects import ObjectSource
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
 from datagen.workers.robots.gripper import Gripper
@@ -87,18 +86,16 @@ def franka_hand() -> Gripper:
     return gripper_of("panda")
 
 
-def test_real_things_that_lie_flat_are_targets(assets: Path) -> None:
+def test_real_things_that_lie_flat_are_targets(ycb: ObjectSource) -> None:
     gripper = franka_hand()
-    source = open_objects(f"ycb:{assets / 'ycb'}")
     for name in ("011_banana", "007_tuna_fish_can", "031_spoon", "026_sponge", "024_bowl"):
-        found = graspability(source.load(name), gripper, GraspParams())
+        found = graspability(ycb.load(name), gripper, GraspParams())
         assert found.is_target, found
         assert found.n_clear_held >= 4
 
 
 @pytest.mark.slow
-def test_thirty_varied_targets_among_real_objects(assets: Path) -> None:
-    source = open_objects(f"ycb:{assets / 'ycb'}")
-    targets = Targets(source.names(), source.load, franka_hand(), GraspParams()).names()
+def test_thirty_varied_targets_among_real_objects(ycb: ObjectSource) -> None:
+    targets = Targets(ycb.names(), ycb.load, franka_hand(), GraspParams()).names()
     assert len(targets) >= 30
     assert sum("cups" in name for name in targets) == 2

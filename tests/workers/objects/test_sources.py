@@ -27,22 +27,10 @@ OUTSIDE_EXCEPTIONS_M = {("ycb", "036_wood_block"): 0.0085}
 
 
 @pytest.fixture(scope="module")
-def source_of(
-    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
-) -> Callable[[str], ObjectSource]:
-    shared = tmp_path_factory.mktemp("cache")
-
+def source_of(request: pytest.FixtureRequest) -> Callable[[str], ObjectSource]:
     @cache
     def opened(kind: str) -> ObjectSource:
-        if kind == "builtin":
-            return open_objects("builtin")
-        folder: Path = request.getfixturevalue("assets")
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("DATAGEN_CACHE", str(shared))
-            source = open_objects(f"ycb:{folder / 'ycb'}")
-            for name in source.names():
-                source.load(name)
-        return source
+        return open_objects("builtin") if kind == "builtin" else request.getfixturevalue("ycb")
 
     return opened
 
