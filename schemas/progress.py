@@ -107,6 +107,21 @@ class Progress:
             self._next_s, self._told = now_s + self._every_s, True
             self._show()
 
+    def counter(self, what: str) -> Seen:
+        """A function `seen(done, of)` that shows the progress of `what` with rate and time left."""
+        pace = Pace(self.clock)
+
+        def seen(done: int, of: int) -> None:
+            def figures() -> tuple[str, dict[str, object]]:
+                rate, left_s = pace.per_s(), pace.left_s(of - done)
+                values = {"what": what, "done": done, "of": of, "per_s": round(rate, 1)}
+                return f"{rate:,.0f}/s  {clock_text(left_s)} left", {**values, "left_s": whole(left_s)}
+
+            pace.see(done)
+            self.update(what, done, of, figures)
+
+        return seen
+
     def say(self, event: str, values: Mapping[str, object], text: str, style: str = "") -> None:
         """Print a line above the bar: `text`, or as JSON the event with its values."""
         self._told = True
@@ -149,17 +164,7 @@ class Progress:
 def counting(what: str, as_json: bool = False, clock: Clock = time.monotonic, of: int = 0) -> Generator[Seen]:
     """Give a function `seen(done, of)` that shows the progress with rate and time left."""
     with Progress(as_json, clock) as progress:
-        pace = Pace(clock)
-
-        def seen(done: int, of: int) -> None:
-            def figures() -> tuple[str, dict[str, object]]:
-                rate, left_s = pace.per_s(), pace.left_s(of - done)
-                values = {"what": what, "done": done, "of": of, "per_s": round(rate, 1)}
-                return f"{rate:,.0f}/s  {clock_text(left_s)} left", {**values, "left_s": whole(left_s)}
-
-            pace.see(done)
-            progress.update(what, done, of, figures)
-
+        seen = progress.counter(what)
         seen(0, of)  # a terminal shows it from the start
         yield seen
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import Progress
+from datagen.schemas.progress import Progress, Seen
 from datagen.train.augment import Augmentation
 from datagen.train.dataset import SampleStream
 from datagen.train.encoded.batches import EncodedBatches
@@ -68,12 +68,13 @@ def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> b
     torch.set_num_threads(job.threads)
     with ExitStack() as stack:
         callbacks: list[TrainingCallback] = []
+        shown: Progress | None = None
         if ranks.leads:
             stack.enter_context(only_writer(job.out))
             shown = stack.enter_context(Progress(job.json_lines))
             shown.phase("opening runs")
             callbacks.append(TrainingProgress(shown, job.out))
-        training, head = prepare_training(job, ranks)
+        training, head = prepare_training(job, ranks, shown.counter("scenes encoded") if shown else None)
         at = training.position
         if ranks.leads and job.tensorboard and not at.finished:
             callbacks.append(stack.enter_context(closing(TensorBoardCallback(job.tensorboard, at.step))))
@@ -82,8 +83,13 @@ def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> b
         )
 
 
-def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, CheckpointHead]:
-    """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say."""
+def prepare_training(
+    job: TrainingJob, ranks: Ranks, seen: Seen | None = None
+) -> tuple[Training, CheckpointHead]:
+    """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say.
+
+    `seen(done, of)` is called while scenes are encoded.
+    """
     options, stage = job.options, STAGES[job.options.stage]
     began = read_checkpoint(job.init) if job.init is not None else None
     train, val = _streams(job, ranks)
@@ -92,7 +98,7 @@ def prepare_training(job: TrainingJob, ranks: Ranks) -> tuple[Training, Checkpoi
         _refuse_known_houses(job, began.head, val)
     class_weights = _class_weights(train, stage.weighted)
     model = _model(job, began)
-    batches = (train, val) if job.encoded is None else _encoded(job, ranks, model, train, val)
+    batches = (train, val) if job.encoded is None else _encoded(job, ranks, model, (train, val), seen)
     optimiser = make_optimiser(model, options.lr, options.weight_decay)
     head = _head(job, model, train, val, began.head if began else None)
     position = Position()
@@ -173,7 +179,11 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
 
 
 def _encoded(
-    job: TrainingJob, ranks: Ranks, model: Model, train: SampleStream, val: SampleStream
+    job: TrainingJob,
+    ranks: Ranks,
+    model: Model,
+    streams: tuple[SampleStream, SampleStream],
+    seen: Seen | None,
 ) -> tuple[EncodedBatches, EncodedBatches]:
     """Batches of the streams' scenes from clouds that are encoded once. InputError where that cannot be."""
     options, folder = job.options, Path(job.encoded or "")
@@ -184,15 +194,16 @@ def _encoded(
         "--processes": ranks.world > 1,
         "--perturb": bool(_rate_fields(job, job.runs)),
     }
-    for option, given in cannot.items():
-        if given:
+    for option, is_given in cannot.items():
+        if is_given:
             problem = f"does not go with {option}: clouds are encoded once, for one `shared` model"
             raise InputError("datagen train", "--encoded", problem, "Omit one of them")
     assert isinstance(model, SharedModel)
     made: list[EncodedBatches] = []
-    for stream, runs, seed in ((train, job.runs, options.seed), (val, job.val_runs or job.runs, None)):
+    given = (job.runs, options.seed), (job.val_runs or job.runs, None)
+    for stream, (runs, seed) in zip(streams, given, strict=True):
         clouds = encoded_stream(runs, job.allow_incomplete)
-        encoded = encode_runs(clouds, model, folder, lambda done, of: None)
+        encoded = encode_runs(clouds, model, folder, seen or (lambda done, of: None))
         scenes = np.flatnonzero(np.isin(encoded.houses, sorted(stream.house_ids())))
         made.append(EncodedBatches(encoded, scenes, options.batch_scenes, seed))
     return made[0], made[1]
