@@ -64,7 +64,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "frontier": ("datagen.commands.frontier:frontier", "Show which labels pay, and which to buy next."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
-    "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
+    "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
 }
 
 _HEADINGS = {
