@@ -61,6 +61,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "show": ("datagen.commands.show:show", "Draw a picture of one scene of a run."),
     "train": ("datagen.commands.train:train_model", "Train a model on labels."),
     "evaluate": ("datagen.commands.evaluate:evaluate", "Compare models with baselines and the paper."),
+    "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
     "frontier": ("datagen.commands.frontier:frontier", "Show which labels pay, and which to buy next."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
@@ -71,12 +72,14 @@ _HEADINGS = {
     "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
     "Look at runs": ("status", "logs", "show", "audit", "report", "estimate"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
-    "Models": ("train", "evaluate", "frontier", "predict", "calibrate"),
+    "Models": ("train", "evaluate", "benchmark", "frontier", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
 }
 
 # The extra to name where a library that a verb lacks comes with several.
-_EXTRA_OF: dict[str, str] = dict.fromkeys(("train", "evaluate", "frontier", "predict", "calibrate"), "train")
+_EXTRA_OF: dict[str, str] = dict.fromkeys(
+    ("train", "evaluate", "benchmark", "frontier", "predict", "calibrate"), "train"
+)
 
 
 def build_app(called: str = "") -> App:

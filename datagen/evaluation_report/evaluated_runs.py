@@ -139,9 +139,12 @@ def candidate_sets_of(runs: Sequence[EvaluatedRun], asked: Sequence[str]) -> dic
     return {name: rows for name, rows in offered.items() if not asked or name in asked}
 
 
-def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[EvaluatedMethod]) -> None:
+def refuse_seen_houses(
+    runs: Sequence[EvaluatedRun],
+    evaluated: Iterable[EvaluatedMethod],
+    fix: str = "Evaluate a run of another split, or give --allow-seen-houses to report them separately",
+) -> None:
     """InputError that names a house of these runs on which a method was trained."""
-    fix = "Evaluate a run of another split, or give --allow-seen-houses to report them separately"
     by = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
     for run in runs:
         here = run.stream.house_ids()
