@@ -13,7 +13,10 @@ from datagen.evaluation_report.evaluated_runs import EvaluatedRun
 from datagen.evaluation_report.methods import EvaluatedMethod, baseline_methods, open_models
 from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
+from datagen.schemas.progress import Progress
 from datagen.train.baselines import BASELINES
+
+_RUNS = "runs the code of"
 
 
 def open_methods(
@@ -46,9 +49,10 @@ def open_methods(
                 gives_probabilities=file.says_probabilities,
             )
         elif kind == "python":
+            Progress(json).say("note", {"note": f"{_RUNS} {each}"}, f"{_RUNS} {each}")
             scorer = import_scorer(each)
             found[each] = EvaluatedMethod(
-                each, scorer, each, note="runs your code", gives_probabilities=scorer.says_probabilities
+                each, scorer, each, note=f"{_RUNS} {each}", gives_probabilities=scorer.says_probabilities
             )
     methods = [found[each] for each in kinds]
     for name, count in Counter(method.name for method in methods).items():
