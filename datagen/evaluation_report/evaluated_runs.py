@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from datagen.released import RELEASED, released_checkpoint
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -58,7 +59,10 @@ class EvaluatedRun:
 
 
 def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return (checkpoints, runs): files are checkpoints; folders and s3:// addresses are runs."""
+    """Return (checkpoints, runs): files are checkpoints; folders and s3:// addresses are runs.
+
+    `released` is the checkpoint of the released model, unless there is a file or folder of that name.
+    """
     checkpoints: list[str] = []
     runs: list[str] = []
     for place in places:
@@ -66,6 +70,8 @@ def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
             runs.append(place)
         elif Path(place).is_file():
             checkpoints.append(place)
+        elif place == RELEASED:
+            checkpoints.append(str(released_checkpoint()))
         else:
             fix = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
             raise InputError(place, "", "is neither a checkpoint file nor a run folder", fix)

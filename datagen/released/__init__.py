@@ -11,7 +11,12 @@ from datagen.schemas.errors import InputError
 
 RELEASED = "released"
 FOLDER = Path(str(files("datagen.released")))
-CHECKPOINT, CARD, RESULTS, FRAME = "model.safetensors", "card.json", "benchmark.json", "frame"
+CHECKPOINT, RESULTS, FRAME = "model.safetensors", "results.json", "frame"
+# The facts, how the model was made, and the page of both.
+CARD, RECIPE, CARD_PAGE = "card.json", "recipe.md", "MODEL_CARD.md"
+# What `datagen predict --demo` asks on the sample frame: a pixel on the blue cup, and a robot.
+DEMO_CLICK = (390, 256)
+DEMO_BASE_HEIGHT_M, DEMO_REACH_M = 0.7, 0.9
 
 
 def released_checkpoint() -> Path:
