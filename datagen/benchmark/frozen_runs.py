@@ -30,7 +30,7 @@ def refuse_differing(place: str, name: str, wanted: BenchmarkRun, version: str) 
     Digests are compared where the run is frozen.
     """
     whose = f"run {name} of benchmark {version}"
-    fix = f"Make it with `datagen benchmark make --run {name}`, or copy its store"
+    fix = f"Make it with `datagen benchmark make --run {name}`, or copy the run"
     parts = open_parts([place], _FIELDS)
     for part in parts:
         ours, theirs = (s.model_dump(mode="json") for s in (wanted.spec, part.specs[0]))

@@ -60,7 +60,7 @@ def make_runs(
 ) -> Iterator[JobResult]:
     """Make each run in its folder of `out`, and give what was done; a complete one is left as it is.
 
-    InputError, before anything is written, where the houses, objects or engines here are others than the
+    InputError, before a run is begun, where the houses, objects or engines here are others than the
     definition's: the labels would differ.
     """
     planned: list[PlannedRun] = []

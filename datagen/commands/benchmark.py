@@ -8,7 +8,7 @@ from typing import Annotated, Any, Unpack
 
 from cyclopts import App, Parameter
 
-from datagen.console.command_lines import prints, words_of
+from datagen.console.command_lines import Interrupted, prints, words_of
 from datagen.console.options import AsJson, File, Place, Places, Whole, refuse_odd_draws, refuse_output
 from datagen.console.printing import print_json, print_rows
 from datagen.jobs.job_report import JobResult, print_job
@@ -70,11 +70,15 @@ def make(
     words += job_options.words()
     sources = divided_sources(houses, objects, folder, runs)
     results: list[JobResult] = []
-    for result in make_runs(runs, sources, folder, job_options, words):
-        results.append(result)
-        print_job(result, job=job)
-        if not result.complete:
-            return results
+    try:
+        for result in make_runs(runs, sources, folder, job_options, words):
+            results.append(result)
+            print_job(result, job=job)
+            if not result.complete:
+                return results
+    except Interrupted as stopped:
+        print_job(stopped.result, job=job)
+        raise Interrupted(str(stopped), [*results, stopped.result]) from stopped
     rows: list[tuple[str, str]] = []
     for name, wanted in runs.items():
         refuse_differing(str(folder / name), name, wanted, definition.version)

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import runpy
+import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from datagen import cli
+from datagen.benchmark import make_runs
 from datagen.benchmark.definition import read_benchmark
 from datagen.benchmark.frozen_runs import digests_of
+from datagen.cli import build_app
+from datagen.console.command_lines import Interrupted
+from datagen.jobs.job_report import JobResult
 from tests.conftest import REPOSITORY
 from tests.sim_extra import needs_sim
 from tests.small_runs import arrays_of, assert_equal_runs
@@ -34,6 +40,22 @@ def test_the_runs_are_made_again_bit_for_bit(
     assert not (out / "grids").exists()
     assert made(small_benchmark, out, "--run", "test") == 0
     assert "nothing to do" in capsys.readouterr().out
+
+
+@needs_sim
+def test_an_interrupted_command_says_how_to_resume_itself(
+    small_benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: Any, resume: list[str], **more: Any) -> JobResult:
+        raise Interrupted("1 shard left", JobResult("x", "interrupted", remaining=1, resume=tuple(resume)))
+
+    monkeypatch.setattr(make_runs, "start_job", stopped)
+    assert made(small_benchmark, tmp_path / "out", "--run", "test") == 130
+    told = capsys.readouterr().err
+    assert "interrupted; 1 shard left. Resume with:\n  datagen benchmark make --houses builtin" in told
+    (line,) = [each for each in told.splitlines() if each.startswith("  datagen ")]
+    build_app("benchmark").parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+    assert f"--out {tmp_path / 'out'} --run test" in line
 
 
 @needs_sim
