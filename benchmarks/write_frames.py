@@ -39,16 +39,18 @@ def main() -> None:
     parser.add_argument("--objects", default="builtin")
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--seed", type=int, default=77)
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--posed", action="store_true", help="write the pose of the camera too")
     options = parser.parse_args()
     opened = open_houses(options.houses), open_objects(options.objects)
     house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
-    spec = Specification(seed=options.seed, split="test", houses=house, objects=thing)
+    spec = Specification(seed=options.seed, split=options.split, houses=house, objects=thing)
     world = assemble_world(spec, *opened, options.houses, options.objects)
     options.folder.mkdir(parents=True, exist_ok=True)
     for index in range(options.scenes):
         scene, _ = generate_scene(world, index, StageClock())
         seen = Seen(scene, render_rays(scene.rays, scene.camera)).noisy()
-        place = write_frame(options.folder / f"frame{index}", seen, posed=False)
+        place = write_frame(options.folder / f"frame{index}", seen, posed=options.posed)
         print(f"{place}  camera height {seen.height_m:.3f} m")
 
 

@@ -65,23 +65,24 @@ VERBS: dict[str, tuple[str, str]] = {
         "datagen.commands.closed_loop:closed_loop",
         "Execute methods' picks where robots park off them.",
     ),
+    "benchmark": ("datagen.commands.benchmark:app", "Make and score the frozen benchmark."),
     "frontier": ("datagen.commands.frontier:frontier", "Show which labels pay, and which to buy next."),
     "predict": ("datagen.commands.predict:predict", "Find a base pose in a depth camera's frame."),
     "doctor": ("datagen.doctor:doctor", "Check this machine, and show how to fix what is missing."),
-    "assets": ("datagen.assets.cli:app", "List, fetch, lock and verify houses and objects."),
+    "assets": ("datagen.assets.cli:app", "List, fetch, lock, verify and split houses and objects."),
 }
 
 _HEADINGS = {
     "Make labels": ("submit", "resume", "extend", "cancel", "merge", "relabel"),
     "Look at runs": ("status", "logs", "show", "audit", "report", "estimate"),
     "Check and keep runs": ("verify", "repair", "replay", "seal", "unseal", "gc"),
-    "Models": ("train", "evaluate", "closed-loop", "frontier", "predict", "calibrate"),
+    "Models": ("train", "evaluate", "benchmark", "closed-loop", "frontier", "predict", "calibrate"),
     "This machine": ("doctor", "assets"),
 }
 
 # The extra to name where a library that a verb lacks comes with several.
 _EXTRA_OF: dict[str, str] = dict.fromkeys(
-    ("train", "evaluate", "closed-loop", "frontier", "predict", "calibrate"), "train"
+    ("train", "evaluate", "benchmark", "closed-loop", "frontier", "predict", "calibrate"), "train"
 )
 
 

@@ -76,9 +76,7 @@ made_after() {
 }
 
 # 1. Objects: four fifths to train on, and every fifth, which only the test runs have.
-if ! [ -f "$OUT/objects/test/objects.json" ]; then
-    "$BIN/python" "$ROOT/scripts/split_objects.py" "$ASSETS/ycb" "$OUT/objects"
-fi
+datagen assets split "$ASSETS/ycb" "$OUT/objects"
 
 # 2. Labels: the paper's rule, which is cheap, and trials, which are not. No house is in two splits.
 SOME=(--candidates-per-scene "$PER_SCENE")

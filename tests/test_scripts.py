@@ -30,7 +30,7 @@ def load(name: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["environment", "split_objects", "system_libraries"])
+@pytest.mark.parametrize("name", ["environment", "system_libraries"])
 def test_they_need_only_the_standard_library(name: str) -> None:
     code = f"import runpy; runpy.run_path({str(SCRIPTS / (name + '.py'))!r}, run_name='loaded')"
     subprocess.run([sys.executable, "-I", "-S", "-c", code], check=True)
@@ -129,75 +129,3 @@ def test_missing_libraries_are_found_and_answered(monkeypatch: pytest.MonkeyPatc
     assert libraries.packages_for(["libnothere.so.9"]) == ["libnewname9"]
     monkeypatch.setattr(libraries.os, "geteuid", lambda: 1000)
     assert "sudo apt-get install -y --no-install-recommends a b" in libraries.install_command(["a", "b"])
-
-
-def ycb_folder(folder: Path, *, path: str = "{key}/a.obj", n: int = 10, **more: object) -> Path:
-    """A folder of `n` objects with a file each, of which the last one names `path`, or has other fields."""
-    entries: list[dict[str, object]] = []
-    for i in range(n):
-        key = f"{i:03}_thing"
-        (folder / key).mkdir(parents=True)
-        (folder / key / "a.obj").write_text(key)
-        last = i == n - 1
-        entries.append({"key": key, "files": {"visual": (path if last else "{key}/a.obj").format(key=key)}})
-        entries[-1] |= more if last else {}
-    (folder / "objects.json").write_text(json.dumps(entries[::-1]))
-    return folder
-
-
-def files_below(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def test_objects_are_split_by_their_names(tmp_path: Path) -> None:
-    split = load("split_objects")
-    source, out = ycb_folder(tmp_path / "ycb"), tmp_path / "out"
-    assert split.main([str(source), str(out)]) == 0
-    keys = {
-        n: [e["key"] for e in json.loads((out / n / "objects.json").read_text())] for n in ("train", "test")
-    }
-    assert keys["test"] == ["004_thing", "009_thing"]
-    assert sorted(keys["train"] + keys["test"]) == [f"{i:03}_thing" for i in range(10)]
-    before = files_below(out)
-    assert before["test/009_thing/a.obj"] == b"009_thing" and len(before) == 12
-    assert split.main([str(source), str(out)]) == 0
-    assert files_below(out) == before
-    # One of its own results, split again into the place where it lies.
-    assert split.main([str(out / "train"), str(out)]) == 2
-    assert files_below(out) == before
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"path": "../secret"}, "[0].files"),
-        ({"path": "{key}/../../secret"}, "[0].files"),
-        ({"path": "link"}, "[0].files"),
-        ({"path": "/etc/hostname"}, "[0].files"),
-        ({"path": "{key}/none.obj"}, "[0].files"),
-        ({"path": "a\0b"}, "[0].files"),
-        ({"key": "000_thing"}, "].key"),
-        ({"key": 3}, "[0].key"),
-        ({"files": ["a"]}, "[0].files"),
-        ({"n": 4}, "5 objects"),
-    ],
-)
-def test_an_index_that_leads_elsewhere_is_one_line(
-    changes: dict[str, Any], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "secret").write_text("secret")
-    source = ycb_folder(tmp_path / "ycb", **changes)
-    (source / "link").symlink_to(tmp_path / "secret")
-    assert load("split_objects").main([str(source), str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"error: {source}/objects.json: ") and words in told and told.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("text", ["", "[", "{}", "[1,2,3,4,5]", "\xff", "[" * 200_000])
-def test_a_broken_index_is_one_line(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "objects.json").write_bytes(text.encode("latin-1"))
-    assert load("split_objects").main([str(tmp_path), str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert load("split_objects").main([str(tmp_path / "none"), str(tmp_path / "out")]) == 2
-    assert not (tmp_path / "out").exists()

@@ -46,6 +46,17 @@ def test_a_wheel_adds_one_import_name(wheel: Path) -> None:
     assert {name for name in names if not name.endswith(".dist-info")} == {"datagen"}
 
 
+def test_a_wheel_has_the_benchmark_the_model_and_its_frame(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+    released = {name: size for name, size in sizes.items() if name.startswith("datagen/released/")}
+    for folder in ("released", "benchmark"):
+        for path in (REPOSITORY / "datagen" / folder).rglob("*"):
+            if path.is_file() and path.suffix != ".pyc":
+                assert sizes[str(path.relative_to(REPOSITORY))] == path.stat().st_size
+    assert sum(released.values()) < 5_500_000
+
+
 def test_the_folders_of_a_checkout_cannot_be_imported_under_their_own_names() -> None:
     for name in ("cluster", "schemas", "train", "workers"):
         command = [sys.executable, "-c", f"import {name}"]
@@ -79,5 +90,8 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     write_frame(folder / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
     datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png")
-    assert {"scene.png", "page.html", "heat.png"} <= {path.name for path in folder.iterdir()}
+    datagen("predict", "--demo")
+    assert {"scene.png", "page.html", "heat.png", "demo.png", "demo.html"} <= {
+        path.name for path in folder.iterdir()
+    }
     assert not (folder / "imported").exists(), (folder / "imported").read_text()

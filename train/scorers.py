@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -67,6 +68,16 @@ def scored(scorer: Scorer, batch: Batch[Array]) -> F64:
         problem = f"is not finite for sample {batch.sample_id[row].tobytes().hex()}"
         raise InputError(scorer.name, "score", problem, "Train the model again, or omit this method")
     return score
+
+
+def weights_sha256(model: Model) -> str:
+    """sha256 of a model's weights by name: the same for its checkpoint with and without optimiser's state."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        array = tensor.cpu().contiguous().numpy()
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 def use_threads(n: int) -> None:

@@ -1,4 +1,4 @@
-"""`datagen assets`: list, lock, verify and fetch houses and objects."""
+"""`datagen assets`: list, lock, verify, split and fetch houses and objects."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from rich.progress import (
 from datagen.assets import lock as locks
 from datagen.assets.catalogue import CATALOGUE, CatalogueEntry, select
 from datagen.assets.fetch import Fetched, fetch, refuse_full_disk
+from datagen.assets.object_split import split_objects
 from datagen.console.options import AsJson
 from datagen.console.printing import print_json, print_rows, size
 from datagen.schemas.errors import InputError, choices
@@ -29,7 +30,7 @@ from datagen.workers.content_cache import cache_folder
 
 Folder = Annotated[Path, Parameter(help="Folder of assets.")]
 
-app = App(name="assets", help="List, fetch, lock and verify houses and objects.")
+app = App(name="assets", help="List, fetch, lock, verify and split houses and objects.")
 
 
 @app.command(name="list")
@@ -108,6 +109,21 @@ def verify(folder: Folder, *, json: AsJson = False) -> int:
         )
     rows = [("files as locked", str(result.checked)), ("not in the lock", str(len(result.unlisted)))]
     print_rows(f"verified {folder}", rows)
+    return 0
+
+
+@app.command
+def split(folder: Folder, out: Path, *, json: AsJson = False) -> int:
+    """Divide a folder of YCB objects: every fifth to OUT/test, the others to OUT/train.
+
+    Args:
+        out: Folder for the two parts.
+    """
+    sizes = split_objects(folder, out)
+    if json:
+        print_json({"folder": str(out), **sizes})
+    else:
+        print_rows(f"objects of {folder}", [(str(out / name), str(n)) for name, n in sizes.items()])
     return 0
 
 

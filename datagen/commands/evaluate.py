@@ -66,7 +66,7 @@ def evaluate(
     For example: datagen evaluate model.ckpt runs/sim-test --html report.html
 
     Args:
-        paths: Checkpoints of `datagen train`, and runs of sim or plan labels.
+        paths: Checkpoints of `datagen train`, or `released`, and runs of sim or plan labels.
         candidates: Candidate set to report; repeat for more [all in the runs].
         fit: Run in validation houses to fit baselines on; repeat for more.
         baselines: Baseline to compare with, or none; repeat for more [all].

@@ -18,6 +18,7 @@ from cyclopts import Parameter, Token
 from datagen.console.command_lines import prints
 from datagen.console.options import AsJson, File, Whole, refuse_output
 from datagen.console.printing import print_json, print_rows
+from datagen.released import DEMO_BASE_HEIGHT_M, DEMO_CLICK, DEMO_REACH_M, RELEASED, sample_frame
 from datagen.schemas.errors import InputError
 from datagen.schemas.whole_files import whole_file
 from datagen.workers.geometry.mesh import F64
@@ -37,10 +38,17 @@ else:
 _LARGEST_M = 10.0
 _MOST_FRAMES = 64
 _MOST_ENTRIES = 10_000
+# Written by --demo in the working folder, unless it is told where.
+DEMO_PICTURE, DEMO_PAGE = Path("demo.png"), Path("demo.html")
 
 
 def print_prediction(
-    prediction: Prediction, json: bool, out: Path | None = None, html: Path | None = None, **_: Any
+    prediction: Prediction,
+    json: bool,
+    out: str | Path | None = None,
+    html: str | Path | None = None,
+    demo: bool = False,
+    **_: Any,
 ) -> int:
     """Print the best base pose; the exit code is 1 when no cell was seen to be clear."""
     from datagen.train.prediction.prediction_report import document, told
@@ -48,6 +56,8 @@ def print_prediction(
     if json:
         print_json(document(prediction))
     else:
+        if demo:
+            out, html = out or DEMO_PICTURE, html or DEMO_PAGE
         written = [(name, str(file)) for name, file in (("picture", out), ("page", html)) if file is not None]
         print_rows(f"base poses by {prediction.scorer}", [*told(prediction), *written])
     return 0 if prediction.best is not None else 1
@@ -74,11 +84,12 @@ def _numbers(kind: Any, tokens: Sequence[Token]) -> list[float]:
 
 @prints(print_prediction)
 def predict(
-    checkpoint: Annotated[Checkpoint, Parameter(name="CHECKPOINT")],
+    checkpoint: Annotated[Checkpoint | None, Parameter(name="CHECKPOINT")] = None,
     /,
     *,
-    base_height: float,
-    reach: float,
+    base_height: float | None = None,
+    reach: float | None = None,
+    demo: bool = False,
     rgb: File | None = None,
     depth: File | None = None,
     intrinsics: File | None = None,
@@ -109,12 +120,14 @@ def predict(
     --camera-pose, from --gravity and --camera-height, or from the image and --camera-height. Exit code 1 when
     no cell was seen to be clear.
 
-    For example: datagen predict model.ckpt --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
+    For example: datagen predict --base-height 0.4 --reach 0.85 --frame FRAME.npz --out best.png
 
     Args:
-        checkpoint: Checkpoint of `datagen train`; in Python also what `datagen.load_scorer` made of it.
-        base_height: Height of the arm's mount above the floor (m).
-        reach: Reach of the arm from its mount (m).
+        checkpoint: Checkpoint of `datagen train`; in Python also what `datagen.load_scorer` made of it
+            [the released model].
+        base_height: Height of the arm's mount above the floor (m); only --demo has its own.
+        reach: Reach of the arm from its mount (m); only --demo has its own.
+        demo: Predict on the frame that ships with the package; writes demo.png and demo.html.
         rgb: Colour image, aligned with the depth image.
         depth: Depth image, 16-bit PNG.
         intrinsics: JSON file: fx, fy, cx, cy (or ppx, ppy), width, height (pixels).
@@ -161,6 +174,14 @@ def predict(
     from datagen.train.prediction import RobotSize, load_scorer, read_footprint
     from datagen.train.prediction import predict as scored
 
+    if demo:
+        _refuse_with_demo(rgb, depth, intrinsics, mask, click, frame, frame_dir, camera_pose)
+        frame, click = [sample_frame()], DEMO_CLICK
+        base_height, reach = base_height or DEMO_BASE_HEIGHT_M, reach or DEMO_REACH_M
+        out, html = out or DEMO_PICTURE, html or DEMO_PAGE
+    if base_height is None or reach is None:
+        missing = "--base-height" if base_height is None else "--reach"
+        raise InputError("datagen predict", missing, "is missing", "Give both lengths of the robot in metres")
     lengths = {"--base-height": base_height, "--reach": reach, "--camera-height": camera_height}
     for name, value in (lengths | {"--robot-camera-height": robot_camera_height}).items():
         _refuse_length(name, value)
@@ -177,7 +198,7 @@ def predict(
     named = [Path(each) if isinstance(each, str) else each for each in frame or ()]
     frames = _frames(rgb, depth, intrinsics, mask, camera_pose, named, frame_dir, depth_scale)
     files = [each for each in named if isinstance(each, Path)]
-    model = Path(checkpoint) if isinstance(checkpoint, (str, Path)) else None
+    model = Path(checkpoint) if isinstance(checkpoint, (str, Path)) and checkpoint != RELEASED else None
     _refuse_outputs(out, html, [model, rgb, depth, intrinsics, mask, camera_pose, *files])
     own_height = robot_camera_height if robot_camera_height is not None else camera_height
     if own_height is None:
@@ -187,7 +208,7 @@ def predict(
         raise InputError("--camera-height", "", "missing", fix)
     _refuse_length("--robot-camera-height", own_height)
     answer = scored(
-        load_scorer(checkpoint) if isinstance(checkpoint, (str, Path)) else checkpoint,
+        load_scorer(checkpoint) if checkpoint is None or isinstance(checkpoint, (str, Path)) else checkpoint,
         frames,
         RobotSize(own_height, base_height, reach, outline),
         camera_height_m=camera_height,
@@ -258,6 +279,13 @@ def _frames(
     if not pictures and camera_pose is not None:
         frames[0] = replace(frames[0], T_world_camera=read_pose(camera_pose))
     return frames
+
+
+def _refuse_with_demo(*given: object) -> None:
+    """Raise InputError for an option of a frame: the demonstration has its own."""
+    if any(each is not None for each in given):
+        fix = "Omit --demo to predict on a frame of your own"
+        raise InputError("--demo", "", "has a frame and a click of its own", fix)
 
 
 def _refuse_length(name: str, value: float | None) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from datagen.released import RELEASED, released_checkpoint
 from datagen.reports.specification_summary import specification_record
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
@@ -58,7 +59,10 @@ class EvaluatedRun:
 
 
 def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return (checkpoints, runs): files are checkpoints; folders and s3:// addresses are runs."""
+    """Return (checkpoints, runs): files are checkpoints; folders and s3:// addresses are runs.
+
+    `released` is the checkpoint of the released model, unless there is a file or folder of that name.
+    """
     checkpoints: list[str] = []
     runs: list[str] = []
     for place in places:
@@ -66,6 +70,8 @@ def split_paths(places: Sequence[str]) -> tuple[list[str], list[str]]:
             runs.append(place)
         elif Path(place).is_file():
             checkpoints.append(place)
+        elif place == RELEASED:
+            checkpoints.append(str(released_checkpoint()))
         else:
             fix = "Name checkpoints of `datagen train` and runs of `datagen submit sim`"
             raise InputError(place, "", "is neither a checkpoint file nor a run folder", fix)
@@ -139,9 +145,12 @@ def candidate_sets_of(runs: Sequence[EvaluatedRun], asked: Sequence[str]) -> dic
     return {name: rows for name, rows in offered.items() if not asked or name in asked}
 
 
-def refuse_seen_houses(runs: Sequence[EvaluatedRun], evaluated: Iterable[EvaluatedMethod]) -> None:
+def refuse_seen_houses(
+    runs: Sequence[EvaluatedRun],
+    evaluated: Iterable[EvaluatedMethod],
+    fix: str = "Evaluate a run of another split, or give --allow-seen-houses to report them separately",
+) -> None:
     """InputError that names a house of these runs on which a method was trained."""
-    fix = "Evaluate a run of another split, or give --allow-seen-houses to report them separately"
     by = [(f"{c.name} ({c.place})", c.houses) for c in evaluated]
     for run in runs:
         here = run.stream.house_ids()

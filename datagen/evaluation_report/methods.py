@@ -50,6 +50,7 @@ class EvaluatedMethod:
     state: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""
     calibration: Calibration | None = None
+    gives_probabilities: bool = False  # where neither a checkpoint nor `scalars` says so
 
     @property
     def regime(self) -> str:
@@ -66,7 +67,8 @@ class EvaluatedMethod:
     @property
     def method(self) -> Method:
         """The method for the metrics."""
-        is_probability = self.head is not None or isinstance(self.scorer, Scalars)
+        trained = self.head is not None or isinstance(self.scorer, Scalars)
+        is_probability = trained or self.gives_probabilities
         return Method(self.name, self.scorer.threshold, self.origin, is_probability, self.calibration)
 
     @property

@@ -54,7 +54,7 @@ def open_job_run(run: Run, given: Sources, address: str) -> JobRun:
     if given.scenes_from is not None and spec.scenes_from is None:
         problem = f"{run.storage.url} has its own scenes"
         raise InputError("--scenes-from", given.scenes_from, problem, "Omit --scenes-from")
-    _refuse_other_engines(run)
+    refuse_other_engines(f"{run.storage.url}/manifest.json", spec)
     open_sources(run, given)
     refuse_unusable_engines(spec, address)
     return JobRun(
@@ -111,9 +111,13 @@ def start_job(
     began_s: float,
     command: Sequence[str],
     given: Sources = AS_FOUND,
+    resume: Sequence[str] | None = None,
 ) -> JobResult:
-    """Make the missing shards. Raises Interrupted where the job was asked to stop."""
-    words = ["resume", absolute_place(path), *source_words(given), *job_options.words()]
+    """Make the missing shards. Raises Interrupted where the job was asked to stop.
+
+    `resume` are the words of the command that resumes, by default `datagen resume`.
+    """
+    words = list(resume or ["resume", absolute_place(path), *source_words(given), *job_options.words()])
     words += detached_words() or job_options.address_words()
     with resumable(words):
         result = run_job(JobPlan(storage, path, job_runs, job_options, began_s, command, words))
@@ -134,8 +138,8 @@ def refuse_unusable_engines(spec: Specification, address: str) -> None:
             raise InputError("--renderer", "sapien", problem, fix)
 
 
-def _refuse_other_engines(run: Run) -> None:
-    spec = run.manifest.spec
+def refuse_other_engines(place: str, spec: Specification) -> None:
+    """Raise InputError for a specification of other versions of the label code or of engines than here."""
     try:
         here = label_engines(spec.label_source)
         if spec.scenes_from is None:  # stored scenes need no scene engines
@@ -143,9 +147,9 @@ def _refuse_other_engines(run: Run) -> None:
     except PackageNotFoundError as error:
         missing = missing_library(error)
         fix = missing.fix if missing else "Install it"
-        raise InputError(run.storage.url, "engines", f"{error.name} is not installed", fix) from None
+        raise InputError(place, "engines", f"{error.name} is not installed", fix) from None
     made = {name: version for name, version in spec.engines.items() if name in here}
     rows = [f"{name}: the run has {a}, this machine {b}" for name, a, b in different_fields(made, here)]
     if rows:
-        place, fix = f"{run.storage.url}/manifest.json", "Install the run's versions, or start a new run"
+        fix = "Install the run's versions, or start a new run"
         raise InputError(place, "engines", "; ".join(rows), fix)

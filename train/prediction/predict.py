@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import CandidateParams, ObservationParams
 from datagen.train.arrivals import Arrival
@@ -146,11 +147,11 @@ class Prediction:
 _CROP = ObservationParams()
 
 
-def load_scorer(checkpoint: str | Path) -> ModelScorer:
+def load_scorer(checkpoint: str | Path | None = None) -> ModelScorer:
     """The model of a checkpoint, ready to predict many frames: `datagen.predict` accepts it as `checkpoint`.
 
     Args:
-        checkpoint: Checkpoint of `datagen train`.
+        checkpoint: Checkpoint of `datagen train`; the released model where none is given, or for "released".
 
     Returns:
         A scorer with `name`, `threshold` and `score(batch)`.
@@ -169,6 +170,9 @@ def load_scorer(checkpoint: str | Path) -> ModelScorer:
     # Imported here: frames are read and refused without torch.
     from datagen.train.training.checkpoints import load_model
 
+    if checkpoint is None or checkpoint == RELEASED:
+        model, head = load_model(released_checkpoint())
+        return ModelScorer(model, f"the released model, {head.model} ({head.stage})")
     model, head = load_model(checkpoint)
     return ModelScorer(model, f"{head.model} ({head.stage})")
 

@@ -1,0 +1,146 @@
+"""The leaderboard as tables, for terminal and page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from datagen.benchmark.leaderboard import HARD
+from datagen.console.printing import print_rows
+from datagen.evaluation_report.report_tables import (
+    METRIC_WORDS,
+    TitledTable,
+    metres_with_interval,
+    percent,
+    with_interval,
+)
+from datagen.train.evaluation.arrival_success import PICKS
+from datagen.train.html_page import escape, html_facts, html_page, html_table
+
+Report = Mapping[str, Any]
+
+
+def tables(report: Report) -> Iterator[TitledTable]:
+    """All tables, decisions first."""
+    for name, told in report["candidates"].items():
+        yield decisions_table(report, name, told)
+        yield from differences_table(name, told)
+    for name, told in report["grids"].items():
+        for which in ("mixed", "hard"):
+            if told[which] is not None:
+                yield picks_table(report, name, which, told[which])
+                yield arrivals_table(report, name, which, told[which])
+
+
+def decisions_table(report: Report, name: str, told: Report) -> TitledTable:
+    """Balanced accuracy and AUC, calibration, and raw accuracy last, with its base rate."""
+    rows = [
+        (method, with_interval(said["balanced_accuracy"]), with_interval(said["area_under_roc"]),
+         percent(said["expected_calibration_error"]), with_interval(said["accuracy"]))
+        for method, said in told["methods"].items()
+    ]  # fmt: skip
+    rows.append(("the commoner label", "50.0", "50.0", "-", percent(told["base_rate"])))
+    heads = ("method", "balanced accuracy (%)", "AUC (%)", "calibration error (%)", "accuracy (%)")
+    about, rate = report["benchmark"]["runs"][name]["about"], percent(told["positive_rate"])
+    counts = f"{told['candidates']:,} candidates within reach of {told['scenes']:,} scenes"
+    title = f"{name}: {about}; {counts}, {rate}% good"
+    return TitledTable(title, heads, rows)
+
+
+def differences_table(name: str, told: Report) -> Iterator[TitledTable]:
+    """The best model minus the best baseline; nothing without both."""
+    rows = [
+        (f"{d['first']} - {d['second']}", METRIC_WORDS[d["metric"]], with_interval(d, signed=True))
+        for d in told["differences"]
+    ]
+    if rows:
+        yield TitledTable(
+            f"{name}: best model - best baseline, both chosen on these scenes",
+            ("difference", "by", "points"),
+            rows,
+        )
+
+
+def picks_table(report: Report, name: str, which: str, told: Report) -> TitledTable:
+    """How often the best-scored clear cell is good, and how far off it is otherwise."""
+    rows = [
+        (method, with_interval(said["good"]), metres_with_interval(said["missed_m"]),
+         with_interval(said["mean_average_precision"]))
+        for method, said in told["methods"].items()
+    ]  # fmt: skip
+    rows.append(("any clear cell", percent(told["any_clear"]), "-", percent(told["any_clear"])))
+    heads = ("method", "best cell good (%)", "else missed by (m)", "mAP (%)")
+    return TitledTable(_grids_title(report, name, which, told), heads, rows)
+
+
+def arrivals_table(report: Report, name: str, which: str, told: Report) -> TitledTable:
+    """Success of each method's pick where the robot parks off it."""
+    found = told["arrivals"]
+    rows = [
+        (method if pick == PICKS[0] else "", pick,
+         *(percent(row["methods"][method][pick]["value"]) for row in found))
+        for method in told["methods"]
+        for pick in PICKS
+    ]  # fmt: skip
+    rows += [
+        (f"{words} clear cell", "", *(percent(row[key]) for row in found))
+        for key, words in (("best", "best"), ("any", "any"))
+    ]
+    title = f"{name}, {which}: success (%) where the robot parks off the pick, in any direction"
+    return TitledTable(title, ("method", "pick", *(row["arrival"] for row in found)), rows)
+
+
+def _grids_title(report: Report, name: str, which: str, told: Report) -> str:
+    words = "good and bad clear cells" if which == "mixed" else f"at most {HARD:.0%} of the clear cells good"
+    about = report["benchmark"]["runs"][name]["about"]
+    return f"{name}, {which}: {about}; {told['scenes']:,} grids with {words}"
+
+
+def facts(report: Report) -> list[tuple[str, str]]:
+    """What was scored, on which benchmark, and what a reader must know of it."""
+    benchmark, boot = report["benchmark"], report["bootstrap"]
+    found = [("benchmark", f"version {benchmark['version']}, {benchmark['digest'][:12]}")]
+    for name, run in benchmark["runs"].items():
+        digests = run["digests"]
+        told = f"specification {run['spec_hash'][:12]}"
+        if digests is None:
+            told += "; not frozen: its candidates and labels were not compared"
+        else:
+            told += f", candidates {digests['candidates'][:12]}, labels {digests['labels'][:12]}"
+        found.append((f"run {name}", told))
+    if benchmark["not_scored"]:
+        found.append(
+            ("not scored", f"{', '.join(benchmark['not_scored'])}: this is no whole line of a leaderboard")
+        )
+    found.append(
+        ("intervals",
+         f"{100 * boot['level']:g}% by {boot['resamples']:,} resamples of scenes, seed {boot['seed']}")
+    )  # fmt: skip
+    found.append(("clearance", "every method knows where the base is clear, and predicts negative elsewhere"))
+    if report["fitted_on"]:
+        found.append(("baselines", f"fitted on {', '.join(report['fitted_on'])}"))
+    for method in report["methods"]:
+        if checkpoint := method.get("checkpoint"):
+            told = f"{checkpoint['model']} ({method['regime']}), weights {checkpoint['weights_sha256'][:12]}"
+            found.append((method["name"], told))
+        elif method["note"]:
+            found.append((method["name"], method["note"]))
+        if method["threshold"] is None:
+            found.append((method["name"], "has no threshold: each robot's choice counts as positive"))
+    return found
+
+
+def print_leaderboard(report: Report) -> None:
+    """Print all tables, then the facts."""
+    for shown in tables(report):
+        print_rows(shown.title, shown.rows, shown.heads)
+    print_rows("notes", facts(report))
+
+
+def page_of(report: Report) -> str:
+    """The leaderboard as one HTML page."""
+    body: list[str] = [html_facts(facts(report))]
+    for shown in tables(report):
+        body += [f"<h2>{escape(shown.title)}</h2>", html_table(shown.heads, shown.rows)]
+    body.append(f"<p class=note>datagen {escape(report['datagen'])}</p>")
+    return html_page(f"Base placement benchmark {report['benchmark']['version']}", body)

@@ -1,0 +1,94 @@
+"""Make the runs of a benchmark from the houses and objects that it names, by the ordinary jobs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.assets.object_split import split_objects
+from datagen.benchmark.definition import BenchmarkRun
+from datagen.configuration.manifest import manifest_of
+from datagen.configuration.specify import layout_of
+from datagen.console.options import Sources
+from datagen.jobs.dry_run import PlannedRun, dry_run
+from datagen.jobs.job import JobRun
+from datagen.jobs.job_report import JobResult
+from datagen.jobs.options import JobOptions, absolute_source, opening
+from datagen.jobs.start_job import open_job_run, planned_run, refuse_other_engines, start_job
+from datagen.schemas.errors import InputError
+from datagen.schemas.record_files import refuse_other
+from datagen.schemas.run import Run
+from datagen.schemas.run_records import Manifest
+from datagen.schemas.storage import open_storage
+from datagen.workers.world import open_world
+
+
+@dataclass(frozen=True)
+class BenchmarkSources:
+    """References of the houses, and of the objects of each part."""
+
+    houses: str
+    objects: Mapping[str, str]
+
+
+def divided_sources(
+    houses: str, objects: str, out: Path, runs: Mapping[str, BenchmarkRun]
+) -> BenchmarkSources:
+    """Divide the objects into OUT/objects where a run asks for a part of them.
+
+    InputError where they are no folder that can be divided.
+    """
+    parts = {"all": absolute_source(objects)}
+    if any(run.objects != "all" for run in runs.values()):
+        kind, _, folder = objects.partition(":")
+        if kind != "ycb":
+            fix = "Give ycb:DIR, a folder with an objects.json"
+            raise InputError("--objects", objects, "cannot be divided into train and test", fix)
+        split_objects(Path(folder).expanduser(), out / "objects")
+        parts |= {part: absolute_source(f"ycb:{out / 'objects' / part}") for part in ("train", "test")}
+    return BenchmarkSources(absolute_source(houses), parts)
+
+
+def make_runs(
+    runs: Mapping[str, BenchmarkRun],
+    sources: BenchmarkSources,
+    out: Path,
+    job_options: JobOptions,
+    words: list[str],
+) -> Iterator[JobResult]:
+    """Make each run in its folder of `out`, and give what was done; a complete one is left as it is.
+
+    InputError, before a run is begun, where the houses, objects or engines here are others than the
+    definition's: the labels would differ.
+    """
+    planned: list[PlannedRun] = []
+    with opening(words, job_options) as began_s:
+        for name, wanted in runs.items():
+            objects = sources.objects[wanted.objects]
+            refuse_other_engines(f"benchmark run {name}", wanted.spec)
+            world = open_world(wanted.spec, sources.houses, objects)
+            counts = {"n_houses": str(len(world.house_ids)), "n_objects": str(len(world.object_names))}
+            references = {"houses": sources.houses, "objects": objects}
+            manifest = manifest_of(wanted.spec, layout_of(wanted.spec, wanted.n), references | counts)
+            planned.append(_planned(out / name, manifest, wanted.n, sources.houses, objects))
+    if job_options.dry_run:
+        yield dry_run(str(out), planned, job_options, began_s)
+        return
+    for name, each in zip(runs, planned, strict=True):
+        storage = open_storage(out / name)
+        run = Run.create_or_open(storage, each.manifest, each.n)
+        job_run = open_job_run(run, Sources(houses=each.houses, objects=each.objects), job_options.address)
+        yield start_job(
+            storage, str(out / name), [job_run], job_options, time.monotonic(), words, resume=words
+        )
+
+
+def _planned(place: Path, manifest: Manifest, n: int, houses: str, objects: str) -> PlannedRun:
+    """The shards that the run there, or a new one, lacks. InputError for another run there."""
+    if not (place / "manifest.json").is_file():
+        return PlannedRun(manifest, None, n, manifest.layout.shards_for(n), houses, objects)
+    run = Run.open(place)
+    refuse_other(run.storage.url, run.manifest, manifest)
+    return planned_run(JobRun(run, houses, objects), n)

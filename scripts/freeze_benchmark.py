@@ -1,0 +1,56 @@
+"""Write the definition of a benchmark from complete runs: their specifications, sizes and digests.
+
+    python scripts/freeze_benchmark.py FILE.json RUNS [--version 1]
+
+FILE names the runs, what each asks and which objects it has; it is written anew with what RUNS/NAME holds. A
+run that is not there, or not complete, keeps its specification and stays unfrozen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from datagen.benchmark.definition import Benchmark, BenchmarkRun, read_benchmark
+from datagen.benchmark.frozen_runs import digests_of
+from datagen.schemas.errors import InputError
+from datagen.schemas.run import Run
+from datagen.schemas.whole_files import whole_file
+
+
+def frozen(run: BenchmarkRun, place: Path) -> BenchmarkRun:
+    """The run with the specification and digests of the one at `place`. InputError where it is incomplete."""
+    made = Run.open(place)
+    found = digests_of(place)
+    return run.model_copy(update={"n": made.n, "spec": made.manifest.spec, "digests": found})
+
+
+def main() -> int:
+    """Freeze the runs that are complete, and say which are not."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("--version")
+    options = parser.parse_args()
+    try:
+        before = read_benchmark(options.file)
+    except InputError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    runs: dict[str, BenchmarkRun] = {}
+    for name, run in before.runs.items():
+        try:
+            runs[name] = frozen(run, options.runs / name)
+            print(f"{name}: frozen, {runs[name].n:,} labels")
+        except InputError as error:
+            runs[name] = run.model_copy(update={"digests": None})
+            print(f"{name}: not frozen ({error})")
+    after = Benchmark(version=options.version or before.version, runs=runs)
+    with whole_file(options.file, alone=True) as file:
+        file.write((after.model_dump_json(indent=1, exclude_unset=False) + "\n").encode())
+    return 0 if all(run.digests for run in runs.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

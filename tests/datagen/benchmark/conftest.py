@@ -1,0 +1,57 @@
+"""A small benchmark on the built-in world: sampled candidates and whole grids, planned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from datagen import cli
+from datagen.benchmark.definition import Benchmark, BenchmarkRun
+from datagen.benchmark.frozen_runs import digests_of
+from datagen.schemas.run import Run
+from tests.small_runs import CONFIG
+
+SIDE = 5
+SIZES = {"test": 32, "grids": 6 * SIDE * SIDE}
+# Long arms and small grids, so that most grids have good and bad clear cells.
+WORLD = f"""
+[candidates]
+grid_cells = {SIDE}
+arm_reach_m = {{low = 0.9, high = 1.0}}
+
+[arm.grasps]
+per_object = 40
+per_scene = 10
+"""
+
+
+@pytest.fixture(scope="session")
+def small_benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the definition, benchmark.json, and with its runs in `runs`. Tests only read it."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    (folder / "small.toml").write_text(CONFIG + WORLD)
+    kinds = {"test": ["--candidates", "in-range", "--candidates-per-scene", "4"], "grids": []}
+    runs: dict[str, BenchmarkRun] = {}
+    for seed, (name, kind) in enumerate(kinds.items()):
+        out = folder / "runs" / name
+        where = ["--config", str(folder / "small.toml"), "--out", str(out), "--workers", "0"]
+        drawn = ["--n", str(SIZES[name]), "--seed", str(seed), "--split", "test"]
+        assert cli.run(["submit", "plan", *drawn, *kind, *where]) == 0
+        runs[name] = BenchmarkRun(
+            about=f"small {name}",
+            objects="all",
+            n=SIZES[name],
+            spec=Run.open(out).manifest.spec,
+            digests=digests_of(out),
+        )
+    text = Benchmark(version="small", runs=runs).model_dump_json(indent=1)
+    (folder / "benchmark.json").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def scored(small_benchmark: Path) -> list[str]:
+    """The options of `datagen benchmark score` for the small benchmark."""
+    definition = str(small_benchmark / "benchmark.json")
+    return ["--runs", str(small_benchmark / "runs"), "--benchmark", definition, "--bootstrap", "50"]

@@ -1,0 +1,148 @@
+"""`datagen benchmark make`: the same runs again, and the definition that the package ships."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen import cli
+from datagen.benchmark import make_runs
+from datagen.benchmark.definition import read_benchmark
+from datagen.benchmark.frozen_runs import digests_of
+from datagen.cli import build_app
+from datagen.console.command_lines import Interrupted
+from datagen.jobs.job_report import JobResult
+from tests.conftest import REPOSITORY
+from tests.sim_extra import needs_sim
+from tests.small_runs import arrays_of, assert_equal_runs
+
+
+def made(small_benchmark: Path, out: Path, *more: str) -> int:
+    definition = str(small_benchmark / "benchmark.json")
+    sources = ["--houses", "builtin", "--objects", "builtin", "--workers", "0"]
+    return cli.run(["benchmark", "make", *sources, "--benchmark", definition, "--out", str(out), *more])
+
+
+@needs_sim
+def test_the_runs_are_made_again_bit_for_bit(
+    small_benchmark: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "again"
+    assert made(small_benchmark, out, "--run", "test") == 0
+    assert "candidates and labels as frozen" in capsys.readouterr().out
+    assert_equal_runs(arrays_of(out / "test"), arrays_of(small_benchmark / "runs" / "test"))
+    assert not (out / "grids").exists()
+    assert made(small_benchmark, out, "--run", "test") == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+
+@needs_sim
+def test_an_interrupted_command_says_how_to_resume_itself(
+    small_benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: Any, resume: list[str], **more: Any) -> JobResult:
+        raise Interrupted("1 shard left", JobResult("x", "interrupted", remaining=1, resume=tuple(resume)))
+
+    monkeypatch.setattr(make_runs, "start_job", stopped)
+    assert made(small_benchmark, tmp_path / "out", "--run", "test") == 130
+    told = capsys.readouterr().err
+    assert "interrupted; 1 shard left. Resume with:\n  datagen benchmark make --houses builtin" in told
+    (line,) = [each for each in told.splitlines() if each.startswith("  datagen ")]
+    build_app("benchmark").parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+    assert f"--out {tmp_path / 'out'} --run test" in line
+
+
+@needs_sim
+def test_other_engines_or_sources_are_refused_before_anything_is_written(
+    small_benchmark: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    definition = json.loads((small_benchmark / "benchmark.json").read_text())
+    for path, told in (
+        (("engines", "numpy"), "engines: numpy: the run has"),
+        (("houses", "digest"), "--houses: builtin: holds builtin"),
+    ):
+        changed = json.loads(json.dumps(definition))
+        section = changed["runs"]["test"]["spec"][path[0]]
+        section[path[1]] = "0" * 64
+        folder = tmp_path / path[0]
+        folder.mkdir()
+        (folder / "benchmark.json").write_text(json.dumps(changed))
+        assert made(folder, folder / "out") == 2
+        assert told in capsys.readouterr().err
+        assert not (folder / "out").exists()
+
+
+@needs_sim
+def test_labels_that_differ_are_not_the_benchmark(
+    small_benchmark: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    definition = json.loads((small_benchmark / "benchmark.json").read_text())
+    definition["runs"]["test"]["digests"]["labels"] = "0" * 64
+    (tmp_path / "benchmark.json").write_text(json.dumps(definition))
+    assert made(tmp_path, tmp_path / "out", "--run", "test") == 2
+    assert "labels have the digest" in capsys.readouterr().err
+
+
+@needs_sim
+def test_freezing_writes_what_the_runs_hold(
+    small_benchmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    definition = json.loads((small_benchmark / "benchmark.json").read_text())
+    for run in definition["runs"].values():
+        run["digests"] = None
+    definition["runs"]["later"] = definition["runs"]["test"] | {"about": "not made"}
+    (tmp_path / "draft.json").write_text(json.dumps(definition))
+    words = ["freeze", str(tmp_path / "draft.json"), str(small_benchmark / "runs"), "--version", "2"]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(REPOSITORY / "scripts" / "freeze_benchmark.py"), run_name="__main__")
+    assert ended.value.code == 1
+    frozen = read_benchmark(tmp_path / "draft.json")
+    assert frozen.version == "2" and frozen.runs["later"].digests is None
+    known = read_benchmark(small_benchmark / "benchmark.json")
+    assert {n: frozen.runs[n] for n in known.runs} == known.runs
+    assert frozen.runs["test"].digests == digests_of(small_benchmark / "runs" / "test")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "Invalid JSON"),
+        ("{}", "version: Field required"),
+        ('{"version": "1", "runs": {"../x": {}}}', "runs"),
+    ],
+)
+def test_a_broken_definition_is_one_line(
+    text: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "benchmark.json").write_text(text)
+    assert made(tmp_path, tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+
+
+def test_the_shipped_definition_holds_out_houses_and_objects() -> None:
+    shipped = read_benchmark()
+    assert list(shipped.runs) == ["test", "test-known", "grids"]
+    assert {run.spec.split for run in shipped.runs.values()} == {"test"}
+    assert {name: run.objects for name, run in shipped.runs.items()} == {
+        "test": "test", "test-known": "train", "grids": "test",
+    }  # fmt: skip
+    assert [name for name, run in shipped.runs.items() if run.is_of_grids] == ["grids"]
+    assert shipped.runs["test"].spec.objects != shipped.runs["test-known"].spec.objects
+
+
+def test_its_objects_are_the_division_of_the_real_ones(assets: Path, tmp_path: Path) -> None:
+    from datagen.assets.object_split import split_objects
+    from datagen.workers.objects import open_objects
+
+    split_objects(assets / "ycb", tmp_path)
+    shipped = read_benchmark()
+    for run in shipped.runs.values():
+        assert open_objects(f"ycb:{tmp_path / run.objects}").digest == run.spec.objects.digest

@@ -1,0 +1,168 @@
+"""The model that ships with the package is what its card says, and answers right after installation."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import runpy
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import datagen
+from datagen import cli, released
+from datagen.benchmark.definition import read_benchmark
+from datagen.released.card import card_text
+from datagen.train.scorers import weights_sha256
+from datagen.train.training.checkpoints import read_checkpoint
+from tests.conftest import REPOSITORY
+from tests.refusals import refused
+from tests.small_runs import json_of
+from tests.train.prediction.checkpoints import write_untrained
+from tests.train.prediction.seen_scenes import MODEL
+
+FOLDER = released.FOLDER
+
+
+def results() -> dict[str, Any]:
+    return json.loads((FOLDER / released.RESULTS).read_bytes())
+
+
+def test_the_file_is_the_one_on_the_card() -> None:
+    card, path = released.released_card(), released.released_checkpoint()
+    data = path.read_bytes()
+    assert len(data) == card["bytes"] < 5_000_000
+    assert hashlib.sha256(data).hexdigest() == card["sha256"]
+    scorer = datagen.load_scorer()
+    assert weights_sha256(scorer.model) == card["weights_sha256"]
+    checkpoint = read_checkpoint(path)
+    head = checkpoint.head
+    assert not checkpoint.resume  # nothing of the optimiser
+    assert (head.model, head.model_config, head.stage) == (card["model"], card["config"], card["stage"])
+    assert (len(head.house_ids), len(head.object_digests)) == (card["houses"], card["objects"])
+    assert [dict(each) for each in head.data] == card["data"]
+
+
+def test_the_metrics_on_the_card_are_those_of_the_recorded_results() -> None:
+    card, recorded = released.released_card(), results()
+    (method,) = recorded["methods"]
+    assert method["checkpoint"]["weights_sha256"] == card["weights_sha256"]
+    assert {key: recorded["benchmark"][key] for key in ("version", "digest")} == card["benchmark"]
+    shipped = read_benchmark()
+    if recorded["benchmark"]["version"] == shipped.version:
+        assert recorded["benchmark"]["digest"] == shipped.digest()
+        assert recorded["benchmark"]["not_scored"] == []
+    for run, told in recorded["candidates"].items():
+        said = card["metrics"][run]
+        for metric, value in told["methods"][released.RELEASED].items():
+            assert said[metric] == value, (run, metric)
+    for run, told in recorded["grids"].items():
+        for which in ("mixed", "hard"):
+            if (part := told[which]) is not None:
+                said = card["metrics"][f"{run}, {which}"]
+                assert said["good"] == part["methods"][released.RELEASED]["good"]
+                assert list(said["arrivals"]) == [row["arrival"] for row in part["arrivals"]]
+
+
+def test_the_page_is_written_from_the_facts() -> None:
+    page = card_text(released.released_card(), (FOLDER / released.RECIPE).read_text("utf-8"))
+    assert page == (FOLDER / released.CARD_PAGE).read_text("utf-8")
+
+
+def test_no_file_names_a_folder_of_a_machine() -> None:
+    for path in FOLDER.rglob("*"):
+        if path.is_file() and path.suffix in (".json", ".md", ".safetensors"):
+            text = path.read_bytes()
+            assert not any(place in text for place in (b"/tmp/", b"/work/", b"/home/")), path
+
+
+def test_the_sample_frame_is_small_and_names_its_sources() -> None:
+    frame = released.sample_frame()
+    assert sum(path.stat().st_size for path in frame.iterdir()) < 400_000
+    told = (frame / "ATTRIBUTION.md").read_text("utf-8")
+    assert all(each in told for each in ("Apache License 2.0", "Creative Commons Attribution 4.0", "YCB"))
+    assert Image.open(frame / "color.png").size == Image.open(frame / "depth.png").size == (640, 480)
+
+
+def test_the_demonstration_answers_what_the_card_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.run(["predict", "--demo"]) == 0
+    out = capsys.readouterr().out
+    assert "base poses by the released model" in out and "demo.png" in out and "demo.html" in out
+    assert Image.open(tmp_path / "demo.png").size[0] > 500
+    assert b"<html" in (tmp_path / "demo.html").read_bytes()[:200]
+    said = released.released_card()["demo"]
+    answer = json_of(capsys, ["predict", "--demo"])["best"]
+    assert np.allclose([answer["x_m"], answer["y_m"]], said["base_xy_m"], atol=1e-3)
+    assert math.isclose(answer["score"], said["score"], abs_tol=1e-3)
+
+
+def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    u, v = released.DEMO_CLICK
+    frame = ["--frame", str(released.sample_frame()), "--click", f"{u},{v}"]
+    robot = ["--base-height", "0.7", "--reach", "0.9", "--grid", "9"]
+    first = json_of(capsys, ["predict", *frame, *robot])
+    assert first["scorer"].startswith("the released model, ")
+    assert json_of(capsys, ["predict", "released", *frame, *robot]) == first
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--demo", "--click", "1,2"], "has a frame and a click of its own"),
+        (["--demo", "--frame", "x"], "has a frame and a click of its own"),
+        (["--frame", "x"], "--base-height: is missing"),
+        (["--frame", "x", "--base-height", "0.7"], "--reach: is missing"),
+        (["--demo", "--out", "none/a.png"], "its folder does not exist"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert told in refused(["predict", *words], capsys)
+
+
+def test_releasing_another_model_writes_file_results_and_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "released"
+    shutil.copytree(FOLDER, copy)
+    monkeypatch.setattr(released, "FOLDER", copy)
+    write_untrained(tmp_path / "model.ckpt", MODEL)
+    scorer = datagen.load_scorer(tmp_path / "model.ckpt")
+    board = json.loads(json.dumps(results()).replace(f'"{released.RELEASED}"', '"model"'))
+    assert board["methods"][0]["name"] == "model"
+    script = str(REPOSITORY / "scripts" / "release_model.py")
+
+    def release() -> int:
+        (tmp_path / "board.json").write_text(json.dumps(board))
+        monkeypatch.setattr(sys, "argv", ["", str(tmp_path / "model.ckpt"), str(tmp_path / "board.json")])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(script, run_name="__main__")
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+    assert release() == 2
+    assert "has no line of the weights" in capsys.readouterr().err
+    assert (copy / released.CHECKPOINT).read_bytes() == released_bytes()
+    board["methods"][0]["checkpoint"]["weights_sha256"] = weights_sha256(scorer.model)
+    assert release() == 0
+    card = json.loads((copy / released.CARD).read_bytes())
+    assert card["weights_sha256"] == weights_sha256(scorer.model)
+    assert card["bytes"] == (copy / released.CHECKPOINT).stat().st_size
+    assert card["sha256"][:12] in (copy / released.CARD_PAGE).read_text()
+    assert {m["name"] for m in json.loads((copy / released.RESULTS).read_bytes())["methods"]} == {"released"}
+
+
+def released_bytes() -> bytes:
+    return (REPOSITORY / "datagen" / "released" / released.CHECKPOINT).read_bytes()
