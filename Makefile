@@ -8,13 +8,14 @@ BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
 DEMO := build/demo
 
-.PHONY: help demo paper-small paper test faults lint style types format docs site venv venv-labels clean
+.PHONY: help demo paper-small paper model test faults lint style types format docs site venv venv-labels clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    600 labels on the built-in world, a picture, status and audit (in $(DEMO))"
 	@echo "make paper-small  labels, training and tables on real houses, small (DATAGEN_ASSETS; in build/paper-small)"
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
+	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
@@ -46,12 +47,15 @@ demo: venv-labels
 	$(BIN)/datagen audit $(DEMO)/run
 	@echo "the picture: $(DEMO)/scene-0.png"
 
-# Both go on where they were stopped.
+# All three go on where they were stopped.
 paper-small: venv
 	@BIN=$(BIN) scripts/paper.sh small
 
 paper: venv
 	@BIN=$(BIN) scripts/paper.sh full
+
+model: venv
+	@BIN=$(BIN) scripts/released_model.sh
 
 # Runs are made durable file by file, which a shared disk takes ten times as long for as memory does. What
 # failed stays there to be looked at. A test worker has one core: more threads would only wait for each other.

@@ -1,0 +1,50 @@
+#!/usr/bin/env bash
+# The released model, its benchmark and its closed loop, from nothing: labels, training, tables.
+#
+#   scripts/released_model.sh [FOLDER]        (make model)
+#
+# Everything lies below FOLDER (build/model). What is done is not made again: the same command goes on where it
+# was stopped. DATAGEN_ASSETS names the folder that has ycb/ and procthor/. Sizes can be set from outside
+# (LABELS=3000 SCENES=20 scripts/released_model.sh FOLDER).
+set -euo pipefail
+ROOT=$(realpath "$(dirname "$0")/..")
+ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
+BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
+OUT=$(realpath -m "${1:-$ROOT/build/model}")
+LABELS=${LABELS:-100020}  # within reach, in training houses
+EPOCHS=${EPOCHS:-10}
+SCENES=${SCENES:-400}     # whole grids of the closed loop
+
+if ! [ -f "$ASSETS/ycb/objects.json" ] || ! [ -d "$ASSETS/procthor" ]; then
+    echo "error: $ASSETS: no ycb/ and procthor/ there. Set DATAGEN_ASSETS to a folder that has both" >&2
+    exit 2
+fi
+if ! [ -x "$BIN/datagen" ]; then
+    echo "error: $BIN/datagen: no such program. Call \`make venv\`, or set BIN to an environment's bin/" >&2
+    exit 2
+fi
+mkdir -p "$OUT"
+cd "$OUT"
+step() { printf '\n== %s  (%d min %d s)\n' "$*" $((SECONDS / 60)) $((SECONDS % 60)); }
+datagen() { "$BIN/datagen" "$@"; }
+submit() {
+    local name=$1 n=$2 split=$3 seed=$4 each=$5
+    step "$name"
+    datagen submit plan --n "$n" --split "$split" --seed "$seed" --candidates in-range --candidates-per-scene "$each" \
+        --out "$name" --houses "procthor:$ASSETS/procthor" --objects ycb:objects/train
+}
+
+[ -f objects/test/objects.json ] || datagen assets split "$ASSETS/ycb" objects
+submit train "$LABELS" train 301 30
+submit val 3000 val 203 15
+step "the benchmark's runs"
+datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
+step training
+datagen train sim-only train --val val --epochs "$EPOCHS" --encoded inputs --threads 1 --out model.ckpt
+step scores
+[ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability distance proximity \
+    --runs runs --fit val --out board.json --out board.html
+step "closed loop"
+datagen closed-loop model.ckpt runs/grids --fit val --baselines scalars --baselines reachability --baselines distance \
+    --mode plan --scenes "$SCENES" --out loop
+step done

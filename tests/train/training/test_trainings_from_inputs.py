@@ -1,0 +1,51 @@
+"""`--encoded`: inputs are made once, trainings from them resume, and what does not go with it is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen.schemas.errors import InputError
+from datagen.train.augment import Augmentation, Rotation
+from datagen.train.training.checkpoints import read_checkpoint
+from datagen.train.training.launching import Ranks
+from datagen.train.training.training_setup import prepare_training
+from tests.train.training.small import TINY_PAPER, equal, job_of, train_until
+
+
+def test_inputs_are_made_once_and_an_interrupted_training_ends_as_a_whole_one(
+    heuristic_run: Path, tmp_path: Path
+):
+    inputs, seen = tmp_path / "inputs", list[int]()
+    jobs = [replace(job_of(heuristic_run, tmp_path / name), encoded=str(inputs)) for name in ("a", "b")]
+    prepare_training(jobs[0], Ranks(), lambda done, of: seen.append(done))
+    made = {path: path.stat().st_mtime_ns for path in inputs.rglob("*") if path.is_file()}
+    assert seen and made
+    assert train_until(jobs[0])[0]
+    assert not train_until(jobs[1], step=2)[0]
+    assert train_until(jobs[1])[0]
+    whole, resumed = (read_checkpoint(job.out) for job in jobs)
+    assert equal(whole.weights, resumed.weights)
+    assert whole.head.history == resumed.head.history
+    assert {path: path.stat().st_mtime_ns for path in inputs.rglob("*") if path.is_file()} == made
+
+
+@pytest.mark.parametrize(
+    ("told", "job", "options"),
+    [
+        ("--augment", {"augment": Augmentation(rotation=Rotation())}, {}),
+        ("--candidates-per-robot", {}, {"candidates_per_robot": 1}),
+        ("--model", {}, {"model": "paper", "model_config": TINY_PAPER}),
+    ],
+)
+def test_what_does_not_go_with_it_is_refused(
+    heuristic_run: Path, tmp_path: Path, told: str, job: dict[str, Any], options: dict[str, Any]
+):
+    inputs = tmp_path / "inputs"
+    asked = replace(job_of(heuristic_run, tmp_path / "model", **options), encoded=str(inputs), **job)
+    with pytest.raises(InputError, match=told):
+        prepare_training(asked, Ranks())
+    assert not inputs.exists()
