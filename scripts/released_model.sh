@@ -12,7 +12,7 @@ ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
 BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
 LABELS=${LABELS:-100020}  # within reach, in training houses
-EPOCHS=${EPOCHS:-10}
+EPOCHS=${EPOCHS:-12}
 SCENES=${SCENES:-400}     # whole grids of the closed loop
 
 if ! [ -f "$ASSETS/ycb/objects.json" ] || ! [ -d "$ASSETS/procthor" ]; then
@@ -40,11 +40,12 @@ submit val 3000 val 203 15
 step "the benchmark's runs"
 datagen benchmark make --houses "procthor:$ASSETS/procthor" --objects "ycb:$ASSETS/ycb" --out runs
 step training
-datagen train sim-only train --val val --epochs "$EPOCHS" --encoded inputs --threads 1 --out model.ckpt
+datagen train sim-only train --val val --epochs "$EPOCHS" --model-config width=96 --model-config embedding=160 \
+    --seed 1 --encoded inputs --threads 1 --out model.ckpt
 step scores
 [ board.json -nt model.ckpt ] || datagen benchmark score model.ckpt scalars reachability distance proximity \
     --runs runs --fit val --out board.json --out board.html
 step "closed loop"
 datagen closed-loop model.ckpt runs/grids --fit val --baselines scalars --baselines reachability --baselines distance \
     --mode plan --scenes "$SCENES" --out loop
-step done
+step "all is done"

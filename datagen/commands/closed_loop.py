@@ -52,7 +52,7 @@ def closed_loop(
     For example: datagen closed-loop model.ckpt runs/grids --fit runs/val --out loop
 
     Args:
-        paths: Checkpoints of `datagen train`, and runs of plan or sim labels with whole grids.
+        paths: Checkpoints of `datagen train`, or `released`, and runs of plan or sim labels with whole grids.
         out: Folder for arrivals, closed-loop.json and closed-loop.svg.
         mode: End with the plan, or execute it too, which takes most of the time.
         arrival: Arrival error: normal:M[,YAW], disc:M[,YAW], nav2 or FILE.csv; repeat for more [0 to 25 cm].
