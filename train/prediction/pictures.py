@@ -34,7 +34,7 @@ def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.1))
     _draw_frame(frame, prediction)
-    write_facts(facts, told(prediction), head_characters=8)
+    write_facts(facts, told(prediction), head_characters=9)
     upper, lower = np.asarray(right.subfigures(2, 1, height_ratios=(1.45, 1))).tolist()
     plan = upper.subplots()
     upper.colorbar(_draw_plan(plan, prediction), ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
