@@ -10,7 +10,7 @@ and judged on TEST
 - with the true visibility of the target
 - with the target's own grasps that the hand can take in the scene, in place of estimated hand poses
 - with both
-- with half and a quarter of the scenes, and without hand poses
+- with half and a quarter of the scenes, in as many epochs and so in fewer steps; and without hand poses
 
 Printed are balanced accuracy and AUC with 95% intervals over scenes, and their differences from the first
 row. Inputs are kept in FOLDER and not made again. What remains beside the rows with true inputs is the
@@ -174,11 +174,11 @@ def show(rows: dict[str, F64], good: Bools, scene: Array) -> None:
     measured = {name: _measured(score, good, scene, weights) for name, score in rows.items()}
     first = measured[next(iter(rows))]
     print(f"{len(good):,} candidates of {n:,} scenes, {good.mean():.1%} good")
-    print(f"{'':<26}{'balanced accuracy':>22}{'AUC':>22}{'differences':>40}")
+    print(f"{'':<26}{'balanced accuracy':>22}{'AUC':>22}{'differences':>48}")
     for name, values in measured.items():
         cells = [_cell(v) for v in values]
         apart = [_cell(v - f, sign=True) for v, f in zip(values, first, strict=True)]
-        print(f"{name:<26}{cells[0]:>22}{cells[1]:>22}{apart[0]:>20}{apart[1]:>20}")
+        print(f"{name:<26}{cells[0]:>22}{cells[1]:>22}{apart[0]:>24}{apart[1]:>24}")
 
 
 def _measured(score: F64, good: Bools, scene: Array, weights: Array) -> tuple[F64, F64]:
