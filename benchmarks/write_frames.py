@@ -22,12 +22,16 @@ import argparse
 from pathlib import Path
 
 from datagen.schemas.cost import StageClock
+from datagen.schemas.run import Run
+from datagen.schemas.scene_rows import read_scenes
 from datagen.schemas.specification import Source, Specification
 from datagen.workers.houses import open_houses
 from datagen.workers.objects import open_objects
 from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.scenes.generate import generate_scene
-from datagen.workers.world import assemble_world
+from datagen.workers.scenes.reconstruct import ReconstructedScene, reconstruct_scene
+from datagen.workers.scenes.scene import Scene
+from datagen.workers.world import assemble_world, open_world
 from tests.train.prediction.seen_scenes import Seen, write_frame
 
 
@@ -41,17 +45,30 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--split", default="test")
     parser.add_argument("--posed", action="store_true", help="write the pose of the camera too")
+    parser.add_argument("--run", help="write frames of scenes of this run instead")
+    parser.add_argument("--numbers", type=int, nargs="+", default=[0], help="of --run")
     options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    if options.run is not None:
+        run = Run.open(options.run)
+        world = open_world(run.manifest.spec, options.houses, options.objects)
+        for number, stored in zip(options.numbers, read_scenes(run, options.numbers), strict=True):
+            scene = reconstruct_scene(world, stored.record)
+            write(options.folder / f"scene{number}", scene, options.posed)
+        return
     opened = open_houses(options.houses), open_objects(options.objects)
     house, thing = (Source(kind=source.kind, digest=source.digest) for source in opened)
     spec = Specification(seed=options.seed, split=options.split, houses=house, objects=thing)
     world = assemble_world(spec, *opened, options.houses, options.objects)
-    options.folder.mkdir(parents=True, exist_ok=True)
     for index in range(options.scenes):
         scene, _ = generate_scene(world, index, StageClock())
-        seen = Seen(scene, render_rays(scene.rays, scene.camera)).noisy()
-        place = write_frame(options.folder / f"frame{index}", seen, posed=options.posed)
-        print(f"{place}  camera height {seen.height_m:.3f} m")
+        write(options.folder / f"frame{index}", scene, options.posed)
+
+
+def write(folder: Path, scene: Scene | ReconstructedScene, posed: bool) -> None:
+    """Render the frame of a scene with stereo noise, and write it with or without its pose."""
+    seen = Seen(scene, render_rays(scene.rays, scene.camera)).noisy()
+    print(f"{write_frame(folder, seen, posed=posed)}  camera height {seen.height_m:.3f} m")
 
 
 if __name__ == "__main__":

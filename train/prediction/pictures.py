@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import IO, Any
 
 import numpy as np
@@ -30,7 +31,8 @@ _MOST_POINTS = 3_000
 
 def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     """Write the picture as PNG: frame and plan above, numbers and perspective view below."""
-    figure = new_sheet(f"Base poses scored by {prediction.scorer}: {prediction.sure}", 8.8)
+    title = textwrap.fill(f"Base poses scored by {prediction.scorer}: {prediction.sure}", 80)
+    figure = new_sheet(title, 8.8)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.1))
     _draw_frame(frame, prediction)

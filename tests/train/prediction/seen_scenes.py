@@ -23,6 +23,7 @@ from datagen.workers.rendering.embree_renderer import render_rays
 from datagen.workers.rendering.frame import Camera, Frame
 from datagen.workers.rendering.noise import add_noise
 from datagen.workers.scenes.generate import generate_scene
+from datagen.workers.scenes.reconstruct import ReconstructedScene
 from datagen.workers.scenes.scene import Scene
 from datagen.workers.world import assemble_world
 
@@ -34,7 +35,7 @@ OBSERVATION = ObservationParams(width_px=320, height_px=240, fx_px=307.5, fy_px=
 class Seen:
     """A scene with the whole frame of its observation camera."""
 
-    scene: Scene
+    scene: Scene | ReconstructedScene
     frame: Frame
 
     @property
