@@ -35,7 +35,8 @@ VARIANTS: dict[str, tuple[Mapping[str, Any], Sequence[str]]] = {
     "left and right told apart": ({"mirrored": False}, ()),
     "twice the tokens": ({"tokens": (32, 64, 64)}, ()),
     "camera unknown": ({"camera": "unknown"}, ()),
-    "visibility estimated": ({"observed_visibility": True}, ()),
+    "no estimated visibility": ({"observed_visibility": False}, ()),
+    "no hand poses": ({"hand_poses": 0}, ()),
 }
 Encoded = list[tuple[Batch[Tensor], Tokens]]
 

@@ -38,8 +38,10 @@ LIGHT = {
     "head": (256, 128),
 }
 MODELS: list[tuple[str, str, dict[str, Any]]] = [
+    ("shared, tokens alone", "shared", {"hand_poses": 0, "observed_visibility": False}),
+    ("shared, and visibility", "shared", {"hand_poses": 0}),
     ("shared", "shared", {}),
-    ("shared, visibility estimated", "shared", {"observed_visibility": True}),
+    ("shared, as released", "shared", {"width": 96, "embedding": 160}),
     ("paper, lighter", "paper", LIGHT),
     ("paper", "paper", {}),
 ]
@@ -53,13 +55,14 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=600)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--only", default="", help="models whose names begin so")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     clouds = _stored_clouds(options.run) if options.run else _drawn_clouds()
     print(f"{len(clouds)} clouds of {clouds.points_m.shape[1]} points, {options.threads} threads")
     print(f"{'model':<30} {'numbers':>9} {'ranking s':>9} {'CPU s':>6} {'step ms/sample':>14} {'CPU ms':>6}")
-    for words, name, config in MODELS:
+    for words, name, config in (m for m in MODELS if m[0].startswith(options.only)):
         model = build_model(name, config)
         slow = name == "paper"
         one = _batch(clouds, robots=1, candidates=options.candidates, scenes=1)
