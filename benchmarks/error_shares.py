@@ -109,7 +109,19 @@ def inputs_of(place: str, houses: str, objects: str, scenes: int | None, out: Pa
         np.savez(kept, visibility=true[0], grasps=true[1])
     with np.load(kept) as file:
         visibility, grasps = file["visibility"], file["grasps"]
-    return Inputs(encoded.first(count), visibility, grasps)
+    return Inputs(first_scenes(encoded, count), visibility, grasps)
+
+
+def first_scenes(encoded: EncodedRuns, count: int) -> EncodedRuns:
+    """The first `count` scenes alone, with their robots and candidates."""
+    robots = int(encoded.robot_bounds[count])
+    kept = {
+        len(encoded.houses): count,
+        len(encoded.columns["scene_of_robot"]): robots,
+        len(encoded.label): int(encoded.candidate_bounds[robots]),
+    }
+    columns = {name: values[: kept[len(values)]] for name, values in encoded.columns.items()}
+    return EncodedRuns(encoded.key, encoded.tokens[:robots], columns)
 
 
 def _true_inputs(

@@ -8,8 +8,7 @@
 # be set from outside (HEURISTIC=6000 scripts/paper.sh small FOLDER).
 set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")
-ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
-BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
+. "$ROOT/scripts/campaign.sh"
 SIZE=${1:-small}
 OUT=$(realpath -m "${2:-$ROOT/build/paper$([ "$SIZE" = full ] || echo -small)}")
 
@@ -47,18 +46,9 @@ SEED=100      # each run has one of its own, counted from here
 WORKERS=${WORKERS:-$(nproc)}  # processes that make labels; 0 for none but this one
 FORM=any      # the distance that the calibrated rule may be a function of
 
-if ! [ -f "$ASSETS/ycb/objects.json" ] || ! [ -d "$ASSETS/procthor" ]; then
-    echo "error: $ASSETS: no ycb/ and procthor/ there. Set DATAGEN_ASSETS to a folder that has both" >&2
-    exit 2
-fi
-if ! [ -x "$BIN/datagen" ]; then
-    echo "error: $BIN/datagen: no such program. Call \`make venv\`, or set BIN to an environment's bin/" >&2
-    exit 2
-fi
+need_assets_and_programs
 mkdir -p "$OUT/runs" "$OUT/models"
 
-step() { printf '\n== %s  (%d min %d s)\n' "$*" $((SECONDS / 60)) $((SECONDS % 60)); }
-datagen() { "$BIN/datagen" "$@"; }
 # submit NAME LABELS SPLIT SEED OBJECTS, then the label source and its options: a run of that name.
 submit() {
     local name=$1 n=$2 split=$3 seed=$4 objects=$5

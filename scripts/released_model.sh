@@ -8,25 +8,15 @@
 # (LABELS=3000 SCENES=20 scripts/released_model.sh FOLDER).
 set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")
-ASSETS=$(realpath -m "${DATAGEN_ASSETS:-$ROOT/../shared/assets}")
-BIN=$(realpath -m "${BIN:-$ROOT/.venv/bin}")
+. "$ROOT/scripts/campaign.sh"
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
 LABELS=${LABELS:-100020}  # within reach, in training houses
 EPOCHS=${EPOCHS:-12}
 SCENES=${SCENES:-400}     # whole grids of the closed loop
 
-if ! [ -f "$ASSETS/ycb/objects.json" ] || ! [ -d "$ASSETS/procthor" ]; then
-    echo "error: $ASSETS: no ycb/ and procthor/ there. Set DATAGEN_ASSETS to a folder that has both" >&2
-    exit 2
-fi
-if ! [ -x "$BIN/datagen" ]; then
-    echo "error: $BIN/datagen: no such program. Call \`make venv\`, or set BIN to an environment's bin/" >&2
-    exit 2
-fi
+need_assets_and_programs
 mkdir -p "$OUT"
 cd "$OUT"
-step() { printf '\n== %s  (%d min %d s)\n' "$*" $((SECONDS / 60)) $((SECONDS % 60)); }
-datagen() { "$BIN/datagen" "$@"; }
 submit() {
     local name=$1 n=$2 split=$3 seed=$4 each=$5
     step "$name"

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from datagen import __version__
 from datagen.benchmark.definition import Benchmark, BenchmarkRun
 from datagen.evaluation_report.methods import EvaluatedMethod
@@ -16,13 +14,11 @@ from datagen.train.evaluation.arrival_success import arrival_table
 from datagen.train.evaluation.bootstrap import LEVEL
 from datagen.train.evaluation.columns import Columns, Gathered
 from datagen.train.evaluation.evaluation import Method, evaluate_grids, evaluate_set, weights_for
-from datagen.train.inputs import Bools
+from datagen.train.evaluation.grids import mixed_grids
 from datagen.train.scorers import ModelScorer, weights_sha256
 
 CANDIDATES = "in-range"
 METRICS = ("balanced_accuracy", "area_under_roc", "accuracy")
-# Grids in which at most this share of the clear cells is good.
-HARD = 0.2
 
 
 def leaderboard(
@@ -115,11 +111,3 @@ def _picks(columns: Columns, methods: Sequence[Method], resamples: int, seed: in
             "arrivals": arrival_table(part, methods, weights),
         }
     return found
-
-
-def mixed_grids(columns: Columns) -> tuple[Bools, Bools]:
-    """Masks (S,) of the scenes with good and bad clear cells, and of those of them that are hard."""
-    clear = np.bincount(columns.scene, columns.is_clear, columns.n_scenes)
-    good = np.bincount(columns.scene, columns.is_clear & columns.label, columns.n_scenes)
-    both = (good > 0) & (good < clear)
-    return both, both & (good <= HARD * clear)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from datagen.benchmark.leaderboard import HARD
 from datagen.console.printing import print_rows
 from datagen.evaluation_report.report_tables import (
     METRIC_WORDS,
@@ -15,6 +14,7 @@ from datagen.evaluation_report.report_tables import (
     with_interval,
 )
 from datagen.train.evaluation.arrival_success import PICKS
+from datagen.train.evaluation.grids import HARD_SHARE
 from datagen.train.html_page import escape, html_facts, html_page, html_table
 
 Report = Mapping[str, Any]
@@ -91,7 +91,11 @@ def arrivals_table(report: Report, name: str, which: str, told: Report) -> Title
 
 
 def _grids_title(report: Report, name: str, which: str, told: Report) -> str:
-    words = "good and bad clear cells" if which == "mixed" else f"at most {HARD:.0%} of the clear cells good"
+    words = (
+        "good and bad clear cells"
+        if which == "mixed"
+        else f"at most {HARD_SHARE:.0%} of the clear cells good"
+    )
     about = report["benchmark"]["runs"][name]["about"]
     return f"{name}, {which}: {about}; {told['scenes']:,} grids with {words}"
 

@@ -20,18 +20,17 @@ from datagen.train.arrivals import Arrival, ring_arrival
 from datagen.train.evaluation.arrival_success import DISTANCES_M, GridMaps, grid_maps
 from datagen.train.evaluation.bootstrap import LEVEL
 from datagen.train.evaluation.closed_loop import (
-    HARD_SHARE,
     Names,
     Pick,
     Turns,
     candidates_of,
-    is_hard,
     label_success,
     loop_table,
     plan_turns,
 )
 from datagen.train.evaluation.columns import Columns
 from datagen.train.evaluation.evaluation import weights_for
+from datagen.train.evaluation.grids import HARD_SHARE, mixed_grids
 from datagen.train.inputs import F64, I64
 
 # Nav2 lets a robot be off by 0.25 m and 0.25 rad.
@@ -177,7 +176,7 @@ def loop_record(
     }
     origins = {m.name: m.origin for m in (*baselines.baselines, *models)}
     weights = weights_for(loop.columns, resamples, seed)
-    hard = is_hard(loop.maps)
+    _, hard = mixed_grids(loop.columns)
     sides = [("all", np.ones(len(hard), np.bool_)), ("hard", hard)]
     bilinear = {pick: labels[1] for pick, labels in by_labels.items()}
     return {

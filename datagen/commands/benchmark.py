@@ -14,7 +14,6 @@ from datagen.console.printing import print_json, print_rows
 from datagen.jobs.job_report import JobResult, print_job
 from datagen.jobs.options import JobKeywords, JobOptions, absolute_place, absolute_source
 from datagen.schemas.errors import InputError
-from datagen.schemas.progress import counting
 from datagen.schemas.whole_files import whole_file
 
 app = App(name="benchmark", help="Make the runs of the frozen benchmark, and score methods on them.")
@@ -137,15 +136,13 @@ def score(
         out: File to write, .json or .html; repeat for both.
         json: Print one JSON document, and progress as JSON lines.
     """
-    import numpy as np
-
     from datagen.benchmark.definition import read_benchmark
     from datagen.benchmark.frozen_runs import refuse_differing
     from datagen.benchmark.leaderboard import leaderboard
     from datagen.benchmark.leaderboard_tables import page_of
     from datagen.benchmark.methods import open_methods, refuse_trained_objects
     from datagen.evaluation_report.evaluated_runs import open_evaluated_runs, refuse_seen_houses
-    from datagen.train.evaluation.columns import gather
+    from datagen.evaluation_report.scoring import score_runs
 
     files = [Path(file) for file in out or ()]
     for file in files:
@@ -167,17 +164,7 @@ def score(
     refuse_seen_houses(opened, compared, "Train it on runs of the splits train and val alone")
     for (name, place), each in zip(places.items(), opened, strict=True):
         refuse_trained_objects(place, each, compared, wanted[name].objects == "test")
-    with counting("scenes", json) as seen:
-        total, done = sum(each.stream.n_scenes for each in opened), 0
-
-        def step(scenes: int) -> None:
-            nonlocal done
-            done += scenes
-            seen(done, total)
-
-        batches = [(each.cells, each.stream.epoch(0)) for each in opened]
-        scorers = {method.name: method.scorer for method in compared}
-        gathered = gather(batches, scorers, np.random.default_rng([seed, 0]), n_examples=0, seen=step)
+    gathered = score_runs(opened, compared, seed, json)
     report = leaderboard(
         definition, wanted, gathered, compared, [str(place) for place in fit or ()], bootstrap, seed
     )

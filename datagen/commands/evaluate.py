@@ -132,7 +132,7 @@ def evaluate(
     if not evaluated:
         fix = "Name a checkpoint, or omit --baselines"
         raise InputError("datagen evaluate", "PATH", "no model or baseline given", fix)
-    gathered = score_runs(opened, evaluated, seed, json)
+    gathered = score_runs(opened, evaluated, seed, json, n_examples=4)
     report = evaluation_report(gathered, baseline_set, models, opened, sets, fit, bootstrap, seed, error)
     if html is not None:
         from datagen.evaluation_report.page import page_of

@@ -13,9 +13,13 @@ from datagen.train.evaluation.columns import Gathered, gather
 
 
 def score_runs(
-    runs: Sequence[EvaluatedRun], methods: Sequence[EvaluatedMethod], seed: int, json: bool
+    runs: Sequence[EvaluatedRun],
+    methods: Sequence[EvaluatedMethod],
+    seed: int,
+    json: bool,
+    n_examples: int = 0,
 ) -> Gathered:
-    """The columns of all runs in stored order; `seed` draws the example scenes."""
+    """The columns of all runs in stored order, and `n_examples` scenes to show, drawn by `seed`."""
     with counting("scenes", json) as seen:
         total, done = sum(run.stream.n_scenes for run in runs), 0
 
@@ -26,4 +30,4 @@ def score_runs(
 
         batches = [(run.cells, run.stream.epoch(0)) for run in runs]
         rng = np.random.default_rng([seed, 0])
-        return gather(batches, {m.name: m.scorer for m in methods}, rng, seen=step)
+        return gather(batches, {m.name: m.scorer for m in methods}, rng, n_examples, step)

@@ -35,15 +35,6 @@ _VERSION = 2
 EXTRA = ("house_id", "base_is_clear", "mount_distance_m")
 # Fields of a model's configuration that decide its tokens.
 _DECISIVE = ("n_points", "tokens", "near_m", "scales_m", "camera", "observed_visibility", "hand_poses")
-_TABLE_OF = {
-    **dict.fromkeys(("house", "target_height_m", "target_radius_m", "hand_poses"), "scene"),
-    **dict.fromkeys(
-        ("scene_of_robot", "camera_height_m", "base_height_m", "arm_reach_m", "targets"), "robot"
-    ),
-    **dict.fromkeys(
-        ("robot_of_candidate", "base_xy_m", "visible_share", "label", "sample_id", "in_range"), "candidate"
-    ),
-}
 _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 
@@ -85,13 +76,6 @@ class EncodedRuns:
     def in_range(self) -> Bools:
         """Where (N,) the base is clear and the target within reach."""
         return self.columns["in_range"]
-
-    def first(self, count: int) -> EncodedRuns:
-        """The first `count` scenes alone."""
-        robots = int(self.robot_bounds[count])
-        bounds = {"scene": count, "robot": robots, "candidate": int(self.candidate_bounds[robots])}
-        kept = {name: values[: bounds[_TABLE_OF[name]]] for name, values in self.columns.items()}
-        return EncodedRuns(self.key, self.tokens[:robots], kept)
 
     def batch(self, scenes: I64) -> Batch[Array]:
         """A batch of these scenes, in their order."""

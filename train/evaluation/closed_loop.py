@@ -23,8 +23,6 @@ from datagen.train.inputs import F64, I64, Bools
 
 # Choices that no method makes: by the labels of the whole grid, and at random.
 BY_LABELS, AT_RANDOM = "best by labels", "random in reach"
-# Of scenes in which at most this share of the clear cells is good.
-HARD_SHARE = 0.2
 
 Pick = tuple[str, str]  # a method, and one of PICKS
 Names = npt.NDArray[np.object_]
@@ -99,12 +97,6 @@ def label_success(columns: Columns, maps: GridMaps, cells: I64, offsets: F64) ->
         for order in (0, 1)
     )
     return nearest, bilinear
-
-
-def is_hard(maps: GridMaps) -> Bools:
-    """Scenes (S,) in which at most `HARD_SHARE` of the clear cells are good."""
-    good = (maps.truth * maps.is_clear).sum(axis=(1, 2))
-    return good <= HARD_SHARE * maps.is_clear.sum(axis=(1, 2))
 
 
 def loop_table(

@@ -101,7 +101,7 @@ def gather(
     places: Sequence[tuple[int, Iterable[Batch[Array]]]],
     scorers: Mapping[str, Scorer],
     rng: np.random.Generator,
-    n_examples: int = 4,
+    n_examples: int = 0,
     seen: Callable[[int], None] = lambda scenes: None,
 ) -> Gathered:
     """Score every candidate of every place by every scorer, a batch at a time.

@@ -1,4 +1,4 @@
-"""Choice of the best-scored candidate of each robot: its label, its distance to a positive, the order."""
+"""Grids, and the best-scored candidate of each robot: its label, its distance to a positive, the order."""
 
 from __future__ import annotations
 
@@ -8,8 +8,20 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from datagen.train.evaluation.columns import Columns
 from datagen.train.evaluation.metrics import average_precision
 from datagen.train.inputs import F64, Bools, Ints
+
+# A grid is hard where at most this share of its clear cells is good.
+HARD_SHARE = 0.2
+
+
+def mixed_grids(columns: Columns) -> tuple[Bools, Bools]:
+    """Masks (S,) of the scenes with good and bad clear cells, and of those of them that are hard."""
+    clear = np.bincount(columns.scene, columns.is_clear, columns.n_scenes)
+    good = np.bincount(columns.scene, columns.is_clear & columns.label, columns.n_scenes)
+    both = (good > 0) & (good < clear)
+    return both, both & (good <= HARD_SHARE * clear)
 
 
 def picks(score: F64, group: Ints, allowed: Bools) -> F64:

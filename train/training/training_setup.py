@@ -187,18 +187,19 @@ def _encoded(
 ) -> tuple[EncodedBatches, EncodedBatches]:
     """Batches of the streams' scenes from clouds that are encoded once. InputError where that cannot be."""
     options, folder = job.options, Path(job.encoded or "")
-    cannot = {
-        "--model": not isinstance(model, SharedModel),
+    if not isinstance(model, SharedModel):
+        problem = f"does not go with --model {model.name}: only clouds of `shared` are encoded apart from it"
+        raise InputError("datagen train", "--encoded", problem, "Omit one of them")
+    changing = {
         "--augment": job.augment is not None,
         "--candidates-per-robot": options.candidates_per_robot is not None,
         "--processes": ranks.world > 1,
-        "--perturb": bool(_rate_fields(job, job.runs)),
+        "runs of disturbed trials": bool(_rate_fields(job, job.runs)),
     }
-    for option, is_given in cannot.items():
+    for name, is_given in changing.items():
         if is_given:
-            problem = f"does not go with {option}: clouds are encoded once, for one `shared` model"
+            problem = f"does not go with {name}: all candidates are encoded once, with one label each"
             raise InputError("datagen train", "--encoded", problem, "Omit one of them")
-    assert isinstance(model, SharedModel)
     made: list[EncodedBatches] = []
     given = (job.runs, options.seed), (job.val_runs or job.runs, None)
     for stream, (runs, seed) in zip(streams, given, strict=True):

@@ -13,7 +13,6 @@ from datagen.train.evaluation.closed_loop import (
     AT_RANDOM,
     BY_LABELS,
     candidates_of,
-    is_hard,
     label_success,
     loop_table,
     plan_turns,
@@ -21,6 +20,7 @@ from datagen.train.evaluation.closed_loop import (
 from datagen.train.evaluation.columns import Columns
 from datagen.train.evaluation.comparisons import NO_TRAINING, TrainedBy
 from datagen.train.evaluation.evaluation import Method, weights_for
+from datagen.train.evaluation.grids import mixed_grids
 from datagen.train.inputs import F64
 from tests.train.evaluation.made_columns import make_columns
 
@@ -120,7 +120,7 @@ def test_labels_around_an_arrival_are_those_of_the_cell_that_lies_there() -> Non
 
 def test_rates_are_means_over_scenes_with_their_causes_and_gains() -> None:
     columns = grids(*lonely_and_wide())
-    hard = is_hard(maps_of(columns))
+    _, hard = mixed_grids(columns)
     assert hard.all()  # 26 of 169 cells
     good, bad = ["success"] * 2, ["no_ik", "success"]
     nominal = np.array([[bad, bad, good, ["no_lift", "no_ik"]]], object)

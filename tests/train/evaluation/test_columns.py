@@ -69,7 +69,7 @@ def test_scenes_and_robots_are_numbered_through_all_places() -> None:
     first, second, third = make_batch(0, [1, 2]), make_batch(2, [1]), make_batch(3, [1, 1])
     told: list[int] = []
     places = [(CELLS, [first, second]), (0, [third])]
-    found = gather(places, {"x": ByX()}, np.random.default_rng(0), seen=told.append)
+    found = gather(places, {"x": ByX()}, np.random.default_rng(0), n_examples=4, seen=told.append)
     columns = found.columns
     assert told == [2, 1, 2]
     assert columns.scene.tolist() == np.repeat([0, 1, 1, 2, 3, 4], CELLS).tolist()
