@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from datagen.configuration.specify import first_of, read_toml
 from datagen.evaluation_report.evaluated_runs import SCENES_PER_BATCH, EvaluatedRun, refuse_no_trials
+from datagen.released import RELEASED, released_checkpoint
 from datagen.schemas.errors import InputError
 from datagen.schemas.merged_runs import open_runs
 from datagen.schemas.progress import steps
@@ -208,13 +209,16 @@ def baseline_methods(
 
 
 def open_models(places: Sequence[str]) -> list[EvaluatedMethod]:
-    """The models of these checkpoints, with unique names from their regimes."""
+    """The models of these checkpoints, with unique names from their regimes; the released one has its own."""
     if not places:
         return []
     from datagen.train.training.checkpoints import load_model
 
     loaded = [(place, *load_model(place)) for place in places]
-    names = _names([(_regime_name(head), head.model) for _, _, head in loaded])
+    ours = str(released_checkpoint())
+    names = _names(
+        [(RELEASED if place == ours else _regime_name(head), head.model) for place, _, head in loaded]
+    )
     by_digest: dict[str, str] = {}
     for place, _, head in loaded:
         if head.digest in by_digest:

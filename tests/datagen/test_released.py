@@ -18,6 +18,7 @@ from PIL import Image
 import datagen
 from datagen import cli, released
 from datagen.benchmark.definition import read_benchmark
+from datagen.evaluation_report.methods import open_models
 from datagen.released.card import card_text
 from datagen.train.scorers import weights_sha256
 from datagen.train.training.checkpoints import read_checkpoint
@@ -114,6 +115,12 @@ def test_a_frame_without_a_checkpoint_is_scored_by_the_released_model(
     first = json_of(capsys, ["predict", *frame, *robot])
     assert first["scorer"].startswith("the released model, ")
     assert json_of(capsys, ["predict", "released", *frame, *robot]) == first
+
+
+def test_it_has_its_own_name_beside_other_models(tmp_path: Path) -> None:
+    write_untrained(tmp_path / "other.ckpt", MODEL)
+    found = open_models([str(released.released_checkpoint()), str(tmp_path / "other.ckpt")])
+    assert [method.name for method in found] == ["released", "stage1"]
 
 
 @pytest.mark.parametrize(
