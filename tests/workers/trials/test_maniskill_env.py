@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="ManiSkill cannot be imported here")
-
-import gymnasium as gym
-import torch
-from sapien import physx
+pytest.importorskip("sapien", reason="SAPIEN cannot be imported here: run `datagen doctor`")
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import TrialParams
+from datagen.workers.geometry.mesh import F64
 from datagen.workers.geometry.transforms import translation
+from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.robots import open_robot
 from datagen.workers.trials.execute import run_trial
-from datagen.workers.trials.maniskill_env import ENV_ID, DatagenGraspEnv, GraspTask, execute_plans
 from datagen.workers.trials.trial import Disturbance
-from datagen.workers.trials.trial_scene import prepare_trials
+from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
 from tests.workers.trials.worlds import base_before, on_top_m, plan_from_above, scene_with
 from tests.workers.worlds import box_model, cylinder_model
 
 PARAMS = TrialParams()
-ROBOT = open_robot("panda-scaled", 0.8, 0.8)
-BASE = base_before(ROBOT, 0.5)
 MODELS = [box_model("target", (0.05, 0.05, 0.12), 0.6), cylinder_model("other", 0.03, 0.1)]
-PREPARED = prepare_trials(scene_with(MODELS, [(0.0, 0.0), (0.0, 0.2)]), ROBOT, PARAMS, 0.1)
-PLAN = plan_from_above(ROBOT, BASE, on_top_m(scene_with(MODELS[:1], [(0.0, 0.0)]), 0.03), 0.07)
 WORLDS = {
     "as planned": (Disturbance.none(0.6), "success"),
     "slippery": (Disturbance.none(0.001), "slipped"),
@@ -37,27 +32,61 @@ WORLDS = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def settings_of_the_process() -> Iterator[None]:
-    """ManiSkill changes SAPIEN's settings for the whole process: other tests shall not see them."""
+@dataclass(frozen=True)
+class Planned:
+    """A plan of a robot in a scene."""
+
+    prepared: TrialScene
+    base: F64
+    plan: MotionPlan
+
+
+@pytest.fixture(scope="module")
+def planned() -> Planned:
+    robot = open_robot("panda-scaled", 0.8, 0.8)
+    base = base_before(robot, 0.5)
+    prepared = prepare_trials(scene_with(MODELS, [(0.0, 0.0), (0.0, 0.2)]), robot, PARAMS, 0.1)
+    grasped_m = on_top_m(scene_with(MODELS[:1], [(0.0, 0.0)]), 0.03)
+    return Planned(prepared, base, plan_from_above(robot, base, grasped_m, 0.07))
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Any]:
+    """Our module of the environment. Imported here, for every test process imports this file, and ManiSkill
+    takes a quarter as long as all other libraries.
+
+    ManiSkill changes SAPIEN's settings for the whole process: other tests shall not see them.
+    """
+    pytest.importorskip("mani_skill", reason="ManiSkill cannot be imported here")
+    from sapien import physx
+
+    from datagen.workers.trials import maniskill_env
+
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
-    yield
+    yield maniskill_env
     physx.set_scene_config(scene)
     physx.set_body_config(body)
     physx.set_shape_config(shape)
 
 
+def make(engine: Any, *tasks: Any, **more: Any) -> Any:
+    """The registered environment with these tasks."""
+    import gymnasium
+
+    return gymnasium.make(engine.ENV_ID, tasks=list(tasks), **more)
+
+
 @pytest.mark.parametrize("world", WORLDS)
-def test_both_engines_agree(world: str) -> None:
+def test_both_engines_agree(engine: Any, planned: Planned, world: str) -> None:
     disturbance, outcome = WORLDS[world]
-    task = GraspTask(PREPARED, BASE, PLAN, disturbance)
-    own = run_trial(PREPARED, BASE, PLAN, disturbance)
+    task = engine.GraspTask(planned.prepared, planned.base, planned.plan, disturbance)
+    own = run_trial(planned.prepared, planned.base, planned.plan, disturbance)
     assert own.outcome == outcome
-    env = gym.make(ENV_ID, tasks=[task], obs_mode="state")
+    env = make(engine, task, obs_mode="state")
     try:
         unwrapped = env.unwrapped
-        assert isinstance(unwrapped, DatagenGraspEnv)
-        assert execute_plans(unwrapped).tolist() == [outcome == "success"]
+        assert isinstance(unwrapped, engine.DatagenGraspEnv)
+        assert engine.execute_plans(unwrapped).tolist() == [outcome == "success"]
         if outcome == "success":
             lift_m = float(unwrapped.evaluate()["lift_m"][0])
             assert lift_m == pytest.approx(own.lift_m, abs=0.003)
@@ -66,23 +95,27 @@ def test_both_engines_agree(world: str) -> None:
         env.close()
 
 
-def test_a_policy_can_step_it() -> None:
-    env = gym.make(ENV_ID, tasks=[GraspTask(PREPARED, BASE, PLAN, Disturbance.none(0.6))], obs_mode="state")
+def test_a_policy_can_step_it(engine: Any, planned: Planned) -> None:
+    task = engine.GraspTask(planned.prepared, planned.base, planned.plan, Disturbance.none(0.6))
+    env = make(engine, task, obs_mode="state")
     try:
         env.reset(seed=0)
         observed, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        assert torch.isfinite(observed).all()
+        assert bool(observed.isfinite().all())
         assert float(reward) == 0.0 and not bool(terminated) and not bool(truncated)
         assert set(info) >= {"success", "held", "lift_m", "slip_m"}
     finally:
         env.close()
 
 
-def test_tasks_of_different_robots_are_refused() -> None:
+def test_tasks_of_different_robots_are_refused(engine: Any, planned: Planned) -> None:
     other = open_robot("panda-scaled", 0.7, 0.8)
     prepared = prepare_trials(scene_with(MODELS[:1], [(0.0, 0.0)]), other, PARAMS, 0.1)
-    tasks = [GraspTask(p, BASE, PLAN, Disturbance.none(0.6)) for p in (PREPARED, prepared)]
+    tasks = [
+        engine.GraspTask(p, planned.base, planned.plan, Disturbance.none(0.6))
+        for p in (planned.prepared, prepared)
+    ]
     with pytest.raises(InputError, match="differ in robot"):
-        gym.make(ENV_ID, tasks=tasks)
+        make(engine, *tasks)
     with pytest.raises(InputError, match="are missing"):
-        gym.make(ENV_ID, tasks=[])
+        make(engine)
