@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from tests.linked_environments import install_wheel, link_libraries, wheel
@@ -38,8 +39,9 @@ print(json.dumps(done))
 
 @dataclass(frozen=True)
 class Done:
-    """How a command ended."""
+    """A command and how it ended."""
 
+    words: list[str]
     code: int
     out: str
     err: str
@@ -52,18 +54,14 @@ class Installed:
         self.wheel, self.folder = wheel, folder
         link_libraries(install_wheel(wheel, folder / "venv"), *extras)
 
-    def run(self, *commands: Command) -> list[Done]:
-        """Do commands one after another; the first by the program itself, as a user does."""
+    def run(self, *commands: Command) -> Iterator[Done]:
+        """Do commands in turn: the first by the program itself, as a user does, the rest in one process."""
         first, *rest = ([*map(str, words)] for words in commands)
         program = self._start(self.folder / "venv" / "bin" / "datagen", *first)
-        done = [Done(program.returncode, program.stdout, program.stderr)]
-        if rest:
-            python = self._start(
-                self.folder / "venv" / "bin" / "python", "-I", "-c", PROGRAM, json.dumps(rest)
-            )
-            assert python.returncode == 0, python.stderr
-            done += [Done(*one) for one in json.loads(python.stdout)]
-        return done
+        yield Done(first, program.returncode, program.stdout, program.stderr)
+        python = self._start(self.folder / "venv" / "bin" / "python", "-I", "-c", PROGRAM, json.dumps(rest))
+        assert python.returncode == 0, python.stderr
+        yield from (Done(words, *one) for words, one in zip(rest, json.loads(python.stdout), strict=True))
 
     def _start(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
@@ -72,15 +70,10 @@ class Installed:
             env=environment | {"OMP_NUM_THREADS": "1"},
         )  # fmt: skip
 
-    def succeed(self, *commands: Command) -> None:
-        for words, done in zip(commands, self.run(*commands), strict=True):
-            assert done.code == 0, f"{words}: {done.err}"
-
-    def lacks(self, extra: str, *commands: Command) -> None:
-        """Each command says that this extra is missing, and how the wheel that is installed brings it."""
-        for words, done in zip(commands, self.run(*commands), strict=True):
-            line = refused_line(done)
-            assert f"Install the extra {extra}: pip install '{self.wheel}[{extra}]'" in line, words
+    def assert_lacks(self, extra: str, done: Done) -> None:
+        """The command says that this extra is missing, and how the wheel that is installed brings it."""
+        told = f"Install the extra {extra}: pip install '{self.wheel}[{extra}]'"
+        assert told in refused_line(done), done
 
 
 def refused_line(done: Done) -> str:
@@ -92,47 +85,59 @@ def refused_line(done: Done) -> str:
 
 
 def test_the_base_keeps_runs_and_names_what_it_lacks(wheel: Path, copied: Path, tmp_path: Path) -> None:
-    base = Installed(wheel, tmp_path)
+    base, out = Installed(wheel, tmp_path), tmp_path / "out"
     verbs = ("verify", "audit", "status", "logs", "seal", "unseal", "repair", "gc", "cancel")
-    base.succeed(
+    works: list[Command] = [
         ["--help"], ["doctor", "--help"], ["assets", "list"], *([verb, copied] for verb in verbs),
         ["merge", copied, "--out", tmp_path / "merged"],
-    )  # fmt: skip
-    (doctor,) = base.run(["doctor"])
-    assert doctor.code == 1 and "Traceback" not in doctor.err
-    assert "[labels]" in "".join(doctor.out.split())  # whatever the width of its table
-    out = tmp_path / "out"
-    base.lacks(
-        "labels",
+    ]  # fmt: skip
+    lacks_labels: list[Command] = [
         submit_arguments(out, PER_SCENE),
         ["submit", "sim", "--n", "48", "--out", out],
         ["resume", copied],
         ["show", copied, "--scene", "0", "--out", out],
         ["replay", copied, "0"],
         ["verify", copied, "--deep", "1"],
-    )
-    base.lacks("train", ["train", "stage1", copied, "--out", out], ["evaluate", "model.ckpt", copied])
-    assert not out.exists()
+    ]
+    lacks_train: list[Command] = [
+        ["train", "stage1", copied, "--out", out],
+        ["evaluate", "model.ckpt", copied],
+    ]
+    done = base.run(*works, ["doctor"], *lacks_labels, *lacks_train)
+    for each in islice(done, len(works)):
+        assert each.code == 0, each
+    doctor = next(done)
+    assert doctor.code == 1 and "Traceback" not in doctor.err
+    assert "[labels]" in "".join(doctor.out.split())  # whatever the width of its table
+    for each in islice(done, len(lacks_labels)):
+        base.assert_lacks("labels", each)
+    for each in islice(done, len(lacks_train)):
+        base.assert_lacks("train", each)
+    assert next(done, None) is None and not out.exists()
 
 
 def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: Path) -> None:
     labels, run, other = Installed(wheel, tmp_path, "labels"), tmp_path / "run", tmp_path / "other"
-    labels.succeed(
+    *made, no_ray, no_cluster, no_sim, no_settler, no_renderer = labels.run(
         submit_arguments(run, PER_SCENE),
         ["show", run, "--scene", "0", "--out", tmp_path / "scene.png"],
         ["verify", run, "--deep", "1"],
         ["relabel", run, "--mu", "0.9", "--out", tmp_path / "relabelled"],
-    )
-    line = refused_line(labels.run(submit_arguments(other, PER_SCENE, workers=1))[0])
-    assert line.startswith("error: ray: is not installed. Install the extra cluster: ")
-    assert "or work in this process: --workers 0" in line
-    labels.lacks("cluster", ["resume", run, "--detach"])
-    labels.lacks("sim", ["submit", "plan", "--n", "48", "--workers", "0", "--out", other])
-    labels.lacks(
-        "pybullet",
+        submit_arguments(other, PER_SCENE, workers=1),
+        ["resume", run, "--detach"],
+        ["submit", "plan", "--n", "48", "--workers", "0", "--out", other],
         submit_arguments(other, PER_SCENE, "--settler", "pybullet"),
         submit_arguments(other, PER_SCENE, "--renderer", "pybullet"),
     )
+    for done in made:
+        assert done.code == 0, done
+    line = refused_line(no_ray)
+    assert line.startswith("error: ray: is not installed. Install the extra cluster: ")
+    assert "or work in this process: --workers 0" in line
+    for extra, done in (
+        ("cluster", no_cluster), ("sim", no_sim), ("pybullet", no_settler), ("pybullet", no_renderer)
+    ):  # fmt: skip
+        labels.assert_lacks(extra, done)
     assert not other.exists()
 
 
@@ -140,12 +145,14 @@ def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path
     train = Installed(wheel, tmp_path, "train")
     for split in ("train", "val"):
         make_small_run(tmp_path / split, 48, "--split", split)
-    words = ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL]
-    train.succeed(words)
     write_untrained(tmp_path / "model.ckpt", {})
     write_frame(tmp_path / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
     given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
-    (done,) = train.run(["predict", "model.ckpt", *given])
-    assert done.code in (0, 1), done.err  # 1 where a model without training finds no good base
+    trained, predicted = train.run(
+        ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL],
+        ["predict", "model.ckpt", *given],
+    )
+    assert trained.code == 0, trained.err
+    assert predicted.code in (0, 1), predicted.err  # 1 where a model without training finds no good base
     assert (tmp_path / "heat.png").is_file() and (tmp_path / "a.html").is_file()
