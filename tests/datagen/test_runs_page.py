@@ -15,6 +15,7 @@ import pytest
 
 from datagen import cli
 from tests.conftest import REPOSITORY
+from tests.small_runs import json_of
 
 # Small runs in the command's own process: starting Ray eight times would cost more than the labels.
 SMALL = {
@@ -86,3 +87,4 @@ def test_the_page_of_runs(
         assert done.exit_code == command.exit_code, f"{text}\n{told}"
         missing = set(script.labels_of(command.output)) - set(script.labels_of(output))
         assert not missing, f"{text}\nno longer prints {missing}:\n{told}"
+    assert len(json_of(capsys, ["status", f"{runs}/both"])["parts"]) == 2

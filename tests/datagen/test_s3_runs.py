@@ -1,4 +1,7 @@
-"""The same command lines with an s3:// address: runs made, grown, labelled again, merged and read."""
+"""The same command lines with an s3:// address: runs made, grown, labelled again and read.
+
+`test_runs_page.py` resumes, merges, verifies, damages and repairs runs there.
+"""
 
 from __future__ import annotations
 
@@ -46,27 +49,11 @@ def test_a_run_on_s3_is_the_run_on_a_disk(
     assert cli.run(["audit", out]) == 0
     assert cli.run(["show", out, "--out", str(tmp_path / "scene.png")]) == 0
     assert (tmp_path / "scene.png").stat().st_size > 10_000
-    assert cli.run(["verify", out]) == 0
-
-    file = run.commit_of(1).files[-1]
-    key = f"shards/000001/{run.commit_of(1).attempt}/{file.path}"
-    right = run.storage.get(key, 2**24)
-    run.storage.put(key, b"damaged")
-    assert cli.run(["verify", out]) == 1
-    assert cli.run(["repair", out]) == 0
-    assert run.storage.get(key, 2**24) == right
-
     again = f"{bucket}/runs/again"
     submit(again, 8, "--scenes-from", out)
     assert sealed_arrays(Run.open(again))["scene_index"].tolist() == [0]
     arguments = ["submit", "heuristic", "--n", "32", "--out", f"{bucket}/more", "--scenes-from", out]
     refused([*arguments, "--workers", "0"], capsys, "--n: 32", f"is more than the 16 candidates of {out}")
-
-    other, merged = f"{bucket}/runs/b", f"{bucket}/merged"
-    submit(other, 8, "--seed", "7", *config)
-    assert cli.run(["merge", out, other, "--out", merged]) == 0
-    assert cli.run(["verify", merged]) == 0
-    assert len(json_of(capsys, ["status", merged])["parts"]) == 2
 
 
 def test_worker_processes_write_to_s3_and_a_reader_reads_it(
