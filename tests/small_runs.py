@@ -27,6 +27,19 @@ n_farthest = 64
 [visibility]
 window_px = 24
 """
+# Of plans on whole grids. Long arms and small grids, so that most grids have good and bad clear cells.
+GRID_CONFIG = (
+    CONFIG
+    + """
+[candidates]
+grid_cells = {side}
+arm_reach_m = {{low = 0.9, high = 1.0}}
+
+[arm.grasps]
+per_object = 40
+per_scene = 10
+"""
+)
 PER_SCENE = 8
 HERE = ("--workers", "0")  # in the calling process
 

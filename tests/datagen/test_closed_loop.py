@@ -16,23 +16,12 @@ from datagen.closed_loop import arrivals_of_scene
 from datagen.schemas.outcomes import OUTCOMES
 from tests.refusals import refused
 from tests.sim_extra import needs_sim
-from tests.small_runs import CONFIG, arrays_of, json_of
+from tests.small_runs import GRID_CONFIG, arrays_of, json_of
 
 pytestmark = needs_sim
 
 SIDE, SCENES = 7, 5
-GRID = f"""
-[scene]
-n_clutter = 1
-
-[candidates]
-grid_cells = {SIDE}
-arm_reach_m = {{low = 0.9, high = 1.0}}
-
-[arm.grasps]
-per_object = 40
-per_scene = 10
-"""
+GRID = GRID_CONFIG.format(side=SIDE) + "\n[scene]\nn_clutter = 1\n"
 QUICK = ("--bootstrap", "30", "--baselines", "proximity", "--baselines", "analytic", "--repeats", "2")
 NEAR, FAR = "disc:0", "normal:0.1,3deg"
 
@@ -40,7 +29,7 @@ NEAR, FAR = "disc:0", "normal:0.1,3deg"
 @pytest.fixture(scope="module")
 def grids(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("loop")
-    (folder / "grid.toml").write_text(CONFIG + GRID)
+    (folder / "grid.toml").write_text(GRID)
     where = ["--out", str(folder / "run"), "--config", str(folder / "grid.toml"), "--workers", "0"]
     n = str(SCENES * SIDE**2)
     assert cli.run(["submit", "plan", "--n", n, "--candidates-per-scene", "grid", "--seed", "4", *where]) == 0
@@ -195,7 +184,7 @@ def test_odd_calls_are_refused(
     refused(["closed-loop", str(grids), "--out", str(file), *QUICK], capfd, "is not a folder")
     none = ["--baselines", "none", "--bootstrap", "30"]
     refused(["closed-loop", str(grids), "--out", str(tmp_path), *none], capfd, "no model or baseline given")
-    (grids.parent / "near.toml").write_text(CONFIG + GRID)
+    (grids.parent / "near.toml").write_text(GRID)
     near = str(tmp_path / "near")
     drawn = ["--candidates", "in-range", "--candidates-per-scene", "3", "--n", "3", "--workers", "0"]
     assert (

@@ -10,27 +10,17 @@ from datagen import cli
 from datagen.benchmark.definition import Benchmark, BenchmarkRun
 from datagen.benchmark.frozen_runs import digests_of
 from datagen.schemas.run import Run
-from tests.small_runs import CONFIG
+from tests.small_runs import GRID_CONFIG
 
 SIDE = 5
 SIZES = {"test": 32, "grids": 6 * SIDE * SIDE}
-# Long arms and small grids, so that most grids have good and bad clear cells.
-WORLD = f"""
-[candidates]
-grid_cells = {SIDE}
-arm_reach_m = {{low = 0.9, high = 1.0}}
-
-[arm.grasps]
-per_object = 40
-per_scene = 10
-"""
 
 
 @pytest.fixture(scope="session")
 def small_benchmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the definition, benchmark.json, and with its runs in `runs`. Tests only read it."""
     folder = tmp_path_factory.mktemp("benchmark")
-    (folder / "small.toml").write_text(CONFIG + WORLD)
+    (folder / "small.toml").write_text(GRID_CONFIG.format(side=SIDE))
     kinds = {"test": ["--candidates", "in-range", "--candidates-per-scene", "4"], "grids": []}
     runs: dict[str, BenchmarkRun] = {}
     for seed, (name, kind) in enumerate(kinds.items()):

@@ -62,23 +62,26 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return line
 
 
-def test_every_kind_of_method_has_a_line(
-    small_benchmark: Path,
-    scored: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+@pytest.fixture
+def folder_of_mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with the module `mine`."""
     (tmp_path / "mine.py").write_text(SCORER)
     monkeypatch.chdir(tmp_path)
-    model, out = checkpoint(tmp_path / "tiny.ckpt"), tmp_path / "board.json"
-    write_near(small_benchmark / "runs", tmp_path / "file.csv", "test", "grids")
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    return tmp_path
+
+
+def test_every_kind_of_method_has_a_line(
+    small_benchmark: Path, scored: list[str], folder_of_mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, out = checkpoint(folder_of_mine / "tiny.ckpt"), folder_of_mine / "board.json"
+    write_near(small_benchmark / "runs", folder_of_mine / "file.csv", "test", "grids")
     words = [model, "mine:near", "file.csv", "mine:far", "proximity", *scored, "--out", str(out)]
-    report = json_of(capsys, ["benchmark", "score", *words, "--out", str(tmp_path / "board.html")])
+    report = json_of(capsys, ["benchmark", "score", *words, "--out", str(folder_of_mine / "board.html")])
     assert json.loads(out.read_text()) == report
-    assert "<h2>test: small test; 32 candidates" in (tmp_path / "board.html").read_text()
+    assert "<h2>test: small test; 32 candidates" in (folder_of_mine / "board.html").read_text()
     assert [m["name"] for m in report["methods"]] == ["tiny", "mine:near", "file", "mine:far", "proximity"]
-    assert str(tmp_path) not in out.read_text()
+    assert str(folder_of_mine) not in out.read_text()
     told = report["candidates"]["test"]["methods"]
     # The same scores by a function, and by a file that another program wrote.
     for metric in ("balanced_accuracy", "area_under_roc", "accuracy"):
@@ -210,16 +213,8 @@ def test_a_broken_file_of_scores_is_one_line(
     ],
 )
 def test_a_method_that_is_none_is_one_line(
-    method: str,
-    told: str,
-    scored: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    method: str, told: str, scored: list[str], folder_of_mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "mine.py").write_text(SCORER)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "mine", raising=False)
     assert told in refused([method, *scored], capsys)
 
 
