@@ -115,7 +115,7 @@ def test_grids_are_those_with_good_and_bad_cells(
     scenes = stored["sample_scene_index"]
     clear, good = stored["base_is_clear"], stored["label"] == 1
     counts = [(clear[scenes == s].sum(), (clear & good)[scenes == s].sum()) for s in np.unique(scenes)]
-    mixed = [share for of, share in ((c, g / c) for c, g in counts if c) if 0 < share < 1]
+    mixed = [share for share in (g / c for c, g in counts if c) if 0 < share < 1]
     told = report["grids"]["grids"]
     assert mixed and told["mixed"]["scenes"] == len(mixed)
     hard = sum(share <= 0.2 for share in mixed)
