@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -21,6 +22,17 @@ __all__ = ["wheel"]
 OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
 FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
+# Commands in one process, which imports its libraries once; the first that fails ends it.
+SEVERAL = """
+import json, sys
+from datagen import cli
+
+if __name__ == "__main__":
+    for words in json.loads(sys.argv[1]):
+        code = cli.run(words)
+        if code != 0:
+            sys.exit(f"{words}: exit code {code}")
+"""
 
 
 @pytest.fixture(scope="module")
@@ -68,29 +80,33 @@ def test_the_folders_of_a_checkout_cannot_be_imported_under_their_own_names() ->
 def test_labels_training_and_prediction_beside_a_users_files(installed: Path, folder: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "RAY_"))}
     environment["OMP_NUM_THREADS"] = "1"
+    several = installed / "several"  # as `datagen` is, whose folder comes first in the path of its imports
+    several.write_text(SEVERAL)
 
-    def datagen(*words: str) -> None:
-        command = [installed / "datagen", *words]
-        run = subprocess.run(
+    def run(*command: str | Path) -> None:
+        done = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
-        assert run.returncode == 0, f"{' '.join(words)}: {run.stderr}"
+        assert done.returncode == 0, f"{' '.join(map(str, command))}: {done.stderr}"
 
     (folder / "small.toml").write_text(CONFIG)
     (folder / "plan.toml").write_text(CONFIG + FEW_GRASPS)
     small = ("--n", "48", "--candidates-per-scene", "8")
-    datagen("submit", "heuristic", "--out", "run", "--split", "train", "--config", "small.toml", *small)
-    here = ("--workers", "0")
-    datagen("submit", "heuristic", "--out", "val", "--split", "val", "--config", "small.toml", *small, *here)
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
-    datagen("submit", "plan", "--out", "plan", *plan, *small)
-    datagen("show", "run", "--scene", "0", "--out", "scene.png")
-    datagen("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL)
-    datagen("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html")
-    write_frame(folder / "frame", draw_seen(0))
+    run(installed / "datagen", "submit", "plan", "--out", "plan", *plan, *small)  # on Ray
+    heuristic = ("submit", "heuristic", "--workers", "0", "--config", "small.toml", *small)
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
-    datagen("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png")
-    datagen("predict", "--demo")
+    write_frame(folder / "frame", draw_seen(0))
+    commands = [
+        (*heuristic, "--out", "run", "--split", "train"),
+        (*heuristic, "--out", "val", "--split", "val"),
+        ("show", "run", "--scene", "0", "--out", "scene.png"),
+        ("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL),
+        ("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html"),
+        ("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png"),
+        ("predict", "--demo"),
+    ]
+    run(installed / "python", several, json.dumps(commands))
     assert {"scene.png", "page.html", "heat.png", "demo.png", "demo.html"} <= {
         path.name for path in folder.iterdir()
     }
