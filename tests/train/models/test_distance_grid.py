@@ -25,4 +25,4 @@ def test_points_outside_and_points_that_are_no_numbers_are_left_out():
     bad = np.array([[np.nan, 0, 0], [np.inf, 0, 0.01], [5.0, 0.0, 0.0], [0.0, 0.0, -0.01]])
     grid = DistanceGrid(bad, LOW_M, SHAPE, CELL_M)
     assert np.ptp(grid(CENTRES_M, -1)) == 0
-    np.testing.assert_array_equal(grid(CENTRES_M[:1] + [[0, 0, 1]], 0.1), np.float32([0.1]))
+    np.testing.assert_array_equal(grid(CENTRES_M[:1] + 1.0, 0.1), np.array([0.1], np.float32))
