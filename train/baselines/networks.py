@@ -11,10 +11,8 @@ from datagen.train.inputs import F64, Bools, Ints
 MEMBERS = 5
 _WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
 _MEAN = 0.995  # of the weights over steps: what is used, and what is judged
-_EVERY, _PATIENCE = (
-    50,
-    1000,
-)  # steps between looks at the held-out loss, and without a lower one until it ends
+_EVERY = 50  # steps between looks at the held-out loss
+_PATIENCE = 1000  # steps without a lower one until it ends
 
 Layer = tuple[F64, F64]  # weights (MEMBERS, in, out), bias (MEMBERS, 1, out)
 

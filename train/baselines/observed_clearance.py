@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
+from datagen.schemas.specification import CandidateParams
 from datagen.train.inputs import F64, Array, Batch
 
 # Lower points are floor, as far as a depth camera can say.
 _FLOOR_M = 0.05
 # Clearances are capped here: the cloud ends a metre around the target.
 FAR_M = 1.0
-_BASE_RADIUS_M, _RADIUS_PER_REACH = 0.25, 0.29  # the narrower of both, as `datagen predict` has it
+_BASES = CandidateParams(scaled_base=True)  # as `datagen predict` has them
 
 
 def observed_clearance_m(batch: Batch[Array]) -> F64:
@@ -28,12 +29,11 @@ def observed_clearance_m(batch: Batch[Array]) -> F64:
         rows, cloud = order[ends[robot] : ends[robot + 1]], int(robots.cloud_row[robot])
         points_m = clouds.points_m[cloud, : int(clouds.n_points[cloud])].astype(np.float64)
         height_m = points_m[:, 2] + clouds.target_height_m[cloud]
-        low = (height_m > _FLOOR_M) & (
-            height_m < robots.base_height_m[robot]
-        )  # also drops what is not finite
+        # What is not finite fails the comparisons.
+        low = (height_m > _FLOOR_M) & (height_m < robots.base_height_m[robot])
         if not low.any():
             continue
-        radius_m = min(_BASE_RADIUS_M, _RADIUS_PER_REACH * float(robots.arm_reach_m[robot]))
+        radius_m = float(_BASES.radius_of_base_m(float(robots.arm_reach_m[robot])))
         away_m, _ = KDTree(points_m[low, :2]).query(batch.candidates.base_xy_m[rows].astype(np.float64))
         clearance[rows] = np.minimum(away_m - radius_m, FAR_M)
     return clearance

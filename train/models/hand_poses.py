@@ -13,14 +13,14 @@ so that poses turn with the scene.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from math import pi
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from datagen.train.inputs import F32, F64, Bools, Ints
+from datagen.train.models.distance_grid import DistanceGrid
 
 # The Franka Hand's collision shapes (robots' files in workers/robots): other parallel hands are alike.
 _STROKE_M = 0.08
@@ -235,8 +235,8 @@ def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64],
     places of the way in; all on two of the way up. From the target: fingers, palm.
     """
     fingers, palm, wrist = hands.fingers(), hands.palm(), hands.wrist()
-    others = _DistanceGrid(others_m, _AROUND_M, _CELL_M)
-    own = _DistanceGrid(target_m, _TARGET_AROUND_M, _TARGET_CELL_M)
+    others = partial(_around(others_m, _AROUND_M, _CELL_M), outside_m=_BEYOND_M)
+    own = partial(_around(target_m, _TARGET_AROUND_M, _TARGET_CELL_M), outside_m=_BEYOND_M)
     each = others(fingers).min(2) - _FINGER_RADIUS_M
     clear = [each.min(1), each.max(1), others(palm).min(1) - _PALM_RADIUS_M]
     clear.append(others(wrist).min(1) - _WRIST_RADIUS_M)
@@ -251,29 +251,10 @@ def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64],
     return clear, [own(both).min(1) - _FINGER_RADIUS_M, own(palm).min(1) - _PALM_RADIUS_M]
 
 
-class _DistanceGrid:
-    """Distances to the nearest of some points, in cells of a cube around the origin."""
-
-    def __init__(self, points_m: F64, half_m: float, cell_m: float) -> None:
-        self._half_m, self._cell_m, self._n = half_m, cell_m, round(2 * half_m / cell_m)
-        free = np.ones((self._n,) * 3, np.bool_)
-        cell, inside = self._cells(points_m)
-        free[tuple(cell[inside].T)] = False
-        if free.all():
-            distance = np.full(free.shape, half_m)
-        else:
-            distance = ndimage.distance_transform_edt(free, cell_m)
-        self._distance_m = np.asarray(distance, np.float32).ravel()
-
-    def __call__(self, points_m: F64) -> F64:
-        """Distances (...) of points (..., 3)."""
-        cell, inside = self._cells(points_m)
-        row = (cell[..., 0] * self._n + cell[..., 1]) * self._n + cell[..., 2]
-        return np.where(inside, self._distance_m[np.where(inside, row, 0)], _BEYOND_M)
-
-    def _cells(self, points_m: F64) -> tuple[np.ndarray, Bools]:
-        cell = np.floor((points_m + self._half_m) / self._cell_m).astype(np.int32)
-        return cell, np.asarray(((cell >= 0) & (cell < self._n)).all(-1), np.bool_)
+def _around(points_m: F64, half_m: float, cell_m: float) -> DistanceGrid:
+    """Distances to points in a cube around the origin. Measures are cut off before its farthest."""
+    cells = round(2 * half_m / cell_m)
+    return DistanceGrid(points_m, np.full(3, -half_m), (cells, cells, cells), cell_m)
 
 
 def _normals(points_m: F64) -> F64:

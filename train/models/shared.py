@@ -184,7 +184,8 @@ class SharedModel(Model):
             scalars = torch.cat(parts, dim=1)
         same, left = self._steered(tokens)
         condition, condition_left = self.condition(scalars), self.condition_left(target_left)
-        cut = tiles(candidates.robot_row, _TILE_CUDA if scalars.is_cuda else _TILE_CPU)
+        size = _TILE_CUDA if scalars.is_cuda else _TILE_CPU
+        cut = tiles(candidates.robot_row, size)
         pooled = [
             self._pool(
                 same[robot],
@@ -202,7 +203,12 @@ class SharedModel(Model):
         joined = [self.pooled(sides).mean(1), self.scalars(scalars)]
         if tokens.hand_poses is not None and self.sizes.hand_poses:
             cloud_row = robots.cloud_row[candidates.robot_row]
-            joined.append(self.hands(tokens.hand_poses, cloud_row, frames, scalars))
+            some = torch.arange(len(candidates), device=scalars.device).split(size)
+            of_tiles = [
+                self.hands(tokens.hand_poses, cloud_row[rows], take_rows(frames, rows), scalars[rows])
+                for rows in some
+            ]
+            joined.append(torch.cat(of_tiles))
         return self.head(torch.cat(joined, dim=1)).float()
 
     def visible_share(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from datagen.schemas.specification import PANDA_REACH_M
 from datagen.train.baselines.observed_clearance import FAR_M, observed_clearance_m
 from datagen.train.inputs import Batch
 from tests.train.baselines.scenes import make_batch, moved, take
@@ -44,7 +45,7 @@ def test_narrow_bases_of_short_arms_have_more_room() -> None:
     batch = batch_with([[0, 0, -0.4]], [[0.5, 0]])
     short = replace(batch, robots=replace(batch.robots, arm_reach_m=np.full(2, 0.5, np.float32)))
     np.testing.assert_allclose(
-        observed_clearance_m(short) - observed_clearance_m(batch), 0.25 - 0.145, atol=1e-6
+        observed_clearance_m(short) - observed_clearance_m(batch), 0.25 * (1 - 0.5 / PANDA_REACH_M), atol=1e-6
     )
 
 
