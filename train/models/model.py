@@ -49,6 +49,22 @@ class Model(nn.Module, ABC):
         """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) go through it."""
 
     @property
+    def logit_layer(self) -> nn.Linear | None:
+        """The layer whose outputs are the logits; None where they are no layer's."""
+        return None
+
+    def tempered(self, temperature: float) -> dict[str, Tensor]:
+        """A copy of the parameters with which all logits are divided by `temperature`.
+
+        Unchanged without a `logit_layer`. Decisions and the order of scores stay.
+        """
+        of_logits = () if self.logit_layer is None else tuple(map(id, self.logit_layer.parameters()))
+        return {
+            name: value.detach() / temperature if id(value) in of_logits else value.detach().clone()
+            for name, value in self.state_dict(keep_vars=True).items()
+        }
+
+    @property
     def device(self) -> torch.device:
         """Where the parameters are."""
         return next(self.parameters()).device

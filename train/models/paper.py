@@ -112,6 +112,11 @@ class PaperModel(Model):
             width = narrower
         self.head = nn.Sequential(*layers, nn.Linear(width, 2))
 
+    @property
+    def logit_layer(self) -> nn.Linear | None:
+        """The last layer of the head."""
+        return self.head[-1]
+
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:

@@ -141,6 +141,11 @@ class SharedModel(Model):
             mlp(joined, self.sizes.head, 2),
         )
 
+    @property
+    def logit_layer(self) -> nn.Linear | None:
+        """The last layer of the head."""
+        return self.head[-1][-1]
+
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:

@@ -160,7 +160,7 @@ def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
     at.epoch, at.batch, at.sums = at.epoch + 1, 0, [0.0] * 4
     if best:
         at.best_epoch = at.epoch
-        at.best_weights = {k: v.detach().clone() for k, v in training.model.state_dict().items()}
+        at.best_weights = training.model.tempered(measured.get("val_temperature", 1.0))
     worse_for = at.epoch - (at.best_epoch or 0)
     at.finished = at.epoch >= options.epochs or worse_for >= options.patience
     wall_s, cpu_s, _ = clock.lap()
