@@ -49,7 +49,7 @@ class Model(nn.Module, ABC):
         """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) go through it."""
 
     @property
-    def logit_layer(self) -> nn.Linear | None:
+    def logit_layer(self) -> nn.Module | None:
         """The layer whose outputs are the logits; None where they are no layer's."""
         return None
 

@@ -113,7 +113,7 @@ class PaperModel(Model):
         self.head = nn.Sequential(*layers, nn.Linear(width, 2))
 
     @property
-    def logit_layer(self) -> nn.Linear | None:
+    def logit_layer(self) -> nn.Module:
         """The last layer of the head."""
         return self.head[-1]
 

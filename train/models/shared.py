@@ -142,9 +142,9 @@ class SharedModel(Model):
         )
 
     @property
-    def logit_layer(self) -> nn.Linear | None:
+    def logit_layer(self) -> nn.Module:
         """The last layer of the head."""
-        return self.head[-1][-1]
+        return list(self.head.modules())[-1]
 
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
