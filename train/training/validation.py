@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NotRequired
 
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import NotRequired, TypedDict  # pydantic reads typing's from Python 3.12 on
+from typing_extensions import TypedDict  # pydantic reads typing's from Python 3.12 on
 
 from datagen.schemas.errors import InputError
 from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
