@@ -10,7 +10,7 @@ set -euo pipefail
 ROOT=$(realpath "$(dirname "$0")/..")
 . "$ROOT/scripts/campaign.sh"
 OUT=$(realpath -m "${1:-$ROOT/build/model}")
-LABELS=${LABELS:-100020}  # within reach, in training houses
+LABELS=${LABELS:-200010}  # within reach, in training houses
 EPOCHS=${EPOCHS:-12}
 SCENES=${SCENES:-400}     # whole grids of the closed loop
 
