@@ -5,12 +5,8 @@ r"""Write frames of test scenes as folders for `datagen predict --frame`, such a
 Each scene is drawn in a house of the test split and rendered with stereo noise. The camera's height, for
 `--camera-height`, is printed. The pictures docs/images/predict.png and predict-unseen.png were made by
 
-    HEURISTIC=12000 SIM_IN_RANGE=600 SIM_CLEAR=450 scripts/paper.sh small PAPER    # its training runs
-    datagen train stage1 PAPER/runs/heuristic --epochs 3 --threads 1 --out stage1.ckpt
-    datagen train stage2 PAPER/runs/train-in-range PAPER/runs/train-clear --init stage1.ckpt --epochs 4 \
-        --threads 1 --out model.ckpt
     python -m benchmarks.write_frames FRAMES --houses procthor:DIR --objects ycb:DIR
-    datagen predict model.ckpt --frame FRAMES/frame2 --camera-height 1.333 --base-height 0.7 --reach 0.9 \
+    datagen predict --frame FRAMES/frame2 --camera-height 1.333 --base-height 0.7 --reach 0.9 \
         --out predict.png
 
 and the last command with frame1 and --camera-height 1.346.
