@@ -26,6 +26,7 @@ _LOCAL = {
     # A busy machine needs longer than the 30 to 60 s that Ray gives its own processes.
     "RAY_gcs_server_port_wait_time_s": "300",
     "RAY_worker_register_timeout_seconds": "300",
+    "RAY_DASHBOARD_STARTUP_TIMEOUT_S": "300",
     # Whether the raylet learns from a pipe that its parent has exited.
     "RAY_enable_pipe_based_agent_to_parent_health_check": "1",
 }

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pybullet
+import pybullet  # pyright: ignore[reportMissingImports]  # no wheels from Python 3.12 on
 from PIL import Image
 
 from datagen.schemas.errors import InputError

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pybullet
+import pybullet  # pyright: ignore[reportMissingImports]  # no wheels from Python 3.12 on
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.specification import SettleParams
