@@ -1,9 +1,10 @@
-"""What selected labels are worth at equal CPU seconds: `submit --select` against random and new scenes.
+r"""What selected labels are worth at equal CPU seconds: `submit --select` against random and new scenes.
 
     datagen submit plan --n 100000 --candidates in-range --candidates-per-scene 30 ... --out TRAIN
     datagen submit heuristic --robot panda-scaled --candidates in-range ... --out POOL
     datagen submit plan --candidates-from POOL --n 1050 ... --out SELECTED
-    python -m benchmarks.selection TRAIN --selected SELECTED --val VAL --test TEST --out FOLDER
+    python -m benchmarks.selection TRAIN --selected SELECTED --val VAL --test TEST --out FOLDER \
+        --houses procthor:DIR --objects ycb:DIR
 
 TRAIN plays a pool of candidates of which any label can be bought. For each seed, a model is trained on
 --first labelled scenes, and each way buys labels for --budget CPU seconds:
@@ -15,9 +16,9 @@ TRAIN plays a pool of candidates of which any label can be bought. For each seed
 - new scenes: scenes that are made for it, with all their candidates, as `datagen frontier` advises
 
 Seconds of a purchase are those of making its scenes, new or again, and of planning its candidates, by
-outcome: fitted to the ledgers of TRAIN and SELECTED. A model is then trained on the first and the bought
-labels, with as many labels shown and as many steps for every way, and judged on TEST. Intervals are over
-seeds and scenes; differences are paired by seed. Trainings are kept in FOLDER and not made again.
+outcome (`selection_costs.py`). A model is then trained on the first and the bought labels, with as many
+labels shown and as many steps for every way, and judged on TEST. Intervals are over seeds and scenes;
+differences are paired by seed. Trainings are kept in FOLDER and not made again.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from benchmarks.selection_costs import Costs, fitted_costs, kinds_of, scoring_s
+from benchmarks.selection_costs import Costs, kinds_of, measured_costs
 from datagen.estimation.mixed_labels import read_whole_scenes
 from datagen.estimation.two_stage_sampling import all_alike, draw_sample
 from datagen.estimation.unsureness import By, design_by, unsureness
@@ -97,7 +98,10 @@ def main() -> None:
             stream = encoded_stream([vars(given)[name]], False)
             runs[name] = encode_runs(stream, model, out / "encodings", seen)
     train = Run.open(given.train)
-    costs = fitted_costs(train, Run.open(given.selected), scoring_s(model, given.train))
+    sources = given.houses, given.objects
+    costs = measured_costs(
+        train, Run.open(given.selected), *sources, given.timed, model, out / "selection-costs.json"
+    )
     data = Data(runs["train"], *_kinds_and_cheap(train, runs["train"]), runs["val"], runs["test"], costs)
     asked = {"train": runs["train"].key} | {name: vars(given)[name] for name in _DECISIVE}
     kept = out / f"selection-{digest_of(asked)[:12]}"
@@ -115,14 +119,15 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("train", metavar="TRAIN", help="run of plan, all of whose candidates are labelled")
-    for name in ("--selected", "--val", "--test", "--out"):
+    for name in ("--selected", "--val", "--test", "--houses", "--objects", "--out"):
         parser.add_argument(name, required=True)
     parser.add_argument("--first", type=int, default=200, help="scenes of the first model [200]")
     parser.add_argument("--pool", type=int, default=1200, help="scenes of the pool [1200]")
     parser.add_argument("--per-scene", type=int, default=7, help="candidates selected in a scene [7]")
     parser.add_argument("--budget", type=float, default=300.0, help="CPU seconds of each way [300]")
-    parser.add_argument("--shown", type=int, default=150_000, help="labels shown in a training [150000]")
-    parser.add_argument("--steps", type=int, default=600, help="steps of a training [600]")
+    parser.add_argument("--shown", type=int, default=100_000, help="labels shown in a training [100000]")
+    parser.add_argument("--steps", type=int, default=400, help="steps of a training [400]")
+    parser.add_argument("--timed", type=int, default=40, help="scenes of TRAIN that are timed [40]")
     parser.add_argument("--seeds", type=int, default=5)
     return parser.parse_args()
 
