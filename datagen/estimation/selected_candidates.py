@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
 from datagen.configuration.specify import layout_of
 from datagen.configuration.stored_scenes import StoredScenes
 from datagen.schemas.errors import InputError
@@ -143,19 +141,16 @@ def _select(
     json: bool,
 ) -> Selection:
     # Imported here: making labels needs none of what reads and scores them.
-    from datagen.estimation.two_stage_sampling import Design, draw_sample, first_of, in_proportion
-    from datagen.estimation.unsureness import read_unsure
+    from datagen.estimation.two_stage_sampling import all_alike, draw_sample
+    from datagen.estimation.unsureness import design_by, read_unsure
 
     rng = generator(options.seed, Stream.SELECTION)
     size = stored.candidates_per_scene
     if by == "random":
-        design = Design(np.full(available, scenes / available), np.full((available, size), per_scene / size))
+        design = all_alike(available, size, scenes, per_scene)
     else:
         unsure = read_unsure(stored.run, available, by, methods, json)
-        if by == "uncertain":
-            design = in_proportion(unsure, scenes, per_scene)
-        else:
-            design = first_of(unsure, scenes, per_scene, rng)
+        design = design_by(by, unsure, scenes, per_scene, rng)
     share = 1.0 if by == "random" else options.random_share
     sample = draw_sample(design, scenes, per_scene, share, rng)
     return Selection(

@@ -31,6 +31,11 @@ class Design:
     candidate: F64
 
 
+def all_alike(scenes: int, size: int, n_scenes: int, per_scene: int) -> Design:
+    """Equal probabilities for M scenes and for the K candidates in each."""
+    return Design(np.full(scenes, n_scenes / scenes), np.full((scenes, size), per_scene / size))
+
+
 def first_of(score: F64, n_scenes: int, per_scene: int, rng: np.random.Generator) -> Design:
     """The k candidates of highest score (M, K) in each scene, in the S scenes where their mean is highest.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from datagen.estimation.mixed_labels import read_whole_scenes
 from datagen.estimation.picks import score_candidates
+from datagen.estimation.two_stage_sampling import Design, first_of, in_proportion
 from datagen.evaluation_report.methods import EvaluatedMethod
 from datagen.schemas.errors import InputError
 from datagen.schemas.run import Run
@@ -31,6 +32,13 @@ def unsureness(by: By, chance: F64, threshold: float, label: F64) -> F64:
             return -p * np.log2(p) - (1 - p) * np.log2(1 - p)
         case "disagree":
             return ((chance >= threshold) != (label == 1)).astype(np.float64)
+
+
+def design_by(by: By, unsure: F64, n_scenes: int, per_scene: int, rng: np.random.Generator) -> Design:
+    """The design of a selection from the unsureness (M, K) of all candidates; `rng` breaks ties."""
+    if by == "uncertain":
+        return in_proportion(unsure, n_scenes, per_scene)
+    return first_of(unsure, n_scenes, per_scene, rng)
 
 
 def read_unsure(

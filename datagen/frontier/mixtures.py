@@ -13,9 +13,10 @@ FIDELITY = ("heuristic", "plan", "sim")
 CHEAP = "heuristic"
 # Small and fast: half the width of `datagen train`'s default, and half the tokens.
 MODEL_CONFIG = {"width": 32, "embedding": 64, "tokens": (8, 16, 16)}
-# Epochs show this number of labels in all, within bounds. Without that a small set would have few steps, and
-# the curve would measure steps.
-_LABELS_SHOWN, _LEAST_EPOCHS, _MOST_EPOCHS = 200_000, 3, 40
+# Epochs show this number of labels in all, within bounds: a small set would have few steps otherwise, a large
+# one few epochs, and the curve would measure these. 100,020 plan labels gave 1.1 points of balanced accuracy
+# more in 6 epochs than in 3.
+_LABELS_SHOWN, _LEAST_EPOCHS, _MOST_EPOCHS = 200_000, 6, 40
 
 
 @dataclass(frozen=True)

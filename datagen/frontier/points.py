@@ -10,7 +10,13 @@ import numpy as np
 from datagen.frontier.cost_per_label import LabelCost
 from datagen.frontier.mixtures import Mixture
 from datagen.frontier.trainings import TrainingResult
-from datagen.train.evaluation.bootstrap import Estimate, resample_weights, resampled_area_under_roc, summed
+from datagen.train.evaluation.bootstrap import (
+    Estimate,
+    Weights,
+    resample_weights,
+    resampled_area_under_roc,
+    summed,
+)
 from datagen.train.evaluation.metrics import area_under_roc, balanced_accuracy, confusion
 from datagen.train.inputs import F32, F64, I64, Bools
 
@@ -58,8 +64,7 @@ def points_of(
 ) -> list[Point]:
     """A point for each mixture, from its results of several seeds.
 
-    Scenes are resampled with replacement, together for all; seeds for each mixture. Resampled means of n
-    seeds vary by a factor sqrt((n - 1) / n) too little, which is put right. One seed has no variance.
+    Scenes are resampled with replacement, together for all; seeds for each mixture.
     """
     rng = np.random.default_rng([seed, test.n_scenes])
     weights = resample_weights(test.n_scenes, n_resamples, rng)
@@ -69,13 +74,8 @@ def points_of(
         drawn = rng.integers(0, n, (n_resamples, n))
         values: dict[str, Estimate] = {}
         for metric in METRICS:
-            found = [_value(metric, test, result.scores, weights) for result in of_seeds]
-            whole = float(np.mean([value for value, _ in found]))
-            resampled = np.stack([values for _, values in found], axis=1)  # (B, n)
-            mean = resampled.mean(axis=1)
-            spread = np.take_along_axis(resampled, drawn, axis=1).mean(axis=1) - mean
-            wider = np.sqrt(n / (n - 1)) if n > 1 else 0.0
-            values[metric] = Estimate(whole, mean + wider * spread)
+            found = [measured(metric, test, result.scores, weights) for result in of_seeds]
+            values[metric] = mean_over_seeds(found, drawn)
         names = {name for result in of_seeds for name in result.labels}
         labels = {name: float(np.mean([r.labels.get(name, 0) for r in of_seeds])) for name in sorted(names)}
         points.append(
@@ -92,14 +92,30 @@ def points_of(
     return points
 
 
-def _value(metric: str, test: TestSet, scores: F32, weights: np.ndarray) -> tuple[float, F64]:
+def measured(metric: str, test: TestSet, scores: F32, weights: Weights) -> Estimate:
+    """One of METRICS from scores (T,); `weights` (B, S) count the scenes of each resample."""
     score = scores.astype(np.float64)
     if metric == "area_under_roc":
-        return area_under_roc(test.label, score), resampled_area_under_roc(
-            weights, test.label, score, test.scene
+        return Estimate(
+            area_under_roc(test.label, score),
+            resampled_area_under_roc(weights, test.label, score, test.scene),
         )
     counts = confusion((score >= _THRESHOLD).astype(np.float64), test.label, test.scene, test.n_scenes)
-    return float(balanced_accuracy(counts.sum(axis=0))), balanced_accuracy(summed(weights, counts))
+    return Estimate(float(balanced_accuracy(counts.sum(axis=0))), balanced_accuracy(summed(weights, counts)))
+
+
+def mean_over_seeds(found: Sequence[Estimate], drawn: I64) -> Estimate:
+    """The mean of n seeds; `drawn` (B, n) are the seeds of each resample.
+
+    Resampled means of n seeds vary by a factor sqrt((n - 1) / n) too little, which is put right. One seed has
+    no variance.
+    """
+    n = len(found)
+    resampled = np.stack([estimate.resamples for estimate in found], axis=1)  # (B, n)
+    mean = resampled.mean(axis=1)
+    spread = np.take_along_axis(resampled, drawn, axis=1).mean(axis=1) - mean
+    wider = np.sqrt(n / (n - 1)) if n > 1 else 0.0
+    return Estimate(float(np.mean([estimate.value for estimate in found])), mean + wider * spread)
 
 
 def efficient(points: Sequence[Point], metric: str) -> list[bool]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from datagen.train.encoded.batches import EncodedBatches
 from datagen.train.encoded.runs import EncodedRuns
-from datagen.train.inputs import F32
+from datagen.train.inputs import F32, I64
 from datagen.train.models import Model, build_model
 from datagen.train.tensors import to_torch
 from datagen.train.training.checkpoints import EpochRecord, put_weights
@@ -72,9 +72,10 @@ def _class_weights(train: EncodedBatches, weighted: bool) -> Tensor:
     return torch.from_numpy(weights.astype(np.float32))
 
 
-def scores_of(model: Model, encoded: EncodedRuns) -> F32:
-    """Probabilities (N,) of label 1 of all candidates, in their order."""
-    batches = EncodedBatches(encoded, np.arange(len(encoded.houses)), _SCENES_PER_BATCH)
+def scores_of(model: Model, encoded: EncodedRuns, scenes: I64 | None = None) -> F32:
+    """Probabilities (N,) of label 1 of the candidates of these scenes [all], in their order."""
+    chosen = np.arange(len(encoded.houses)) if scenes is None else scenes
+    batches = EncodedBatches(encoded, chosen, _SCENES_PER_BATCH)
     found: list[Any] = []
     with torch.inference_mode():
         for batch in batches.epoch(0):

@@ -45,7 +45,7 @@ def test_options_are_those_of_the_stage_with_fewer_epochs_for_more_labels():
         "sim-only",
         "stage2",
     ]
-    assert [options_of(alone, n, 0, 16).epochs for n in (1000, 20_000, 10**6)] == [40, 10, 3]
+    assert [options_of(alone, n, 0, 16).epochs for n in (1000, 20_000, 10**6)] == [40, 10, 6]
 
 
 def test_points_have_the_mean_of_the_seeds_and_intervals_over_seeds_and_scenes():

@@ -47,6 +47,9 @@ def test_a_model_scores_encoded_candidates_as_it_scores_clouds(heuristic_run: Pa
     plain = np.concatenate([ModelScorer(model, "model").score(batch) for batch in batches])
     np.testing.assert_allclose(scores_of(model, data), plain, atol=2e-3)  # tokens have half precision
     assert np.ptp(plain) > 0.01
+    some = np.array([1, 4, 2])
+    chosen = np.concatenate([np.flatnonzero(data.scene_of_candidate == scene) for scene in some])
+    np.testing.assert_allclose(scores_of(model, data, some), scores_of(model, data)[chosen], atol=1e-5)
     np.testing.assert_array_equal(data.label, np.concatenate([batch.label for batch in batches]))
     within = [
         (batch.extra["base_is_clear"] == 1)
