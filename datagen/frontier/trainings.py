@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from datagen.train.encoded.runs import EncodedRuns
 
 # Raise it when the same inputs and options would give another model.
-_VERSION = 1
+_VERSION = 2
 _BATCH_SCENES = 8
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
