@@ -10,7 +10,7 @@ from datagen.train.inputs import Batch
 from datagen.train.run_parts import RunPart
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor, dtype
 
 RATE_FIELDS = ("trials", "successes")
 
@@ -33,12 +33,21 @@ def label_losses(logits: Tensor, batch: Batch[Tensor]) -> Tensor:
     The latter is the negative log-likelihood of a binomial number of successes, without its constant, for
     each trial. A candidate without a trial keeps its label.
     """
-    import torch
     from torch.nn import functional
 
     if "trials" not in batch.extra:
         return functional.cross_entropy(logits, batch.label, reduction="none")
-    trials, successes = (batch.extra[name].to(logits.dtype) for name in RATE_FIELDS)
-    rate = torch.where(trials > 0, successes / trials.clamp(min=1), batch.label.to(logits.dtype))
+    rate = success_shares(batch, logits.dtype)
     log_p = functional.log_softmax(logits, dim=1)
     return -(rate * log_p[:, 1] + (1 - rate) * log_p[:, 0])
+
+
+def success_shares(batch: Batch[Tensor], kind: dtype) -> Tensor:
+    """Shares (N,) of successful trials; the label where there was none."""
+    import torch
+
+    label = batch.label.to(kind)
+    if "trials" not in batch.extra:
+        return label
+    trials, successes = (batch.extra[name].to(kind) for name in RATE_FIELDS)
+    return torch.where(trials > 0, successes / trials.clamp(min=1), label)

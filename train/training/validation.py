@@ -12,13 +12,13 @@ from typing_extensions import TypedDict  # pydantic reads typing's from Python 3
 
 from datagen.schemas.errors import InputError
 from datagen.train.evaluation.metrics import accuracy, area_under_roc, balanced_accuracy, confusion
-from datagen.train.inputs import Array, Batch
+from datagen.train.inputs import F64, Array, Batch
 from datagen.train.models import Model
-from datagen.train.rates import label_losses
+from datagen.train.rates import label_losses, success_shares
 from datagen.train.tensors import to_torch
 from datagen.train.training.launching import Ranks
 
-# Of which `validate` finds the best; 1 is among them.
+# Of which the best is found; 1 is among them.
 _TEMPERATURES = 1.02 ** np.arange(-35, 71)
 
 
@@ -49,16 +49,16 @@ def validate(
             given = to_torch(batch, model.device)
             logits = model.score(given.clouds, given.candidates, given.robots).double()
             log_p = torch.log_softmax(logits, dim=1)
-            losses = [label_losses(logits, given)]
-            losses += [label_losses(logits / temperature, given) for temperature in _TEMPERATURES]
-            rows = torch.stack([given.label.double(), log_p[:, 1].exp(), *losses], dim=1)
+            loss = label_losses(logits, given)
+            share, odds = success_shares(given, logits.dtype), logits[:, 1] - logits[:, 0]
+            rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss, share, odds], dim=1)
             ids.append(batch.sample_id)
             columns.append(rows.cpu().numpy())
     model.train()
     everyone = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
     # Several ranks may have judged the same sample.
     _, first = np.unique(np.concatenate([i for i, _ in everyone]), axis=0, return_index=True)
-    label, p, loss, *tempered = np.concatenate([c for _, c in everyone])[np.sort(first)].T
+    label, p, loss, share, odds = np.concatenate([c for _, c in everyone])[np.sort(first)].T
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
     mean_loss = float(np.average(loss, weights=weight))
     if not np.isfinite(mean_loss):
@@ -71,5 +71,12 @@ def validate(
         "val_accuracy": float(accuracy(counts)),
         "val_balanced_accuracy": balanced if np.isfinite(balanced) else None,
         "val_auc": auc if np.isfinite(auc) else None,
-        "val_temperature": float(_TEMPERATURES[np.argmin(np.average(tempered, axis=1, weights=weight))]),
+        "val_temperature": _best_temperature(odds, share, weight),
     }
+
+
+def _best_temperature(odds: F64, share: F64, weight: F64) -> float:
+    """Of logarithms of odds (N,) that samples with shares (N,) of successes have."""
+    cooled = odds / _TEMPERATURES[:, None]
+    losses = np.logaddexp(0, cooled) - share * cooled
+    return float(_TEMPERATURES[np.average(losses, axis=1, weights=weight).argmin()])
