@@ -8,7 +8,7 @@ from tests.faults.driver_pair import drive_in_pairs
 
 def test_every_shard_has_one_winner_and_the_losers_work_is_waste_in_the_ledger() -> None:
     with memory_folder() as folder:
-        told = drive_in_pairs(folder, shards=20, seconds=0.02, workers=2, stubborn=True)
+        told = drive_in_pairs(folder, shards=40, seconds=0.02, workers=2, stubborn=True)
     assert told["ended superseded"] >= 5 and told["drivers that won shards"] >= 1
 
 
