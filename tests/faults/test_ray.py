@@ -172,10 +172,7 @@ def test_a_forced_stop_ends_hung_workers_and_frees_their_slots(ray: Any, tmp_pat
 
     words = dict.fromkeys(range(6), ("hang_with_lock",))
     played = play(ray, tmp_path, words, shards=6, on_tick=stop_when_running)
-    outcomes = played.summary.totals.outcomes
-    assert played.summary.end == "interrupted" and outcomes["cancelled"] == 4
-    # Seen once: Ray gave an attempt to a worker that the test before had killed, and it was tried again.
-    assert set(outcomes) <= {"cancelled", "crashed"}
+    assert played.summary.end == "interrupted" and played.summary.totals.outcomes == {"cancelled": 4}
     (tmp_path / "after").mkdir()
     assert play(ray, tmp_path / "after", {}, shards=6).summary.totals.committed == 6
 
