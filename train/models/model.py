@@ -50,7 +50,7 @@ class Model(nn.Module, ABC):
 
     @property
     def logit_layer(self) -> nn.Module | None:
-        """The layer whose outputs are the logits; None where they are no layer's."""
+        """The linear layer whose outputs are the logits; None for a model that computes them otherwise."""
         return None
 
     def tempered(self, temperature: float) -> dict[str, Tensor]:

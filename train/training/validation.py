@@ -50,15 +50,15 @@ def validate(
             logits = model.score(given.clouds, given.candidates, given.robots).double()
             log_p = torch.log_softmax(logits, dim=1)
             loss = label_losses(logits, given)
-            share, odds = success_shares(given, logits.dtype), logits[:, 1] - logits[:, 0]
-            rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss, share, odds], dim=1)
+            share, log_odds = success_shares(given, logits.dtype), logits[:, 1] - logits[:, 0]
+            rows = torch.stack([given.label.double(), log_p[:, 1].exp(), loss, share, log_odds], dim=1)
             ids.append(batch.sample_id)
             columns.append(rows.cpu().numpy())
     model.train()
     everyone = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
     # Several ranks may have judged the same sample.
     _, first = np.unique(np.concatenate([i for i, _ in everyone]), axis=0, return_index=True)
-    label, p, loss, share, odds = np.concatenate([c for _, c in everyone])[np.sort(first)].T
+    label, p, loss, share, log_odds = np.concatenate([c for _, c in everyone])[np.sort(first)].T
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
     mean_loss = float(np.average(loss, weights=weight))
     if not np.isfinite(mean_loss):
@@ -71,12 +71,12 @@ def validate(
         "val_accuracy": float(accuracy(counts)),
         "val_balanced_accuracy": balanced if np.isfinite(balanced) else None,
         "val_auc": auc if np.isfinite(auc) else None,
-        "val_temperature": _best_temperature(odds, share, weight),
+        "val_temperature": _best_temperature(log_odds, share, weight),
     }
 
 
-def _best_temperature(odds: F64, share: F64, weight: F64) -> float:
-    """Of logarithms of odds (N,) that samples with shares (N,) of successes have."""
-    cooled = odds / _TEMPERATURES[:, None]
+def _best_temperature(log_odds: F64, share: F64, weight: F64) -> float:
+    """The temperature with the least mean loss over samples with log-odds and shares of successes, (N,) each."""
+    cooled = log_odds / _TEMPERATURES[:, None]
     losses = np.logaddexp(0, cooled) - share * cooled
     return float(_TEMPERATURES[np.average(losses, axis=1, weights=weight).argmin()])
