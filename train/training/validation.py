@@ -76,7 +76,7 @@ def validate(
 
 
 def _best_temperature(log_odds: F64, share: F64, weight: F64) -> float:
-    """The temperature with the least mean loss over samples with log-odds and shares of successes, (N,) each."""
+    """The one with the least mean loss over samples with log-odds and shares of successes, (N,) each."""
     cooled = log_odds / _TEMPERATURES[:, None]
     losses = np.logaddexp(0, cooled) - share * cooled
     return float(_TEMPERATURES[np.average(losses, axis=1, weights=weight).argmin()])
