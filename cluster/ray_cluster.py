@@ -71,7 +71,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
             wanted, options = head_environment("") | token_for(address), {}
         start.enter_context(changed_environment(wanted))  # workers inherit it; the caller's is restored
         import ray
-        from ray.exceptions import AuthenticationError
+        from ray.exceptions import AuthenticationError, RaySystemError
 
         _keep_ray_local()
         forget_former_token()
@@ -84,7 +84,7 @@ def ray_cluster(settings: RaySettings) -> Generator[Any]:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except InputError:
             raise
-        except (OSError, RuntimeError, ValueError, AuthenticationError) as error:
+        except (OSError, RuntimeError, ValueError, AuthenticationError, RaySystemError) as error:
             raise _refusal(settings.address, error) from error
         start.close()
         # Ray prints a paragraph for each dead worker; the driver reports it already.

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from datagen.cluster.cluster_folders import OWNER, RAY, private_folder
+from datagen.cluster.cluster_folders import OWNER, RAY, is_alive, private_folder
 from tests.other_user import NOBODY, as_another_user, needs_root
 
 # Owns a folder with a process in it, says both, and waits to be killed.
@@ -29,14 +29,14 @@ with private_folder() as folder:
 
 
 @pytest.fixture
-def owner() -> Iterator[tuple[subprocess.Popen[str], Path, int]]:
+def owner() -> Iterator[tuple[subprocess.Popen[str], Path, psutil.Process]]:
     process = subprocess.Popen(
         [sys.executable, "-c", OWNER_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         cwd=Path(__file__).resolve().parents[2],
     )  # fmt: skip
     assert process.stdout is not None
     folder, child = process.stdout.readline().split()
-    yield process, Path(folder), int(child)
+    yield process, Path(folder), psutil.Process(int(child))
     process.kill()
     process.wait()
     with private_folder():
@@ -44,26 +44,26 @@ def owner() -> Iterator[tuple[subprocess.Popen[str], Path, int]]:
 
 
 def test_a_folder_is_closed_and_goes_with_its_processes(
-    owner: tuple[subprocess.Popen[str], Path, int],
+    owner: tuple[subprocess.Popen[str], Path, psutil.Process],
 ) -> None:
     process, folder, child = owner
     assert folder.stat().st_mode & 0o777 == 0o700 and (folder / RAY).is_dir()
     process.communicate()  # ends its input
-    assert process.returncode == 0 and not folder.exists() and not psutil.pid_exists(child)
+    assert process.returncode == 0 and not folder.exists() and not is_alive(child)
 
 
 def test_the_next_program_removes_what_a_killed_one_left_and_nothing_of_a_living_one(
-    owner: tuple[subprocess.Popen[str], Path, int],
+    owner: tuple[subprocess.Popen[str], Path, psutil.Process],
 ) -> None:
     process, folder, child = owner
     process.send_signal(signal.SIGSTOP)  # silent, but alive
     with private_folder():
-        assert folder.exists() and psutil.pid_exists(child)
+        assert folder.exists() and is_alive(child)
     process.kill()
     process.wait()
-    assert folder.exists() and psutil.pid_exists(child)
+    assert folder.exists() and is_alive(child)
     with private_folder() as own:
-        assert not folder.exists() and not psutil.pid_exists(child) and own.exists()
+        assert not folder.exists() and not is_alive(child) and own.exists()
 
 
 @needs_root

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from datagen.cluster import ray_cluster as ray_cluster_module
-from datagen.cluster.cluster_folders import private_folder
+from datagen.cluster.cluster_folders import is_alive, private_folder
 from datagen.cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
 from datagen.schemas.errors import InputError
@@ -150,13 +150,6 @@ with ray_cluster(RaySettings(workers=1)) as ray:
     assert folder.exists()
     with private_folder():  # as the next cluster begins
         assert not folder.exists() and not [p for p in its if is_alive(p)]
-
-
-def is_alive(process: psutil.Process) -> bool:
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 def test_a_cluster_that_does_not_start_is_one_line_and_leaves_nothing(
