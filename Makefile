@@ -8,7 +8,7 @@ BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
 DEMO := build/demo
 
-.PHONY: help demo paper-small paper model test faults lint style types format docs site venv venv-labels clean
+.PHONY: help demo paper-small paper model test slow faults lint style types format docs site venv venv-labels clean
 .DEFAULT_GOAL := help
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"
+	@echo "make slow    the tests that make test leaves out: kills, dying clusters, a failing store"
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
@@ -60,13 +61,17 @@ model: venv
 # Runs are made durable file by file, which a shared disk takes ten times as long for as memory does. What
 # failed stays there to be looked at. A test worker has one core: more threads would only wait for each other.
 # Types are checked beside the tests: the checker has one thread and takes as long as a tenth of them.
+SCRATCH := scratch=$$(mktemp -d -p /dev/shm 2>/dev/null || mktemp -d)
+TESTS := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal
 test: style
-	@scratch=$$(mktemp -d -p /dev/shm 2>/dev/null || mktemp -d); \
-	$(TYPES) > $$scratch/types 2>&1 & types=$$!; \
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal --basetemp=$$scratch/tests; tests=$$?; \
+	@$(SCRATCH); $(TYPES) > $$scratch/types 2>&1 & types=$$!; \
+	$(TESTS) --basetemp=$$scratch/tests; tests=$$?; \
 	wait $$types; types=$$?; cat $$scratch/types; \
 	[ $$tests -eq 0 ] && [ $$types -eq 0 ] && rm -rf $$scratch
+
+# What `make test` leaves out, for its time. CI runs both.
+slow: venv
+	@$(SCRATCH); $(TESTS) -m slow --basetemp=$$scratch/tests && rm -rf $$scratch
 
 # Each ends with an error where a promise was broken.
 FAULTS := crash_points damage kills executors two_drivers s3 confinement listing swaps storage_errors \

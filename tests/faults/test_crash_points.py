@@ -16,6 +16,8 @@ from tests.faults.crash_points_campaign import run_campaign, start
 from tests.faults.crash_points_operations import OPERATIONS
 from tests.faults.crash_points_shim import Call, build, read_log
 
+pytestmark = pytest.mark.slow
+
 SAMPLE = 0  # of each kind of end only the first and the last call
 # Calls that leave files as they are. Any other one that touches a run must be known to the shim.
 READING = {

@@ -18,6 +18,8 @@ from datagen.cluster.stop_request import StopRequest
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import FILL_BYTES, ScriptedTask, perform
 
+pytestmark = pytest.mark.slow
+
 
 def test_who_fills_the_memory_is_ended_and_tried_once_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

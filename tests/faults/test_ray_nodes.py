@@ -28,6 +28,8 @@ from tests.faults.scripted import ScriptedTask, perform
 from tests.made_runs import check_digests, make_run
 from tests.small_runs import make_small_run
 
+pytestmark = pytest.mark.slow
+
 POLICY = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 
 

@@ -22,6 +22,8 @@ from datagen.cluster.ray_settings import OBJECT_STORE_BYTES, free_port, new_toke
 from datagen.schemas.errors import InputError
 from tests.made_runs import check_digests, make_run
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 SHARDS = 12
 

@@ -20,6 +20,8 @@ from tests.faults.server_campaign import check_bytes_and_ledger, kill_servers
 from tests.faults.test_ray_processes import REPOSITORY, kill_machine, ray_start
 from tests.made_runs import make_run
 
+pytestmark = pytest.mark.slow
+
 # Two slots that take a second a shard are at work for longer than a server may be silent.
 SHARDS, PATIENCE_S = 24, "3"
 

@@ -9,6 +9,8 @@ import pytest
 from tests.faults.s3_campaign import campaign
 from tests.s3_servers import Faults, environment, faulty_proxy
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_job_on_a_failing_store_is_resumed_until_it_is_done(
     bucket: str, s3_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
