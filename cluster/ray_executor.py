@@ -233,9 +233,11 @@ class RayExecutor(Generic[T]):
         has_others = bool(deaths) and bool(self.others.alive())
         for death in deaths:
             here = collect_post_mortem(death.task.notes, death.task.attempt)
-            is_elsewhere = here.note is None and death.outcome != "lost" and bool(death.task.notes)
-            if has_others and is_elsewhere:
+            has_no_note = here.note is None and death.outcome != "lost" and bool(death.task.notes)
+            if has_others and has_no_note:
                 unknown[death.task.notes].append(death)
+            elif has_no_note and death.outcome == "crashed":  # of a worker that Ray gave out as it ended
+                reports.append(failure_report(death.task, "lost", "its worker died before it began", here))
             else:
                 reports.append(failure_report(death.task, death.outcome, death.cause, here))
         for notes, found in unknown.items():
