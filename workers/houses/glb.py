@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import trimesh
 from PIL import Image
 
 from datagen.schemas.errors import InputError
@@ -37,6 +36,9 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
+    # Imported here: robots read their own meshes with this, once.
+    import trimesh
+
     data = read_regular(path, MAX_FILE_BYTES, _FIX)
     _check_header(path, data)
     try:

@@ -7,9 +7,9 @@ from collections import defaultdict
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
-from trimesh.graph import connected_component_labels
 
 from datagen.workers.furniture.support_tops import Rectangle
+from datagen.workers.geometry.components import vertex_components
 from datagen.workers.geometry.mesh import F32, F64, Mesh
 
 MAX_PARTS = 32
@@ -29,7 +29,7 @@ def normals_and_areas(mesh: Mesh) -> tuple[F64, F64]:
 
 def face_components(faces: npt.NDArray[np.int32], vertex_count: int) -> npt.NDArray[np.int32]:
     """The connected component of each face (F,), by shared vertices."""
-    labels = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), vertex_count)
+    labels = vertex_components(faces, vertex_count)
     return np.unique(labels[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import read_regular
+from datagen.workers.geometry.components import vertex_components
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
@@ -84,6 +84,9 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
+    # Imported here: it takes as long as the rest of a short command, and few objects are PLY files.
+    import trimesh
+
     data = read_regular(path, MAX_FILE_BYTES, "Give a PLY file of a simplified mesh")
     try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
@@ -102,8 +105,7 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
 
 
 def _components(faces: npt.NDArray[np.int64], n_vertices: int) -> list[npt.NDArray[np.int64]]:
-    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    of_face = trimesh.graph.connected_component_labels(edges, n_vertices)[faces[:, 0]]
+    of_face = vertex_components(faces, n_vertices)[faces[:, 0]]
     order = np.argsort(of_face, kind="stable")
     cuts = np.flatnonzero(np.diff(of_face[order])) + 1
     # In order of first appearance in the file, as groups are.

@@ -14,7 +14,6 @@ from typing import Any
 import coal
 import numpy as np
 import numpy.typing as npt
-import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.schemas.errors import InputError
@@ -65,6 +64,9 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
+    # Imported here: collision bodies of objects need none of it.
+    import trimesh
+
     data = read_regular(path, _MAX_BYTES, _FIX)
     try:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix, process=False)
