@@ -18,6 +18,7 @@ from tests.small_runs import CONFIG, json_of, make_small_run
 from tests.train.conftest import ARM, heuristic_run
 
 __all__ = ["heuristic_run"]
+PLANS, JUDGED = 36, 24  # labels to train on, and of the test
 SHARES = ("--shares", "0.5", "--shares", "1")
 
 
@@ -34,7 +35,7 @@ def make_runs(folder: Path) -> None:
     make_small_run(folder / "heuristic", 96, "--split", "train", per_scene=16)
     file = folder / "plan.toml"
     file.write_text(CONFIG + ARM)
-    for split, n in (("train", 60), ("val", 30), ("test", 36)):
+    for split, n in (("train", PLANS), ("val", 18), ("test", JUDGED)):
         words = ["submit", "plan", "--n", str(n), "--out", str(folder / split), "--split", split]
         more = ["--candidates", "in-range", "--candidates-per-scene", "6", "--workers", "0"]
         assert cli.run([*words, *more, "--config", str(file)]) == 0
@@ -56,11 +57,15 @@ def test_a_frontier_of_real_runs_resumes_and_says_what_to_buy(
     assert names == ["heuristic"] * 2 + ["plan"] * 2 + ["heuristic, plan"] * 2 + ["50% heuristic, plan"] * 2
     assert len(made) == 8
     last = first["points"][5]
-    assert last["labels"] == {"heuristic": 96, "plan": 60}
+    assert last["labels"] == {"heuristic": 96, "plan": PLANS}
     costs = first["label_costs"]
-    spent_s = 96 * costs["heuristic"]["cpu_s"] + 60 * costs["plan"]["cpu_s"]
+    spent_s = 96 * costs["heuristic"]["cpu_s"] + PLANS * costs["plan"]["cpu_s"]
     assert last["label_cpu_h"] == pytest.approx(spent_s / 3600)
-    assert first["test_set"] == {"candidates": 36, "scenes": 6, "positives": first["test_set"]["positives"]}
+    assert first["test_set"] == {
+        "candidates": JUDGED,
+        "scenes": JUDGED // 6,
+        "positives": first["test_set"]["positives"],
+    }
     assert {gain["source"] for gain in first["stage1"]} == {"plan"} and len(first["stage1"]) == 2
     assert sum(first["advice"]["wins"].values()) == pytest.approx(1)
     assert json.loads((out / "frontier.json").read_text()) == first
@@ -98,7 +103,7 @@ def test_one_source_and_a_target_need_no_heuristic_labels(
     arguments = ["frontier", str(runs / "train"), "--val", str(runs / "val"), "--test", str(runs / "test")]
     more = ["--shares", "0.3", *SHARES, "--seeds", "1", "--bootstrap", "10", "--target-accuracy", "0.99"]
     report = json_of(capfd, [*arguments, "--out", str(tmp_path / "out"), "--workers", "1", *more])
-    assert [point["labels"] for point in report["points"]][-1] == {"plan": 60}
+    assert [point["labels"] for point in report["points"]][-1] == {"plan": PLANS}
     assert report["stage1"] == [] and report["stage1_worth"] is None
     assert report["target"]["accuracy"] == 0.99 and len(report["sentences"]) == 2
 

@@ -21,6 +21,7 @@ n_clutter = 2
 arm_reach_m = {low = 0.6, high = 1.0}
 
 [arm.grasps]
+per_object = 40
 per_scene = 8
 """
 

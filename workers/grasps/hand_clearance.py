@@ -34,8 +34,8 @@ class HandClearance:
         left, right = gripper.finger_parts_m
         self._hand = [
             (coal.CollisionObject(polyhedron(swept(part))), side)
-            # Fingers first: they are the ones that touch.
-            for parts, side in ((left, 0.5), (right, -0.5), (gripper.palm_parts_m, 0.0))
+            # The palm first: on its way in it is the part that touches most often.
+            for parts, side in ((gripper.palm_parts_m, 0.0), (left, 0.5), (right, -0.5))
             for part in parts
         ]
 

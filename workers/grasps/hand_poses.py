@@ -65,12 +65,13 @@ def varied(T_object_tcp: F64, n: int) -> npt.NDArray[np.int64]:
     """
     if len(T_object_tcp) == 0 or n < 1:
         return np.zeros(0, np.int64)
-    position, y, z = T_object_tcp[:, :3, 3], T_object_tcp[:, :3, 1], T_object_tcp[:, :3, 2]
-    gap = np.full(len(position), np.inf)
+    y, z = T_object_tcp[:, :3, 1], T_object_tcp[:, :3, 2]
+    position = np.ascontiguousarray(T_object_tcp[:, :3, 3].T)  # (3, N): sums over a long last axis are fast
+    gap = np.full(len(y), np.inf)
     rows = [0]
-    while len(rows) < min(n, len(position)):
+    while len(rows) < min(n, len(y)):
         k = rows[-1]
-        apart = np.linalg.norm(position - position[k], axis=1)
+        apart = np.sqrt(np.square(position - position[:, k : k + 1]).sum(axis=0))
         turned = np.arccos(np.clip(z @ z[k], -1, 1)) + np.arccos(np.clip(np.abs(y @ y[k]), 0, 1))
         gap = np.minimum(gap, apart + _METRES_PER_RAD * turned)
         gap[k] = -1.0

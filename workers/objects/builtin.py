@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,14 +23,13 @@ GENERATOR_VERSION = 1
 
 
 class BuiltinObjects:
-    """All recipes of `builtin_table`, built on first use; nothing is read from disk."""
+    """All recipes of `builtin_table`, each built once a process, on first use; nothing is read from disk."""
 
     kind = "builtin"
 
     def __init__(self) -> None:
         self.excluded: Mapping[str, str] = {}
         self._digests = {name: _digest(name) for name in sorted(RECIPES)}
-        self._models: dict[str, ObjectModel] = {}
         self.digest = digest_of(self._digests)
 
     def names(self) -> list[str]:
@@ -40,10 +40,7 @@ class BuiltinObjects:
         """The model; the same object at every call. Raises InputError for an unknown name."""
         if name not in self._digests:
             raise InputError("builtin objects", name, "does not exist", "See `names()` for all")
-        model = self._models.get(name)
-        if model is None:
-            model = self._models[name] = _model(name, self._digests[name])
-        return model
+        return _model(name)
 
 
 def open_builtin(argument: str) -> BuiltinObjects:
@@ -57,7 +54,8 @@ def _digest(name: str) -> str:
     return digest_of([GENERATOR_VERSION, name, PUBLISHED_MASS_KG[name], RECIPES[name]])
 
 
-def _model(name: str, digest: str) -> ObjectModel:
+@cache
+def _model(name: str) -> ObjectModel:
     solid = shapes.joined(*[_piece(piece) for piece in RECIPES[name]])
     vertices = solid.mesh.vertices_m.astype(np.float64)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -68,7 +66,7 @@ def _model(name: str, digest: str) -> ObjectModel:
     size = high - low
     return ObjectModel(
         name=name,
-        digest=digest,
+        digest=_digest(name),
         mass_kg=mass_kg,
         size_m=(float(size[0]), float(size[1]), float(size[2])),
         radius_m=float(np.linalg.norm(centred.astype(np.float64), axis=1).max()),

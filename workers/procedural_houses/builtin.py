@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from datagen.workers.procedural_houses.room_layout import layout_of
 GENERATOR_VERSION = 1
 _DEFAULT_COUNT = 400
 _MOST = 100_000
+_HOUSES_KEPT = 64
 # A first word of the seed of its own, so that no other use of small numbers draws the same stream.
 _SEED = 0x486F757365
 _FLOORS = ("OakWood", "DarkWoodParquet", "GreyConcrete", "BeigeTile", "WalnutWood", "Carpet")
@@ -48,14 +50,12 @@ class BuiltinHouses:
         return [_house_id(k) for k in range(self.count)]
 
     def load(self, house_id: str) -> House:
-        """Draw and build the house."""
+        """Draw and build the house; the last ones are kept for all that this process opens."""
         number = house_id.removeprefix("builtin-")
         if not number.isdecimal() or int(number) >= self.count or _house_id(int(number)) != house_id:
             fix = f"Give one of builtin-0000 to {_house_id(self.count - 1)}."
             raise InputError("builtin", "", f"has no house {house_id!r}", fix)
-        document = house_document(int(number))
-        digest = hash_bytes(canonical_json(document)).hex()
-        return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
+        return _house(int(number))
 
 
 def open_builtin(text: str) -> BuiltinHouses:
@@ -65,6 +65,13 @@ def open_builtin(text: str) -> BuiltinHouses:
     count = int(text) if text else _DEFAULT_COUNT
     sizes = {a.asset_id: [a.object_type, *a.size_m] for a in BUILTIN_ASSETS.values()}
     return BuiltinHouses(count, digest_of(["builtin-houses", GENERATOR_VERSION, count, sizes]))
+
+
+@lru_cache(maxsize=_HOUSES_KEPT)
+def _house(number: int) -> House:
+    document, house_id = house_document(number), _house_id(number)
+    digest = hash_bytes(canonical_json(document)).hex()
+    return build_house(JsonNode(f"builtin ({house_id})", "$", document), house_id, digest, BUILTIN_ASSETS)
 
 
 def house_document(number: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -59,14 +60,21 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     return rays
 
 
+_kept: WeakKeyDictionary[House | ObjectModel, RayMesh] = WeakKeyDictionary()
+
+
 def house_rays(house: House) -> RayMesh:
-    """One hierarchy over everything that stands in a house, world frame."""
-    return ray_mesh(concatenate([body.visual for body in house.bodies]))
+    """One hierarchy over everything that stands in a house, world frame; built once for each `house`."""
+    if house not in _kept:
+        _kept[house] = ray_mesh(concatenate([body.visual for body in house.bodies]))
+    return _kept[house]
 
 
 def object_rays(model: ObjectModel) -> RayMesh:
-    """The hierarchy of an object's visual mesh, object frame."""
-    return ray_mesh(model.visual)
+    """The hierarchy of an object's visual mesh, object frame; built once for each `model`."""
+    if model not in _kept:
+        _kept[model] = ray_mesh(model.visual)
+    return _kept[model]
 
 
 def nearest(rays: RayMesh, origins_m: F32, directions: F32) -> F32:
