@@ -30,7 +30,7 @@ ARM = """
 arm_reach_m = {low = 0.9, high = 1.0}
 robots_per_scene = 1
 [arm.grasps]
-per_object = 300
+per_object = 40
 per_scene = 10
 """
 

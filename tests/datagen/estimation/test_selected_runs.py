@@ -105,6 +105,7 @@ def test_selected_labels_are_read_trained_on_and_labelled_again(
     (batch,) = stream.epoch(0)
     assert len(batch) == N and batch.extra["selection_probability"].shape == (N,)
     words = ["submit", "sim", "--n", str(N), "--scenes-from", str(folder / "some"), "--workers", "0"]
+    words += ["--config", str(folder / "arm.toml")]
     assert cli.run([*words, "--out", str(folder / "tried")]) == 0
     assert cli.run(["verify", str(folder / "tried")]) == 0
     before, after = arrays_of(folder / "some"), arrays_of(folder / "tried")

@@ -149,7 +149,7 @@ def test_scenes_that_were_labelled_again_are_drawn_from_where_they_came(source: 
 def test_trials_are_planned_and_executed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm = "[candidates]\narm_reach_m = {low = 0.9, high = 1.0}\nrobots_per_scene = 1\n"
     source = make_small_run(tmp_path / "run", 6, "--candidates", "in-range", config=CONFIG + arm, per_scene=6)
-    (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 300\nper_scene = 10\n")
+    (tmp_path / "arm.toml").write_text("[arm.grasps]\nper_object = 40\nper_scene = 10\n")
     out = tmp_path / "sim"
     more = ["--scenes-from", str(source), "--config", str(tmp_path / "arm.toml"), "--workers", "0"]
     assert cli.run(["submit", "sim", "--n", "6", "--out", str(out), *more]) == 0
