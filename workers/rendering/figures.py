@@ -30,8 +30,9 @@ def new_sheet(title: str, height_in: float) -> Figure:
 def save_sheet(figure: Figure, out: Path | IO[bytes]) -> None:
     """Write the figure as a true-colour PNG, as small as it gets without loss."""
     with io.BytesIO() as drawn:
-        figure.savefig(drawn, format="png")
-        Image.open(drawn).convert("RGB").save(out, format="png", optimize=True)
+        figure.savefig(drawn, format="raw")
+        sheet = Image.frombuffer("RGBA", figure.canvas.get_width_height(), drawn.getvalue())
+        sheet.convert("RGB").save(out, format="png", optimize=True)
 
 
 def draw_frame(axes: Axes, rgb: Any, target: Any, title: str = "RGB frame, target outlined") -> None:
