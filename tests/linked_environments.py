@@ -45,14 +45,24 @@ def build_wheel(folder: Path) -> None:
 
 
 def install_wheel(wheel: Path, folder: Path) -> Path:
-    """site-packages of a fresh environment in the folder that holds the wheel and no library."""
+    """site-packages of a fresh environment in the folder that holds the wheel and no library.
+
+    pip installs the wheel once; each environment is a copy, whose program names its own interpreter.
+    """
+    first = once(wheel.parent / "installed", lambda: _install(wheel, wheel.parent / "installed"))
+    shutil.copytree(first, folder, symlinks=True)
+    program = folder / "bin" / "datagen"
+    program.write_text(program.read_text().replace(str(first), str(folder)))
+    (site,) = folder.glob("lib/python*/site-packages")
+    return site
+
+
+def _install(wheel: Path, folder: Path) -> None:
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     python = str(folder / "bin" / "python")
     options = ["-q", "--no-deps", "--no-index", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "--python", python, "install", *options, str(wheel)]
     subprocess.run(command, check=True)
-    (site,) = folder.glob("lib/python*/site-packages")
-    return site
 
 
 def link_libraries(site: Path, *extras: str) -> None:
@@ -61,25 +71,32 @@ def link_libraries(site: Path, *extras: str) -> None:
     names = list(_closure(DISTRIBUTION, extras, {}))
     if {"all", "sim"} & set(extras) and "mani-skill" not in names:
         names.append("mani-skill")  # where pip cannot, users install it by a command of its own
+    done: dict[str, bool] = {}
     for name in names:
         if name != DISTRIBUTION:
             for file in distribution(name).files or ():
-                _link(libraries, site, Path(file).parts)
+                if file.parts[0] != ".." and "__pycache__" not in file.parts:
+                    _link(libraries, site, file.parts, done)
 
 
-def _link(libraries: Path, site: Path, parts: tuple[str, ...]) -> None:
-    """Link a file by its outermost folder that one distribution has alone: not a namespace as `google`."""
-    if parts[0] == ".." or "__pycache__" in parts:
-        return
+def _link(libraries: Path, site: Path, parts: tuple[str, ...], done: dict[str, bool]) -> None:
+    """Link a file by its outermost folder that one distribution has alone: not a namespace as `google`.
+
+    `done` has what is there already, by path: whether it is a link, which has all that is below it.
+    """
     for depth in range(1, len(parts) + 1):
-        source, target = libraries.joinpath(*parts[:depth]), site.joinpath(*parts[:depth])
-        if target.is_symlink() or not source.exists():
+        path = "/".join(parts[:depth])
+        if path not in done:
+            source, target = libraries / path, site / path
+            if not source.exists():
+                return
+            shared = (
+                source.is_dir() and not (source / "__init__.py").exists() and source.suffix != ".dist-info"
+            )
+            target.mkdir() if shared else target.symlink_to(source)
+            done[path] = not shared
+        if done[path]:
             return
-        shared = source.is_dir() and not (source / "__init__.py").exists() and source.suffix != ".dist-info"
-        if not shared:
-            target.symlink_to(source)
-            return
-        target.mkdir(exist_ok=True)
 
 
 def _closure(name: str, extras: tuple[str, ...], seen: dict[str, set[str]]) -> Iterator[str]:

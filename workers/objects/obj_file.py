@@ -16,6 +16,7 @@ import numpy.typing as npt
 from datagen.schemas.errors import InputError
 from datagen.schemas.untrusted_files import open_regular
 from datagen.workers.geometry.mesh import F64
+from datagen.workers.objects.obj_runs import numbers_of, plain_run
 
 I64 = npt.NDArray[np.int64]
 
@@ -25,6 +26,7 @@ MAX_VERTICES = 4_000_000
 MAX_LINES = 16_000_000  # faces, vertices, and their texture coordinates and normals
 MAX_NAMES = 100_000  # of groups, or of materials
 MAX_LINE_BYTES = 2**20
+_BLOCK_BYTES = 2**16
 _INTEGER = re.compile(rb"-?\d+")
 _CORNERS = re.compile(rb"(?:0 )*0|(?:0/0 )*0/0|(?:0//0 )*0//0|(?:0/0/0 )*0/0/0")
 
@@ -48,16 +50,28 @@ class ObjMesh:
 def read_obj(path: Path) -> ObjMesh:
     """Reads vertices, texture coordinates, faces and groups; other statements are skipped.
 
-    Works line by line and stops at the first limit passed, so that memory stays near the size
+    Works block by block and stops at the first limit passed, so that memory stays near the size
     of the arrays. Raises InputError naming the file and the line or the index at fault: missing
     or oversized file, no faces, too many faces, unreadable numbers, NaN, index out of range.
     """
     vertices, uv, faces, uv_faces = array("d"), array("d"), array("q"), array("q")
     starts: dict[bytes, list[int]] = {b"o": [], b"g": []}
-    for number, line in _lines(path):
+    for number, kind, line in _pieces(path):
         keyword, _, rest = line.lstrip().partition(b" ")
         try:
-            if keyword == b"v":
+            if kind == "v":
+                vertices.frombytes(numbers_of(line, kind).tobytes())
+            elif kind == "vt":
+                uv.frombytes(numbers_of(line, kind).tobytes())
+            elif kind == "f":
+                corners = numbers_of(line, kind)
+                faces.frombytes(corners.tobytes())
+                uv_faces.frombytes(bytes(corners.nbytes))
+            elif kind == "f/":
+                corners = numbers_of(line, kind).reshape(-1, 2)
+                faces.frombytes(corners[:, 0].tobytes())
+                uv_faces.frombytes(corners[:, 1].tobytes())
+            elif keyword == b"v":
                 vertices.extend(_numbers(rest, 3))
             elif keyword == b"vt":
                 uv.extend(_numbers(rest, 2))
@@ -103,7 +117,7 @@ class ObjHeader:
 def read_obj_header(path: Path) -> ObjHeader:
     """The mtllib and usemtl names of a file, without parsing its numbers. Raises InputError."""
     names: dict[bytes, dict[str, None]] = {b"mtllib": {}, b"usemtl": {}}
-    for _, line in _lines(path):
+    for _, _, line in _pieces(path):
         keyword, _, name = line.partition(b" ")
         if keyword in names:
             names[keyword][name.strip().decode("utf-8", "replace")] = None
@@ -112,18 +126,24 @@ def read_obj_header(path: Path) -> ObjHeader:
     return ObjHeader(next(iter(names[b"mtllib"]), ""), tuple(names[b"usemtl"]))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yields (number, line), from 1."""
+def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
+    """Yields (number of its first line from 1, kind, text): a run of plain lines, or one line of kind ``."""
+    number = 1
     with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
-        for number in itertools.count(1):
-            line = file.readline(MAX_LINE_BYTES)
-            if not line:
-                return
-            if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
-                raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
-            if number > MAX_LINES:
-                raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
-            yield number, line
+        while block := file.read(_BLOCK_BYTES):
+            if not block.endswith(b"\n"):
+                block += file.readline(MAX_LINE_BYTES)
+            start = 0
+            while start < len(block):
+                kind, end = plain_run(block, start)
+                piece = block[start:end]
+                lines = piece.count(b"\n") if kind else 1
+                if not kind and len(piece.rstrip(b"\n")) >= MAX_LINE_BYTES:
+                    raise InputError(path, f"line {number}", "the line is too long", "Give a text OBJ file")
+                if number + lines - 1 > MAX_LINES:
+                    raise InputError(path, "", f"more than {MAX_LINES:,} lines", "Simplify the mesh")
+                yield number, kind, piece
+                number, start = number + lines, end
 
 
 def _numbers(text: bytes, width: int) -> list[float]:

@@ -75,6 +75,28 @@ def test_any_bytes_are_read_or_refused_in_one_line(
         assert np.isfinite(mesh.vertices).all()
 
 
+@pytest.mark.parametrize("block_bytes", [7, 100, 2**16])
+def test_plain_lines_and_others_are_read_to_the_last_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    """Wherever the file is cut into blocks; a second space is enough for the slow reader."""
+    rng = np.random.default_rng(0)
+    vertices = rng.uniform(-1, 1, (400, 3)) * 10.0 ** rng.integers(-12, 12, (400, 1))
+    faces = rng.integers(1, 401, (300, 6))
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines += [f"vt {x!r} {y!r}" for x, y, _ in vertices.tolist()]
+    lines += ["f {}/{} {}/{} {}/{}".format(*face) for face in faces.tolist()]
+    others = [line.replace(" ", "  ", 1) if k % 7 < 3 else line for k, line in enumerate(lines)]
+    monkeypatch.setattr(obj_file, "_BLOCK_BYTES", block_bytes)
+    for written in (lines, others):
+        (tmp_path / "mesh.obj").write_text("\n".join(written))
+        mesh = read_obj(tmp_path / "mesh.obj")
+        assert mesh.vertices.tobytes() == vertices.tobytes()
+        assert mesh.uv.tobytes() == np.ascontiguousarray(vertices[:, :2]).tobytes()
+        np.testing.assert_array_equal(mesh.faces, faces[:, ::2] - 1)
+        np.testing.assert_array_equal(mesh.uv_faces, faces[:, 1::2] - 1)
+
+
 HEAD = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
 BAD = {
     "empty": ("", "no faces"),
