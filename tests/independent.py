@@ -56,17 +56,16 @@ def depth_image(
         x = ((u + 0.5) / window * 2 - 1) * half_width
         y = ((v + 0.5) / window * 2 - 1) * half_width
         ray = np.stack([x, y, np.ones(len(face))], axis=1)
-        a, b, c = local[face, 0], local[face, 1], local[face, 2]
-        # Cramer's rule for t ray = a + s (b - a) + r (c - a).
-        ab, ac = b - a, c - a
-        p = np.cross(ray, ac)
-        determinant = (ab * p).sum(1)
+        # Cramer's rule for t ray = a + s (b - a) + r (c - a): triple products, whose face's part is taken first.
+        a, ab, ac = local[part, 0], local[part, 1] - local[part, 0], local[part, 2] - local[part, 0]
+        normal, across, along = np.cross(ac, ab), np.cross(a, ac), np.cross(ab, a)
+        determinant, over_s, over_r = (
+            np.einsum("pk,pk->p", ray, each[face - start]) for each in (normal, across, along)
+        )
         ok = np.abs(determinant) > 1e-18
         inverse = 1 / np.where(ok, determinant, 1)
-        s = (-a * p).sum(1) * inverse
-        q = np.cross(-a, ab)
-        r = (ray * q).sum(1) * inverse
-        t = (ac * q).sum(1) * inverse
+        s, r = over_s * inverse, over_r * inverse
+        t = (a * normal).sum(1)[face - start] * inverse
         hit = ok & (s >= 0) & (r >= 0) & (s + r <= 1) & (t > 0)
         np.minimum.at(depth, (v * window + u)[hit], t[hit])
     return depth.reshape(window, window)

@@ -17,6 +17,8 @@ from packaging.requirements import Requirement
 from datagen.workers.extras import DISTRIBUTION
 from tests.conftest import REPOSITORY, once
 
+# The subpackages, which were import names of their own once, and names that every library has.
+OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
 PACKAGES = ("cluster", "datagen", "schemas", "train", "workers")
 
 
@@ -63,6 +65,12 @@ def _install(wheel: Path, folder: Path) -> None:
     options = ["-q", "--no-deps", "--no-index", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "--python", python, "install", *options, str(wheel)]
     subprocess.run(command, check=True)
+
+
+def own_files(folder: Path) -> None:
+    """A user's own modules in the folder, which name themselves in its file `imported` when imported."""
+    for name in OWN_FILES:
+        (folder / f"{name}.py").write_text(f"open({str(folder / 'imported')!r}, 'a').write({name!r} + ' ')\n")
 
 
 def link_libraries(site: Path, *extras: str) -> None:

@@ -12,14 +12,11 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.linked_environments import install_wheel, link_libraries, wheel
+from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG
-from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
 __all__ = ["wheel"]
-# The subpackages, which were import names of their own once, and names that every library has.
-OWN_FILES = ("train", "workers", "schemas", "cluster", "tests", "datagen", "numpy", "zarr")
 FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
 MODEL = ("--model-config", "width=16", "--model-config", "embedding=32", "--model-config", "n_points=64")
 # Commands in one process, which imports its libraries once; the first that fails ends it.
@@ -47,8 +44,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder, whose own modules say so when anything imports them."""
     folder = tmp_path_factory.mktemp("user")
-    for name in OWN_FILES:
-        (folder / f"{name}.py").write_text(f"open({str(folder / 'imported')!r}, 'a').write({name!r} + ' ')\n")
+    own_files(folder)
     return folder
 
 
@@ -94,20 +90,15 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     small = ("--n", "48", "--candidates-per-scene", "8")
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
     run(installed / "datagen", "submit", "plan", "--out", "plan", *plan, *small)  # on Ray
-    heuristic = ("submit", "heuristic", "--workers", "0", "--config", "small.toml", *small)
-    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
-    write_frame(folder / "frame", draw_seen(0))
+    heuristic = ("submit", "heuristic", "--workers", "0", "--config", "small.toml")
     commands = [
-        (*heuristic, "--out", "run", "--split", "train"),
-        (*heuristic, "--out", "val", "--split", "val"),
+        (*heuristic, "--out", "run", "--split", "train", *small),
+        (*heuristic, "--out", "val", "--split", "val", "--n", "8", "--candidates-per-scene", "8"),
         ("show", "run", "--scene", "0", "--out", "scene.png"),
         ("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL),
         ("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html"),
-        ("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png"),
         ("predict", "--demo"),
     ]
     run(installed / "python", several, json.dumps(commands))
-    assert {"scene.png", "page.html", "heat.png", "demo.png", "demo.html"} <= {
-        path.name for path in folder.iterdir()
-    }
+    assert {"scene.png", "page.html", "demo.png", "demo.html"} <= {path.name for path in folder.iterdir()}
     assert not (folder / "imported").exists(), (folder / "imported").read_text()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from tests.linked_environments import install_wheel, link_libraries, wheel
+from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.small_runs import PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
@@ -48,18 +48,21 @@ class Done:
 
 
 class Installed:
-    """The program of an environment with these extras."""
+    """The program of an environment with these extras, in a folder with a user's own modules."""
 
     def __init__(self, wheel: Path, folder: Path, *extras: str) -> None:
-        self.wheel, self.folder = wheel, folder
+        self.wheel, self.folder, self.bin = wheel, folder, folder / "venv" / "bin"
         link_libraries(install_wheel(wheel, folder / "venv"), *extras)
+        (self.bin / "several").write_text(PROGRAM)  # beside `datagen`: in this folder it looks for modules
+        own_files(folder)
 
     def run(self, *commands: Command) -> Iterator[Done]:
         """Do commands in turn: the first by the program itself, as a user does, the rest in one process."""
         first, *rest = ([*map(str, words)] for words in commands)
-        program = self._start(self.folder / "venv" / "bin" / "datagen", *first)
+        program = self._start(self.bin / "datagen", *first)
         yield Done(first, program.returncode, program.stdout, program.stderr)
-        python = self._start(self.folder / "venv" / "bin" / "python", "-I", "-c", PROGRAM, json.dumps(rest))
+        python = self._start(self.bin / "python", self.bin / "several", json.dumps(rest))
+        assert not (self.folder / "imported").exists(), (self.folder / "imported").read_text()
         assert python.returncode == 0, python.stderr
         yield from (Done(words, *one) for words, one in zip(rest, json.loads(python.stdout), strict=True))
 
@@ -143,16 +146,17 @@ def test_labels_are_made_and_shown_without_ray_and_torch(wheel: Path, tmp_path: 
 
 def test_models_train_and_predict_without_simulators(wheel: Path, tmp_path: Path) -> None:
     train = Installed(wheel, tmp_path, "train")
-    for split in ("train", "val"):
-        make_small_run(tmp_path / split, 48, "--split", split)
+    for split, n in (("train", 48), ("val", PER_SCENE)):
+        make_small_run(tmp_path / split, n, "--split", split)
     write_untrained(tmp_path / "model.ckpt", {})
     write_frame(tmp_path / "frame", draw_seen(0))
     robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "5")
     given = ["--frame", "frame", *robot, "--out", "heat.png", "--html", "a.html"]
-    trained, predicted = train.run(
+    helped, trained, predicted = train.run(
+        ["train", "--help"],
         ["train", "stage1", "train", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL],
         ["predict", "model.ckpt", *given],
     )
-    assert trained.code == 0, trained.err
+    assert helped.code == 0 and trained.code == 0, helped.err + trained.err
     assert predicted.code in (0, 1), predicted.err  # 1 where a model without training finds no good base
     assert (tmp_path / "heat.png").is_file() and (tmp_path / "a.html").is_file()
