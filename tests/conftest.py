@@ -8,15 +8,11 @@ import secrets
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.s3_servers import environment, make_bucket, moto_server
-
-if TYPE_CHECKING:
-    from datagen.workers.objects import ObjectSource
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -65,21 +61,13 @@ def session_cache(shared_folder: Path) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
-def ycb(assets: Path, shared_folder: Path, session_cache: Path) -> ObjectSource:
-    """The real objects, all of them loaded, whatever cache a test has of its own."""
+def real_objects(assets: Path, shared_folder: Path, session_cache: Path) -> str:
+    """The source of the real objects, which the first who asks has read into the cache of all."""
     from datagen.workers.objects import open_objects
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DATAGEN_CACHE", str(session_cache))
-
-        def load() -> ObjectSource:
-            source = open_objects(f"ycb:{assets / 'ycb'}")
-            for name in source.names():
-                source.load(name)
-            return source
-
-        once(shared_folder / "ycb", load)
-        return load()
+    source = f"ycb:{assets / 'ycb'}"
+    once(shared_folder / "ycb", lambda: open_objects(source))
+    return source
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -56,7 +56,7 @@ def depth_image(
         x = ((u + 0.5) / window * 2 - 1) * half_width
         y = ((v + 0.5) / window * 2 - 1) * half_width
         ray = np.stack([x, y, np.ones(len(face))], axis=1)
-        # Cramer's rule for t ray = a + s (b - a) + r (c - a): triple products, whose face's part is taken first.
+        # Cramer's rule for t ray = a + s (b - a) + r (c - a): triple products, the face's part of them first.
         a, ab, ac = local[part, 0], local[part, 1] - local[part, 0], local[part, 2] - local[part, 0]
         normal, across, along = np.cross(ac, ab), np.cross(a, ac), np.cross(ab, a)
         determinant, over_s, over_r = (

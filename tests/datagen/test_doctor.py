@@ -179,8 +179,8 @@ def test_a_missing_folder_of_houses_fails(tmp_path: Path) -> None:
     assert "ycb" in objects.fix
 
 
-def test_real_assets_are_counted(assets: Path) -> None:
-    houses, objects = doctor.asset_checks(f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}")
+def test_real_assets_are_counted(assets: Path, real_objects: str) -> None:
+    houses, objects = doctor.asset_checks(f"procthor:{assets / 'procthor'}", real_objects)
     assert houses.detail.startswith("2018 ")
     assert objects.status == "ok"
 

@@ -151,7 +151,7 @@ def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     houses, objects = "builtin", "builtin"
     if request.param == "real":
         assets: Path = request.getfixturevalue("assets")
-        houses, objects = f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}"
+        houses, objects = f"procthor:{assets / 'procthor'}", request.getfixturevalue("real_objects")
     folder = tmp_path_factory.mktemp(request.param) / "run"
     config = CONFIG.replace("window_px = 24", f"window_px = {WINDOW_PX}")
     assert config != CONFIG

@@ -1,4 +1,4 @@
-"""Runs of OBJ lines that are written plainly, as nearly all lines are: found and read without a loop over them."""
+"""Runs of OBJ lines that are written plainly, as nearly all are: found and read without a loop over them."""
 
 from __future__ import annotations
 

@@ -112,8 +112,10 @@ def test_the_cloud_has_the_shape_of_a_stored_one(seen: Seen, scorer: ModelScorer
     assert 0.9 < share < 1.1
 
 
-def test_a_real_house_gives_the_scores_of_its_stored_cloud(assets: Path, scorer: ModelScorer) -> None:
-    real = draw_seen(5, 77, f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}")
+def test_a_real_house_gives_the_scores_of_its_stored_cloud(
+    assets: Path, real_objects: str, scorer: ModelScorer
+) -> None:
+    real = draw_seen(5, 77, f"procthor:{assets / 'procthor'}", real_objects)
     answer = of(scorer, sensor_frame(real))
     assert np.linalg.norm(answer.center_m - real.scene.target_center_m) < 0.03
     again = of(scorer, sensor_frame(real), seed=1)

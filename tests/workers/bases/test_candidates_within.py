@@ -149,12 +149,16 @@ def by_rejection(rng: np.random.Generator) -> Drawn:
             )
             jitter_m = rng.uniform(-step_m / 2, step_m / 2, (shape, 2))
             xy_m = (target_m[:2] + np.tile(cells, (ROUNDS, 1)) + jitter_m).astype(np.float32)
-            radius_m = params.radius_of_base_m(reach)
+            there = SceneCandidates(xy_m, np.zeros(shape, np.int16), camera, mount, reach, np.zeros(shape))
+            near = np.flatnonzero(distances(there, target_m)[1] <= reach)
+            there = SceneCandidates(*(column[near] for column in vars(there).values()))
+            radius_m = params.radius_of_base_m(there.arm_reach_m)
+            heights = (there.base_height_m, there.camera_height_m)
             clearance_m = base_clearance_m(
-                xy_m, mount, camera, radius_m, OBSTACLES[house], params.mast_radius_m
+                there.base_xy_m, *heights, radius_m, OBSTACLES[house], params.mast_radius_m
             )
-            there = SceneCandidates(xy_m, np.zeros(shape, np.int16), camera, mount, reach, clearance_m)
-            inside = np.flatnonzero((clearance_m >= 0) & (distances(there, target_m)[1] <= reach))
+            there = replace(there, clearance_m=clearance_m)
+            inside = np.flatnonzero(clearance_m >= 0)
             if len(inside):
                 k = rng.choice(inside)
                 found.append(SceneCandidates(*(column[k : k + 1] for column in vars(there).values())))

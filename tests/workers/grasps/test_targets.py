@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from datagen.schemas.specification import GraspParams
 from datagen.workers.grasps.targets import Targets, graspability
-from datagen.workers.objects import ObjectSource
+from datagen.workers.objects import open_objects
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots import gripper_of
 from datagen.workers.robots.gripper import Gripper
@@ -29,6 +30,12 @@ MODELS = {
         box_model("065_other", (0.03, 0.03, 0.05)),
     )
 }
+
+
+@pytest.fixture(autouse=True)
+def own_cache(session_cache: Path) -> Path:
+    """That of all tests: what an object's grasps are is not the question here."""
+    return session_cache
 
 
 def test_the_table_says_why_not() -> None:
@@ -86,7 +93,8 @@ def franka_hand() -> Gripper:
     return gripper_of("panda")
 
 
-def test_real_things_that_lie_flat_are_targets(ycb: ObjectSource) -> None:
+def test_real_things_that_lie_flat_are_targets(real_objects: str) -> None:
+    ycb = open_objects(real_objects)
     gripper = franka_hand()
     for name in ("011_banana", "007_tuna_fish_can", "031_spoon", "026_sponge", "024_bowl"):
         found = graspability(ycb.load(name), gripper, GraspParams())
@@ -95,7 +103,8 @@ def test_real_things_that_lie_flat_are_targets(ycb: ObjectSource) -> None:
 
 
 @pytest.mark.slow
-def test_thirty_varied_targets_among_real_objects(ycb: ObjectSource) -> None:
+def test_thirty_varied_targets_among_real_objects(real_objects: str) -> None:
+    ycb = open_objects(real_objects)
     targets = Targets(ycb.names(), ycb.load, franka_hand(), GraspParams()).names()
     assert len(targets) >= 30
     assert sum("cups" in name for name in targets) == 2

@@ -57,13 +57,12 @@ class Seen:
 
 
 @pytest.fixture(scope="module")
-def seen(assets: Path) -> list[Seen]:
-    return successes(assets)
+def seen(assets: Path, real_objects: str) -> list[Seen]:
+    return successes(f"procthor:{assets / 'procthor'}", real_objects)
 
 
-def successes(assets: Path) -> list[Seen]:
+def successes(house_source: str, object_source: str) -> list[Seen]:
     """The first success of each of a few scenes."""
-    house_source, object_source = f"procthor:{assets / 'procthor'}", f"ycb:{assets / 'ycb'}"
     houses, objects = open_houses(house_source), open_objects(object_source)
     chosen = {
         "seed": 3,
