@@ -30,7 +30,7 @@ OUTSIDE_EXCEPTIONS_M = {("ycb", "036_wood_block"): 0.0085}
 def source_of(request: pytest.FixtureRequest) -> Callable[[str], ObjectSource]:
     @cache
     def opened(kind: str) -> ObjectSource:
-        return open_objects("builtin") if kind == "builtin" else request.getfixturevalue("ycb")
+        return open_objects("builtin" if kind == "builtin" else request.getfixturevalue("real_objects"))
 
     return opened
 
