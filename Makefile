@@ -1,8 +1,8 @@
 # `make demo` and `make test` are all the set-up there is; both are incremental.
 PYTHON ?= python3
-# Test workers, two more than the two cores they are made for: tests of Ray and S3 wait more than they compute.
+# Test workers, one more than the two cores they are made for: tests of Ray and S3 wait more than they compute.
 # Each imports every test (15 s of a core) and has up to 1.5 GB. 1 runs all in one process.
-JOBS ?= 4
+JOBS ?= 3
 
 BIN := .venv/bin
 TYPES := $(BIN)/pyright --pythonpath $(BIN)/python
@@ -17,7 +17,7 @@ help:
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"
-	@echo "make slow    the tests that make test leaves out: kills, dying clusters, a failing store"
+	@echo "make slow    the tests that make test leaves out: kills, dying clusters, what takes ten seconds of a core"
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"

@@ -18,6 +18,8 @@ from datagen.schemas.storage import open_storage
 from tests.refusals import refused
 from tests.small_runs import PER_SCENE, json_of, submit_arguments
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 N = 64 * PER_SCENE  # eight shards
 

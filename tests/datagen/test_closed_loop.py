@@ -56,6 +56,7 @@ def made(grids: Path) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_without_error_a_pick_comes_to_its_label_and_two_processes_make_the_same(
     grids: Path, made: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

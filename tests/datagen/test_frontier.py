@@ -46,6 +46,7 @@ def words(runs: Path, out: Path, *more: str) -> list[str]:
     return [*given, "--test", str(runs / "test"), "--out", str(out), *SHARES, *more]
 
 
+@pytest.mark.slow
 def test_a_frontier_of_real_runs_resumes_and_says_what_to_buy(
     runs: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):

@@ -10,10 +10,14 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
+import pytest
+
 from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.small_runs import PER_SCENE, make_small_run, submit_arguments
 from tests.train.prediction.checkpoints import write_untrained
 from tests.train.prediction.seen_scenes import draw_seen, write_frame
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["wheel"]
 Command = Sequence[str | Path]

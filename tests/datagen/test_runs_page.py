@@ -17,6 +17,8 @@ from datagen import cli
 from tests.conftest import REPOSITORY
 from tests.small_runs import json_of
 
+pytestmark = pytest.mark.slow
+
 # Small runs in the command's own process: starting Ray eight times would cost more than the labels.
 SMALL = {
     "--n 20000 --seed 1": "--n 60 --seed 1 --workers 0",

@@ -21,6 +21,8 @@ from datagen.cluster.stop_request import StopRequest
 from tests.cluster.simulated import Heard, PaperRecorder
 from tests.faults.scripted import ScriptedTask, perform
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = RaySettings(workers=2, attempts_per_worker=50, resident_limit_bytes=250 << 20)
 POLICY = RetryPolicy(max_quarantined_share=1.0, backoff_s=0.05, initial_deadline_s=60)
 

@@ -21,7 +21,7 @@ from tests.faults.trials import FaultyTrials, attempt_with_faults
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG, arrays_of, assert_equal_runs, make_small_run
 
-pytestmark = needs_sim
+pytestmark = [needs_sim, pytest.mark.slow]
 
 SHARDS, PER_SCENE = 6, 6
 N = SHARDS * PER_SCENE

@@ -29,6 +29,7 @@ def made(small_benchmark: Path, out: Path, *more: str) -> int:
     return cli.run(["benchmark", "make", *sources, "--benchmark", definition, "--out", str(out), *more])
 
 
+@pytest.mark.slow
 @needs_sim
 def test_the_runs_are_made_again_bit_for_bit(
     small_benchmark: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -19,6 +19,8 @@ from tests.datagen.jobs.conftest import Detached, N
 from tests.refusals import refused
 from tests.small_runs import arrays_of, assert_equal_runs, json_of, make_small_run
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_detached_job_outlives_its_shell_and_is_followed_from_another(
     detached: Detached, tmp_path: Path, capsys: pytest.CaptureFixture[str]

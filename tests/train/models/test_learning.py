@@ -12,6 +12,8 @@ from datagen.train.models import MODELS, build_model
 from datagen.train.tensors import to_torch
 from tests.train.models.made_batches import SMALL
 
+pytestmark = pytest.mark.slow
+
 STEPS = 300
 
 

@@ -28,6 +28,8 @@ from tests.train.training.rank_work import Union, results_of, train_and_save_res
 from tests.train.training.small import TINY, equal, job_of
 from tests.train.training.waiting_work import wait_for_stop
 
+pytestmark = pytest.mark.slow
+
 # Without dropout, whose draws are each rank's own.
 STILL: dict[str, Any] = {**TINY, "dropout": 0.0}
 

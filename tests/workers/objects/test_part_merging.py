@@ -19,6 +19,8 @@ from datagen.workers.objects.part_merging import MAX_VERTICES, merge_parts
 from datagen.workers.objects.scan import read_scan
 from tests.workers.objects.merging_errors import added_volume_share, cut_off_m, error_m
 
+pytestmark = pytest.mark.slow
+
 
 def box(low: F64, high: F64) -> F32:
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, -1).T

@@ -30,6 +30,8 @@ from datagen.workers.trials.trial import Recording, TrialResult
 from datagen.workers.world import assemble_world
 from tests.workers.motion.tables import HalfSpaces
 
+pytestmark = pytest.mark.slow
+
 SCENES, SUCCESSES = 12, 3
 # PhysX lets bodies enter one another a little before it pushes them apart.
 ENTERS_M = 0.005
