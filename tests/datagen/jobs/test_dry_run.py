@@ -92,16 +92,16 @@ def test_a_budget_ends_between_shards_and_resume_makes_the_rest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    assert cli.run([*submit_arguments(run, N), "--budget", "0.1cpu-s"]) == 3
+    assert cli.run([*submit_arguments(run, N), "--budget", "0.001cpu-s"]) == 3
     said = capsys.readouterr()
     # The first shard shows what one costs: no other fits.
     assert len(Run.open(run).committed()) == 1 and not Run.open(run).ledger.unfinished()
     last = said.err.splitlines()[-2:]
-    assert last[0] == "budget of 0.1cpu-s spent; 11 shards left. Resume with:"
-    assert last[1] == f"  datagen resume {run} --workers 0 --budget 0.1cpu-s"
+    assert last[0] == "budget of 0.001cpu-s spent; 11 shards left. Resume with:"
+    assert last[1] == f"  datagen resume {run} --workers 0 --budget 0.001cpu-s"
     assert cli.run(["status", str(run)]) == 0
     assert "ended budget, exit code 3" in capsys.readouterr().out
-    assert cli.run(["resume", str(run), "--workers", "0", "--budget", "0.1cpu-s", "--json"]) == 3
+    assert cli.run(["resume", str(run), "--workers", "0", "--budget", "0.001cpu-s", "--json"]) == 3
     event = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert (event["event"], event["remaining"], event["exit_code"]) == ("budget", 11, 3)
     assert event["resume"][:2] == ["resume", str(run)]
