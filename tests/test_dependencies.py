@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import tomllib
-from importlib.metadata import requires
+from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 from tests.sim_extra import needs_sim
 
-_PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
+_ROOT = Path(__file__).parents[1]
+_PYPROJECT = _ROOT / "pyproject.toml"
 # The extra `labels` brings them, but for mplib, which has no wheels there and is never imported.
 _LISTED_ELSEWHERE = {"numpy", "scipy", "sapien", "trimesh", "mplib"}
 
@@ -23,6 +25,25 @@ def _needed(requirements: list[str], python: str) -> dict[str, Requirement]:
     return {
         canonicalize_name(r.name): r for r in parsed if r.marker is None or r.marker.evaluate(environment)
     }
+
+
+def test_pinned_versions_install_on_debian_12() -> None:
+    """Its Python is 3.11.2, and some libraries of `3.11 or newer` begin later."""
+    pins = [
+        line.split("==")[0] for line in (_ROOT / "constraints.txt").read_text().splitlines() if "==" in line
+    ]
+    asked = {name: _requires_python(name) for name in pins}
+    assert len(asked) > 100 and any(asked.values())
+    assert not {name: text for name, text in asked.items() if "3.11.2" not in SpecifierSet(text)}
+
+
+def _requires_python(name: str) -> str:
+    """Empty for what is not installed on this Python."""
+    try:
+        found = metadata(name)
+    except PackageNotFoundError:
+        return ""
+    return found["Requires-Python"] if "Requires-Python" in found else ""
 
 
 @needs_sim
