@@ -43,7 +43,7 @@ def _requires_python(name: str) -> str:
         found = metadata(name)
     except PackageNotFoundError:
         return ""
-    return found["Requires-Python"] if "Requires-Python" in found else ""
+    return "".join(found.get_all("Requires-Python") or [])
 
 
 @needs_sim
