@@ -18,7 +18,8 @@ _KINDS = {
     "f": rb"f" + 3 * _INDEX,
     "f/": rb"f" + 3 * _PAIR,
 }
-_RUN = re.compile(b"|".join(rb"((?:" + line + rb" ?\r?\n)++)" for line in _KINDS.values()))
+# Not possessive (`++`), which Python 3.11 before 3.11.5 matches wrongly.
+_RUN = re.compile(b"|".join(rb"((?:" + line + rb" ?\r?\n)+)" for line in _KINDS.values()))
 _NAMES = tuple(_KINDS)
 
 
