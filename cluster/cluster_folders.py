@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import tempfile
-import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +20,8 @@ from datagen.schemas.whole_files import whole_file
 
 _PARENT = Path("/tmp")  # sockets need a short path
 _KIND = "datagen-ray-"
-# Some of Ray's processes ignore SIGTERM. None ignores SIGKILL, but a busy machine takes its time over it.
-_ENDINGS = ((signal.SIGTERM, 4.0), (signal.SIGKILL, 60.0))  # and how long each is waited for, in seconds
+_STOP_WITHIN_S = 4.0  # after SIGTERM, which some of Ray's processes ignore
+_KILL_WITHIN_S = 60.0  # after SIGKILL, on a busy machine
 
 # Variable with the folder in each of its processes; Ray reads it too.
 OWNER = "RAY_TMPDIR"
@@ -59,22 +58,20 @@ def remove_folder(folder: Path) -> None:
 
 def end_processes(processes: list[psutil.Process]) -> None:
     """Send SIGTERM and, some seconds later, SIGKILL to the remaining processes; wait until all have ended."""
-    for number, patience_s in _ENDINGS:
+    for number in (signal.SIGTERM, signal.SIGKILL):
         for process in processes:
             try:
                 process.send_signal(number)
             except psutil.Error:
                 continue
-        until_s = time.monotonic() + patience_s
-        while processes and time.monotonic() < until_s:
-            _, processes = psutil.wait_procs(processes, timeout=0.1)
-            processes = [process for process in processes if is_alive(process)]
+        _, processes = psutil.wait_procs(processes, timeout=_STOP_WITHIN_S)
+    psutil.wait_procs([process for process in processes if is_alive(process)], timeout=_KILL_WITHIN_S)
 
 
 def is_alive(process: psutil.Process) -> bool:
-    """Whether a process has not ended; one that its parent has not asked about yet has."""
+    """Whether a process still has memory, which the kernel takes first from one that ends."""
     try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+        return process.is_running() and process.memory_info().vms > 0
     except psutil.NoSuchProcess:
         return False
 

@@ -29,14 +29,14 @@ with private_folder() as folder:
 
 
 @pytest.fixture
-def owner() -> Iterator[tuple[subprocess.Popen[str], Path, psutil.Process]]:
+def owner() -> Iterator[tuple[subprocess.Popen[str], Path, int]]:
     process = subprocess.Popen(
         [sys.executable, "-c", OWNER_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         cwd=Path(__file__).resolve().parents[2],
     )  # fmt: skip
     assert process.stdout is not None
     folder, child = process.stdout.readline().split()
-    yield process, Path(folder), psutil.Process(int(child))
+    yield process, Path(folder), int(child)
     process.kill()
     process.wait()
     with private_folder():
@@ -44,26 +44,48 @@ def owner() -> Iterator[tuple[subprocess.Popen[str], Path, psutil.Process]]:
 
 
 def test_a_folder_is_closed_and_goes_with_its_processes(
-    owner: tuple[subprocess.Popen[str], Path, psutil.Process],
+    owner: tuple[subprocess.Popen[str], Path, int],
 ) -> None:
     process, folder, child = owner
     assert folder.stat().st_mode & 0o777 == 0o700 and (folder / RAY).is_dir()
     process.communicate()  # ends its input
-    assert process.returncode == 0 and not folder.exists() and not is_alive(child)
+    assert process.returncode == 0 and not folder.exists() and not psutil.pid_exists(child)
 
 
 def test_the_next_program_removes_what_a_killed_one_left_and_nothing_of_a_living_one(
-    owner: tuple[subprocess.Popen[str], Path, psutil.Process],
+    owner: tuple[subprocess.Popen[str], Path, int],
 ) -> None:
     process, folder, child = owner
     process.send_signal(signal.SIGSTOP)  # silent, but alive
     with private_folder():
-        assert folder.exists() and is_alive(child)
+        assert folder.exists() and psutil.pid_exists(child)
     process.kill()
     process.wait()
-    assert folder.exists() and is_alive(child)
+    assert folder.exists() and psutil.pid_exists(child)
     with private_folder() as own:
-        assert not folder.exists() and not is_alive(child) and own.exists()
+        assert not folder.exists() and not psutil.pid_exists(child) and own.exists()
+
+
+def test_a_killed_process_is_alive_only_while_it_can_be_recognised() -> None:
+    """One that ends has no environment left before it is a zombie, so no later look would find it."""
+    for _ in range(20):
+        child = subprocess.Popen([sys.executable, "-c", "print(flush=True); input()"], stdin=-1, stdout=-1)
+        assert child.stdout is not None and child.stdout.readline()
+        process = psutil.Process(child.pid)
+        assert is_recognised(process) and is_alive(process)
+        child.kill()
+        while is_recognised(process):
+            pass
+        assert not is_alive(process)
+        child.communicate()
+        assert not is_alive(process)
+
+
+def is_recognised(process: psutil.Process) -> bool:
+    try:
+        return bool(process.environ())
+    except psutil.Error:
+        return False
 
 
 @needs_root

@@ -83,7 +83,7 @@ def test_the_batch_script_computes_stops_for_preemption_and_is_queued_again(
         "SLURM_CPUS_PER_TASK": "1",
         "SLURM_SUBMIT_DIR": str(here),
     }
-    asked = ["heuristic", "--n", "384", "--out", str(run), "--candidates-per-scene", "8"]
+    asked = ["heuristic", "--n", "768", "--out", str(run), "--candidates-per-scene", "8"]
     with (tmp_path / "output").open("w") as output:
         job = psutil.Popen(
             ["bash", SCRIPT, *asked, "--config", str(tmp_path / "small.toml")],

@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from datagen.cluster import ray_cluster as ray_cluster_module
+from datagen.cluster import ray_settings
 from datagen.cluster.cluster_folders import is_alive, private_folder
 from datagen.cluster.ray_cluster import RaySettings, known_token, ray_cluster, refuse_unusable, token_for
 from datagen.cluster.ray_settings import head_arguments, head_environment, new_token
@@ -152,13 +153,29 @@ with ray_cluster(RaySettings(workers=1)) as ray:
         assert not folder.exists() and not [p for p in its if is_alive(p)]
 
 
+DIES = "raise SystemExit(1)"
+SILENCES_THE_CONTROL_STORE = """
+import os, time, psutil
+for sibling in psutil.Process(os.getppid()).children():
+    if sibling.name() == "gcs_server":
+        sibling.suspend()
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("raylet", [DIES, SILENCES_THE_CONTROL_STORE])
 def test_a_cluster_that_does_not_start_is_one_line_and_leaves_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    raylet: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     from ray._private import services
 
-    monkeypatch.setattr(services, "RAYLET_EXECUTABLE", "/bin/false")
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "1")  # Ray's wait for a node, which is 30 s
+    executable = tmp_path / "raylet"
+    executable.write_text(f"#!{sys.executable}\n{raylet}")
+    executable.chmod(0o755)
+    monkeypatch.setattr(services, "RAYLET_EXECUTABLE", str(executable))
+    # Ray's waits for a node, which is 30 s, and for its control store.
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "1")
+    monkeypatch.setitem(ray_settings._LOCAL, "RAY_gcs_rpc_server_connect_timeout_s", "1")
     monkeypatch.setattr(ray_cluster_module, "_SILENT_START_S", 0.0)
     said = pytest.raises(InputError, match=r"^ray: does not start: .* --workers 0.* --address")
     with said, ray_cluster(RaySettings(workers=1)):
