@@ -236,10 +236,8 @@ class RayExecutor(Generic[T]):
             has_no_note = here.note is None and death.outcome != "lost" and bool(death.task.notes)
             if has_others and has_no_note:
                 unknown[death.task.notes].append(death)
-            elif has_no_note and death.outcome == "crashed":  # of a worker that Ray gave out as it ended
-                reports.append(failure_report(death.task, "lost", "its worker died before it began", here))
             else:
-                reports.append(failure_report(death.task, death.outcome, death.cause, here))
+                reports.append(_report_of(death, here))
         for notes, found in unknown.items():
             attempts = [death.task.attempt for death in found]
             question = self.others.put(post_mortems_of, notes, attempts, patience_s=_POST_MORTEM_WITHIN_S)
@@ -258,12 +256,7 @@ class RayExecutor(Generic[T]):
                 continue
             self._post_mortem_checks.remove(check)
             for death in check.deaths:
-                found, outcome, cause = left.get(death.task.attempt), death.outcome, death.cause
-                # A dead worker left its note on its machine. Where no machine has it, the machine was lost
-                # too.
-                if found is None and outcome == "crashed":
-                    outcome, cause = "lost", "its worker died, and its machine does not respond"
-                reports.append(failure_report(death.task, outcome, cause, found or PostMortem()))
+                reports.append(_report_of(death, left.get(death.task.attempt, PostMortem())))
         return reports
 
     @staticmethod
@@ -273,6 +266,14 @@ class RayExecutor(Generic[T]):
             if task.notes:
                 found[task.notes].append(task.attempt)
         return found
+
+
+def _report_of(death: _Death[Any], left: PostMortem) -> AttemptReport:
+    outcome, cause = death.outcome, death.cause
+    # An attempt has a note from its begin to its end: without one, the shard did not crash the worker.
+    if outcome == "crashed" and left.note is None and death.task.notes:
+        outcome, cause = "lost", "its worker died before it began or after it ended, or with its machine"
+    return failure_report(death.task, outcome, cause, left)
 
 
 def retire_worker() -> None:

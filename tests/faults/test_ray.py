@@ -160,7 +160,8 @@ def test_a_worker_that_dies_before_an_attempt_begins_is_no_fault_of_the_shard(
     played = play(ray, tmp_path, {1: (KillsItsReader(tmp_path / "seen"),)}, shards=3)  # type: ignore[dict-item]
     assert played.summary.totals.committed == 3 and played.ends(1) == ["lost", "committed"]
     lost = played.entry("lost")
-    assert lost.cause == "its worker died before it began" and lost.host is None and lost.cost is None
+    assert lost.cause == "its worker died before it began or after it ended, or with its machine"
+    assert lost.host is None and lost.cost is None
 
 
 def test_hangs_end_at_their_deadline_with_the_stack(ray: Any, tmp_path: Path) -> None:
@@ -199,12 +200,12 @@ def test_a_forced_stop_ends_hung_workers_and_frees_their_slots(ray: Any, tmp_pat
             stop.ask()
             stop.ask()
 
+    # Ray may still give an attempt to a worker that another test has killed; these find it.
+    (tmp_path / "before").mkdir()
+    assert play(ray, tmp_path / "before", {}, shards=6).summary.totals.committed == 6
     words = dict.fromkeys(range(6), ("hang_with_lock",))
     played = play(ray, tmp_path, words, shards=6, on_tick=stop_when_running)
-    assert played.summary.end == "interrupted"
-    outcomes = dict(played.summary.totals.outcomes)
-    outcomes.pop("lost", None)  # to a worker that Ray gave out as it ended: nothing had begun
-    assert outcomes == {"cancelled": 4}
+    assert played.summary.end == "interrupted" and played.summary.totals.outcomes == {"cancelled": 4}
     (tmp_path / "after").mkdir()
     assert play(ray, tmp_path / "after", {}, shards=6).summary.totals.committed == 6
 
