@@ -38,7 +38,7 @@ def frontier(
     out: Path,
     prices: Path | None = None,
     target_accuracy: float | None = None,
-    budget: float = 1.0,
+    budget: str = "1cpu-h",
     shares: Sequence[float] = _SHARES,
     seeds: Whole = 3,
     bootstrap: Whole = 200,
@@ -62,7 +62,7 @@ def frontier(
         out: Folder for encodings, trainings, frontier.json and frontier.svg.
         prices: Prices as a TOML file [datagen's own].
         target_accuracy: Balanced accuracy within reach to buy labels for, such as 0.85.
-        budget: Core-hours of labels to spend next.
+        budget: What to spend on labels next: CPU time (5cpu-h) or money (3usd).
         shares: Shares of each run's houses to train on, ascending; the last is 1.
         seeds: Trainings of each mixture; each seed has its own order of houses.
         bootstrap: Resamples of seeds and scenes.
@@ -70,15 +70,16 @@ def frontier(
         workers: Training processes [cores].
         allow_incomplete: Accept runs that lack planned samples instead of failing.
     """
-    _refuse_odd_options(runs, val, test, target_accuracy, budget, shares, seeds, workers)
+    _refuse_odd_options(runs, val, test, target_accuracy, shares, seeds, workers)
     refuse_odd_draws(bootstrap, seed)
     from datagen.frontier.cost_per_label import label_costs
     from datagen.frontier.mixtures import FIDELITY, mixtures_of
     from datagen.frontier.trainings import TrainingTask, make_trainings
+    from datagen.jobs.budget_option import budget_cpu_h
     from datagen.reports.prices import read_prices
     from datagen.train.training.launching import interruptible
 
-    priced = read_prices(prices)
+    priced, cpu_h = read_prices(prices), budget_cpu_h(budget, prices)
     by_source = _by_source(runs)
     for option, places in (("--val", val), ("--test", test)):
         _refuse_not_dear(places, option)
@@ -97,7 +98,7 @@ def frontier(
         if not make_trainings(tasks, processes, stopping, seen):
             say_interrupted("; finished trainings are kept", sys.argv[1:])
             return 130
-    record = _report(tasks, encoded["test"], costs, priced, budget, target_accuracy, bootstrap, seed, out)
+    record = _report(tasks, encoded["test"], costs, priced, cpu_h, target_accuracy, bootstrap, seed, out)
     record |= {"runs": by_source, "val": list(val), "test": list(test)}
     with whole_file(out / "frontier.json") as file:
         file.write(json_text.dumps(record, indent=1, allow_nan=False).encode())
@@ -115,7 +116,7 @@ def _report(
     tested: EncodedRuns,
     costs: dict[str, Any],
     priced: Any,
-    budget: float,
+    cpu_h: float,
     target_accuracy: float | None,
     bootstrap: int,
     seed: int,
@@ -142,10 +143,10 @@ def _report(
         )
         raise InputError("datagen frontier", "--test", problem, "Name a larger run, of --candidates in-range")
     points = points_of(results, TestSet(label, scene), costs, bootstrap, seed)
-    found = study(points, costs, budget, target_accuracy)
+    found = study(points, costs, cpu_h, target_accuracy)
     draw_frontier(found, priced.currency, out / "frontier.svg")
     counts = {"candidates": len(label), "scenes": int(scene.max()) + 1, "positives": int(label.sum())}
-    return frontier_record(found, priced, budget, {"test_set": counts})
+    return frontier_record(found, priced, cpu_h, {"test_set": counts})
 
 
 def _encoded(
@@ -202,7 +203,6 @@ def _refuse_odd_options(
     val: Sequence[str],
     test: Sequence[str],
     target_accuracy: float | None,
-    budget: float,
     shares: Sequence[float],
     seeds: int,
     workers: int | None,
@@ -216,7 +216,6 @@ def _refuse_odd_options(
             target_accuracy is None or 0.5 < target_accuracy < 1,
             "0.5 to 1",
         ),
-        "--budget": (budget, 0 < budget <= 1e6, "core-hours above 0, at most 1,000,000"),
         "--shares": (list(shares), _are_shares(shares), "ascending shares above 0 that end with 1"),
         "--seeds": (seeds, 1 <= seeds <= _MOST_SEEDS, f"1 to {_MOST_SEEDS}"),
         "--workers": (workers, workers is None or 1 <= workers <= _MOST_WORKERS, f"1 to {_MOST_WORKERS}"),

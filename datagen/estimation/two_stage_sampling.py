@@ -48,15 +48,9 @@ def first_of(score: F64, n_scenes: int, per_scene: int, rng: np.random.Generator
 
 def in_proportion(size: F64, n_scenes: int, per_scene: int) -> Design:
     """Probabilities in proportion to sizes (M, K) >= 0, as far as none is above 1."""
-    size = np.ascontiguousarray(size)
-    total = size.sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        candidate = size * per_scene / total[:, None]
-    # Most scenes need no more than that; the others are worked out one by one.
-    plain = (size > 0).all(axis=1) & (candidate < 1).all(axis=1) & (size.shape[1] > per_scene)
-    for scene in np.flatnonzero(~plain):
-        candidate[scene] = _in_proportion(size[scene], per_scene)
-    return Design(_in_proportion(total, n_scenes), candidate)
+    return Design(
+        _in_proportion(size.sum(axis=1), n_scenes), np.stack([_in_proportion(row, per_scene) for row in size])
+    )
 
 
 def draw_sample(

@@ -114,7 +114,11 @@ def test_odd_calls_are_refused(
 ):
     plain, out = words(runs, tmp_path / "out"), str(tmp_path / "out")
     for more, told in (
-        (("--budget", "0"), "--budget"),
+        (("--budget", "0cpu-h"), "allows nothing"),
+        (("--budget", "20"), "Give CPU time"),
+        (("--budget", "2h"), "is a time, in which any number of cores may work"),
+        (("--budget", "2000000cpu-h"), "more than 1,000,000 core-hours"),
+        (("--budget", "3eur"), "the prices are in USD"),
         (("--target-accuracy", "80"), "0.5 to 1"),
         (("--seeds", "0"), "--seeds"),
         (("--shares", "0.7"), "ascending shares"),

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from datagen import cli
-from datagen.jobs.budget_option import parse_budget
+from datagen.jobs.budget_option import budget_cpu_h, parse_budget
 from datagen.jobs.evidence import made_here
 from datagen.jobs.pilot import pilot_layout
+from datagen.reports.prices import read_prices
 from datagen.schemas.run import Run
 from datagen.schemas.run_records import Layout
 from tests.refusals import refused
@@ -114,6 +115,8 @@ def test_budgets_are_times_cpu_times_or_money() -> None:
     assert parse_budget("5cpu-h").spending == 18_000
     money = parse_budget("3usd")
     assert money.spending == 3 and 0 < money.per_cpu_s < 1e-3 and 0 < money.per_byte < 1e-9
+    assert budget_cpu_h("90cpu-min") == 1.5
+    assert budget_cpu_h("3usd") == pytest.approx(3 / read_prices().core_hour.price)
 
 
 @pytest.mark.parametrize(
