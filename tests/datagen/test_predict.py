@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -72,6 +73,9 @@ def test_an_answer_as_json_picture_and_page(
     text = page.read_text()
     for words in ('<html lang="en">', 'name="viewport"', "<title>Base poses scored by", "color-scheme: dark"):
         assert words in text
+    # The view begins behind the camera, which is at y = 0 and looks ahead along y.
+    eye = re.search(r'"eye":\{"x":([-.\d]+),"y":([-.\d]+)', text)
+    assert eye is not None and abs(float(eye[1])) < 0.5 and float(eye[2]) < -2
     assert "Plotly.newPlot" in text and "score 0." in text and 'src="http' not in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "a.png"]
 

@@ -38,7 +38,7 @@ def page_of(prediction: Prediction) -> str:
         paper_bgcolor="#ffffff",
         scene={
             "aspectmode": "data",
-            "camera": {"eye": {"x": 1.45, "y": -1.45, "z": 1.15}, "center": {"x": 0, "y": 0, "z": -0.12}},
+            "camera": {"eye": _first_eye(prediction), "center": {"x": 0, "y": 0, "z": -0.12}},
             **{f"{axis}axis": {"title": f"{axis} [m]", "nticks": 5} for axis in "xyz"},
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
@@ -54,6 +54,13 @@ def page_of(prediction: Prediction) -> str:
         f"Base poses scored by {prediction.scorer}",
         [html_facts(told(prediction)), html_figure(view, _CAPTION)],
     )
+
+
+def _first_eye(prediction: Prediction) -> dict[str, float]:
+    """Where the view begins: on the side of the camera, which saw the target, and above it."""
+    x, y = prediction.seen.eyes_m[0, :2] - prediction.center_m[:2]
+    azimuth = np.arctan2(y, x)
+    return {"x": round(2.05 * np.cos(azimuth), 3), "y": round(2.05 * np.sin(azimuth), 3), "z": 1.15}
 
 
 def _cloud(prediction: Prediction, rows: I64) -> dict[str, Any]:
