@@ -35,7 +35,7 @@ class PreparedHouse:
 
     house: House
 
-    @cached_property
+    @property
     def rays(self) -> RayMesh:
         """The hierarchy over the whole house."""
         return house_rays(self.house)
@@ -44,14 +44,6 @@ class PreparedHouse:
     def obstacles(self) -> Obstacles:
         """The floor plan that bases must keep clear of."""
         return obstacles_of(self.house)
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedObject:
-    """An object with its ray hierarchy."""
-
-    model: ObjectModel
-    rays: RayMesh
 
 
 @dataclass(eq=False)
@@ -65,7 +57,7 @@ class World:
     object_names: list[str]
     target_names: list[str]
     _houses: OrderedDict[str, PreparedHouse] = field(default_factory=OrderedDict)
-    _objects: dict[str, PreparedObject] = field(default_factory=dict)
+    _objects: dict[str, ObjectModel] = field(default_factory=dict)
     _bad_houses: dict[str, tuple[str, str, str, str]] = field(default_factory=dict)
 
     def house(self, house_id: str) -> PreparedHouse:
@@ -85,10 +77,9 @@ class World:
             self._houses.popitem(last=False)
         return prepared
 
-    def object(self, name: str) -> PreparedObject:
+    def object(self, name: str) -> ObjectModel:
         if name not in self._objects:
-            model = self.objects.load(name)
-            self._objects[name] = PreparedObject(model, object_rays(model))
+            self._objects[name] = self.objects.load(name)
         return self._objects[name]
 
     def draw_target(self, rng: np.random.Generator) -> str:
@@ -122,9 +113,9 @@ class World:
 
     def ray_scene(self, house: PreparedHouse, names: list[str], T_world_object: F64) -> RayScene:
         """A house with the named objects at these poses (K, 4, 4), ready for rays."""
-        prepared = [self.object(name) for name in names]
-        radii_m = np.array([p.model.radius_m for p in prepared])
-        return RayScene(house.rays, [p.rays for p in prepared], radii_m, T_world_object)
+        models = [self.object(name) for name in names]
+        radii_m = np.array([model.radius_m for model in models])
+        return RayScene(house.rays, [object_rays(model) for model in models], radii_m, T_world_object)
 
 
 def _target_names(objects: ObjectSource) -> list[str]:

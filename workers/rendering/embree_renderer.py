@@ -28,7 +28,7 @@ _LAMP_DIRECTION = np.array([0.35, 0.25, 0.90], np.float32) / np.float32(np.sqrt(
 
 
 def ray_scene(scene: SceneGeometry) -> RayScene:
-    """Hierarchies of a scene, built from scratch; runs keep them in `datagen.workers.world` instead."""
+    """A scene ready for rays."""
     return RayScene(
         house_rays(scene.house),
         [object_rays(model) for model in scene.objects],

@@ -60,6 +60,7 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     return rays
 
 
+# As long as the house or object itself is kept.
 _kept: WeakKeyDictionary[House | ObjectModel, RayMesh] = WeakKeyDictionary()
 
 

@@ -65,7 +65,7 @@ def _try_scene(
             raise SceneRejected("no_surface")
         surface = surfaces[rng.integers(len(surfaces))]
         names = _draw_names(world, rng, clock)
-        models = tuple(world.object(name).model for name in names)
+        models = tuple(world.object(name) for name in names)
         taken = standing_footprints(house.house, surface)
         start = drop_poses(models, surface, taken, spec.scene, rng)
         static = nearby_parts(house.house, surface, _SURROUNDINGS_M)

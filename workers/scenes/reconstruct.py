@@ -79,7 +79,7 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     house = world.house(str(record["house_id"]))
     _same(house.house.house_id, house.house.digest, str(record["house_digest"]))
     names = [str(name) for name in record["object_name"]]
-    models = tuple(world.object(name).model for name in names)
+    models = tuple(world.object(name) for name in names)
     for model, digest in zip(models, record["object_digest"], strict=True):
         _same(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
