@@ -15,6 +15,7 @@ from tests.conftest import REPOSITORY
 from tests.linked_environments import install_wheel, link_libraries, own_files, wheel
 from tests.sim_extra import needs_sim
 from tests.small_runs import CONFIG
+from tests.train.prediction.seen_scenes import draw_seen, write_frame
 
 __all__ = ["wheel"]
 FEW_GRASPS = "[arm.grasps]\nper_object = 40\nper_scene = 10\n"
@@ -91,14 +92,19 @@ def test_labels_training_and_prediction_beside_a_users_files(installed: Path, fo
     plan = ("--split", "test", "--candidates", "in-range", "--config", "plan.toml")
     run(installed / "datagen", "submit", "plan", "--out", "plan", *plan, *small)  # on Ray
     heuristic = ("submit", "heuristic", "--workers", "0", "--config", "small.toml")
+    robot = ("--base-height", "0.7", "--reach", "0.9", "--robot-camera-height", "1.2", "--grid", "15")
+    write_frame(folder / "frame", draw_seen(0))
     commands = [
         (*heuristic, "--out", "run", "--split", "train", *small),
         (*heuristic, "--out", "val", "--split", "val", "--n", "8", "--candidates-per-scene", "8"),
         ("show", "run", "--scene", "0", "--out", "scene.png"),
         ("train", "stage1", "run", "--val", "val", "--out", "a.ckpt", "--epochs", "1", *MODEL),
         ("evaluate", "a.ckpt", "plan", "--bootstrap", "20", "--baselines", "none", "--html", "page.html"),
+        ("predict", "a.ckpt", "--frame", "frame", *robot, "--out", "heat.png"),
         ("predict", "--demo"),
     ]
     run(installed / "python", several, json.dumps(commands))
-    assert {"scene.png", "page.html", "demo.png", "demo.html"} <= {path.name for path in folder.iterdir()}
+    assert {"scene.png", "page.html", "heat.png", "demo.png", "demo.html"} <= {
+        path.name for path in folder.iterdir()
+    }
     assert not (folder / "imported").exists(), (folder / "imported").read_text()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import runpy
 import shutil
 import sys
@@ -80,7 +81,9 @@ def test_no_file_names_a_folder_of_a_machine() -> None:
     for path in FOLDER.rglob("*"):
         if path.is_file() and path.suffix in (".json", ".md", ".safetensors"):
             text = path.read_bytes()
-            assert not any(place in text for place in (b"/tmp/", b"/work/", b"/home/")), path
+            if path.suffix == ".safetensors":
+                text = text[8 : 8 + int.from_bytes(text[:8], "little")]  # its JSON header
+            assert not re.search(rb"(?<![\w.:/>-])/[\w.-]+/", text), path
 
 
 def test_the_sample_frame_is_small_and_names_its_sources() -> None:
