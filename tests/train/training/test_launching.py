@@ -8,11 +8,8 @@ import signal
 import stat
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +23,6 @@ from datagen.train.training.loop import run_training
 from datagen.train.training.training_setup import TrainingJob, prepare_training
 from tests.train.training.rank_work import Union, results_of, train_and_save_results
 from tests.train.training.small import TINY, equal, job_of
-from tests.train.training.waiting_work import wait_for_stop
 
 pytestmark = pytest.mark.slow
 
@@ -71,7 +67,7 @@ def test_two_processes_train_like_one_on_both_their_batches_and_end_together(
 WAITING = """
 import sys
 from pathlib import Path
-from tests.train.training.waiting_work import wait_for_stop
+from tests.train.training.rank_work import wait_for_stop
 from datagen.train.training.launching import train_in_processes
 job = sys.argv[1]
 assert train_in_processes(wait_for_stop, job, 1, "cpu", lambda: Path(job + ".stop").exists())
@@ -79,28 +75,23 @@ assert train_in_processes(wait_for_stop, job, 1, "cpu", lambda: Path(job + ".sto
 
 
 def test_the_next_training_removes_folders_of_killed_ones_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ):
     temporary = tmp_path / "tmp"
     temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     running: list[subprocess.Popen[bytes]] = []
 
-    def folder_of(name: str, known: set[Path], ended: Callable[[], bool]) -> Path:
-        """The folder of a training that has begun."""
+    def begin(name: str) -> Path:
+        """A training that has begun; its folder."""
+        known = set(temporary.iterdir())
+        command = [sys.executable, "-c", WAITING, str(tmp_path / name)]
+        running.append(subprocess.Popen(command, env={**os.environ, "TMPDIR": str(temporary)}))
         while not (tmp_path / name).exists():
-            assert not ended()
+            assert running[-1].poll() is None
             time.sleep(0.05)
         (folder,) = set(temporary.glob("datagen-*")) - known
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         return folder
-
-    def begin(name: str) -> Path:
-        known = set(temporary.iterdir())
-        command = [sys.executable, "-c", WAITING, str(tmp_path / name)]
-        process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(temporary)})
-        running.append(process)
-        return folder_of(name, known, lambda: process.poll() is not None)
 
     try:
         dead = begin("killed")
@@ -109,16 +100,11 @@ def test_the_next_training_removes_folders_of_killed_ones_alone(
         assert dead.is_dir()
         living = begin("living")
         assert not dead.exists()
-        with ThreadPoolExecutor(1) as pool:  # one more start of Python and torch would try nothing else
-            job, stop = str(tmp_path / "third"), tmp_path / "third.stop"
-            trained = pool.submit(train_in_processes, wait_for_stop, job, 1, "cpu", stop.exists)
-            try:
-                third = folder_of("third", {living}, trained.done)
-                assert living.is_dir() and third.is_dir()
-            finally:
-                for name in ("living", "third"):
-                    (tmp_path / f"{name}.stop").touch()
-            assert running[1].wait() == 0 and trained.result()
+        third = begin("third")
+        assert living.is_dir() and third.is_dir()
+        for name in ("living", "third"):
+            (tmp_path / f"{name}.stop").touch()
+        assert [process.wait() for process in running[1:]] == [0, 0]
         assert not list(temporary.glob("datagen-*"))
     finally:
         for process in running:
