@@ -17,7 +17,7 @@ help:
 	@echo "make paper   the same with as many labels as the paper has (in build/paper)"
 	@echo "make model   the released model, its benchmark and its closed loop (in build/model)"
 	@echo "make test    format check, lint, types, layers, tests"
-	@echo "make slow    the tests that make test leaves out: kills, dying clusters, what takes ten seconds of a core"
+	@echo "make slow    the tests that make test leaves out: kills, dying clusters, most long ones"
 	@echo "make faults  the full fault campaigns, as tables"
 	@echo "make lint    the same without tests"
 	@echo "make format  rewrite the code in the project's format"
