@@ -24,6 +24,7 @@ from cyclopts.exceptions import (
 
 from datagen import __version__
 from datagen.cluster.environment import job_environment
+from datagen.console.beginning import began_with_process
 from datagen.console.command_lines import PRINTER, Interrupted
 from datagen.schemas.errors import InputError, one_line, refuse_not_utf8
 from datagen.workers.extras import missing_library
@@ -221,7 +222,7 @@ def main() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:  # closed by the shell (`>&-`): no other file may get its descriptor
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
-    with job_environment():
+    with job_environment(), began_with_process():
         code = run(sys.argv[1:])
     sys.exit(code)
 

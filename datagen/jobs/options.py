@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from rich.console import Console
 
 from datagen.cluster.budget import Budget
 from datagen.cluster.ray_cluster import refuse_unusable
+from datagen.console.beginning import beginning_s
 from datagen.console.command_lines import resumable, words_of
 from datagen.console.options import Whole
 from datagen.jobs.budget_option import parse_budget
@@ -118,8 +118,8 @@ def refuse_odd_n(n: int) -> None:
 
 @contextmanager
 def opening(words: Sequence[str], job_options: JobOptions) -> Generator[float]:
-    """Show that sources are opened, and how to resume after an interrupt; gives the start by the clock."""
-    began_s = time.monotonic()
+    """Show that sources are opened and how to resume after an interrupt; gives the beginning by the clock."""
+    began_s = beginning_s()
     with resumable([*words, *job_options.address_words()]), job_options.display() as shown:
         shown.phase("opening houses and objects")
         yield began_s
