@@ -27,6 +27,7 @@ _DISC_SHARE = 0.55
 _LARGEST_DISC_M = 0.06
 _MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
 _NEAREST_M = 0.02  # to an eye; nearer points are the robot's own
+_EYES_AT_ONCE = 48  # whose sector of points is tested together
 _AT_ONCE = 1 << 16  # pairs of eye and point: bounds memory, and stays in the cache
 
 
@@ -88,20 +89,46 @@ def visible_share(others_m: F32, target_m: F32, radius_m: float, eyes_m: F32) ->
 
 def _hidden(views: Views, others_m: F32, front_m: F32) -> Bools:
     """Cells (N, cells, cells) in which something is clearly nearer to the eye than `front_m`."""
-    hidden = np.zeros(front_m.size, np.bool_)
-    limit_m = np.where(front_m > -np.inf, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
-    nearest_m = limit_m.min((1, 2))
-    step = max(1, _AT_ONCE // max(len(others_m), 1))
-    parts = [slice(start, start + step) for start in range(0, len(front_m), step)]
-    largest = Discs(others_m, others_m, np.full(len(others_m), _LARGEST_DISC_M, np.float32))
+    hidden, limits = np.zeros(front_m.size, np.bool_), Limits.of(front_m)
+    sectors = [views.before(others_m, rows, limits) for rows in views.sectors()]
     asked = np.zeros(len(others_m), np.bool_)  # whose disc could be before a target
-    for rows in parts:
-        asked[views.before(largest, rows, nearest_m[rows])[1]] = True
-    discs = fit_discs(others_m, asked)
-    for rows in parts:
-        eye, disc = views.before(discs, rows, nearest_m[rows])
-        views.hide(discs, rows.start + eye, disc, limit_m.reshape(-1), hidden)
+    for pairs in sectors:
+        asked[pairs.point] = True
+    discs, disc_of = fit_discs(others_m, asked), np.cumsum(asked) - 1
+    if len(discs):
+        for pairs in sectors:
+            disc = disc_of[pairs.point]
+            kept = views.reach(pairs, discs.radius_m[disc], limits)
+            views.hide(discs, pairs.eye[kept], disc[kept], limits, hidden)
     return hidden.reshape(front_m.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """How near something must be to each eye to hide a cell of its window."""
+
+    depth_m: F32  # (N * cells * cells,); inf where the target is not
+    nearest_m: F32  # (N,), the least of them
+    farthest: F32  # (N,), in cells from the window's middle, of a corner of a cell with the target
+    rows: tuple[F32, F32]  # (N,), the first and the last with a cell of the target
+    columns: tuple[F32, F32]
+
+    @classmethod
+    def of(cls, front_m: F32) -> Limits:
+        """Behind `front_m` (N, cells, cells), the target's depths, by the margin."""
+        there = front_m > -np.inf
+        depth_m = np.where(there, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
+        rows, columns = (_bounds(there.any(axis)) for axis in (2, 1))
+        corner = np.abs(np.arange(_CELLS) + 0.5 - _CELLS / 2) + 0.5
+        farthest = (there * np.hypot(corner, corner[:, None])).max((1, 2)).astype(np.float32)
+        return cls(depth_m.reshape(-1), depth_m.min((1, 2)), farthest, rows, columns)
+
+
+def _bounds(there: Bools) -> tuple[F32, F32]:
+    """The first and the last true cell of each row (N, cells); the last is first where there is none."""
+    first = np.where(there.any(1), there.argmax(1), _CELLS).astype(np.float32)
+    last = np.where(there.any(1), _CELLS - 1 - there[:, ::-1].argmax(1), -1).astype(np.float32)
+    return first, last
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +156,16 @@ def fit_discs(points_m: F32, asked: Bools) -> Discs:
     return Discs(centre_m, axes[:, :, 0].astype(np.float32), radius_m.astype(np.float32))
 
 
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of an eye and a point, by their rows."""
+
+    eye: Ints  # (K,)
+    point: Ints  # (K,)
+    along_m: F32  # (K,), of the point, from the target's centre towards the eye
+    beside_m2: F32  # (K,), its squared distance from the line between them
+
+
 class Views:
     """Cameras at eyes (N, 3) that look at the origin, each with a square window of cells around it."""
 
@@ -145,18 +182,46 @@ class Views:
         self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), of the window at the target's centre
         self.per_depth = 2 / _CELLS * self.half_m / self.distance_m  # (N,), of a cell's width, by depth
 
-    def before(self, discs: Discs, rows: slice, nearest_m: F32) -> tuple[Ints, Ints]:
-        """Pairs of eye (an index into `rows`) and disc where the disc reaches into the cone around the eye's
-        window, nearer to the eye than nearest_m (len(rows),).
-        """
-        along_m = self.towards[rows] @ discs.centre_m.T
+    def sectors(self) -> list[Ints]:
+        """Rows of eyes, cut by the direction in which they stand."""
+        turned = np.argsort(np.arctan2(self.towards[:, 1], self.towards[:, 0]), kind="stable")
+        return np.array_split(turned, -(-len(turned) // _EYES_AT_ONCE))
+
+    def before(self, points_m: F32, rows: Ints, limits: Limits) -> Pairs:
+        """Pairs of which the largest disc around the point may be nearer to the eye than the limits."""
+        some = self._beside(points_m, rows, limits)
+        points_m = points_m[some]
+        along_m = self.towards[rows] @ points_m.T
         ahead_m = self.distance_m[rows, None] - along_m
-        slope = np.sqrt(2.0, dtype=np.float32) * self.half_m[rows] / self.distance_m[rows]
-        limit_m = slope[:, None] * ahead_m + discs.radius_m
-        inside = np.einsum("ij,ij->i", discs.centre_m, discs.centre_m) - along_m**2 <= limit_m**2
-        inside &= (ahead_m > _NEAREST_M) & (along_m + discs.radius_m > nearest_m[:, None])
-        eye, disc = np.nonzero(inside)
-        return eye, disc
+        beside_m2 = np.einsum("ij,ij->i", points_m, points_m) - along_m**2
+        limit_m = self._slope(rows, limits)[:, None] * ahead_m + _LARGEST_DISC_M
+        inside = (beside_m2 <= limit_m**2) & (along_m + _LARGEST_DISC_M > limits.nearest_m[rows, None])
+        eye, point = np.nonzero(inside & (ahead_m > _NEAREST_M))
+        return Pairs(rows[eye], some[point], along_m[eye, point], beside_m2[eye, point])
+
+    def reach(self, pairs: Pairs, radius_m: F32, limits: Limits) -> Bools:
+        """Which of the pairs that `before` names stay with discs of these radii (K,)."""
+        eye = pairs.eye
+        limit_m = self._slope(eye, limits) * (self.distance_m[eye] - pairs.along_m) + radius_m
+        return (pairs.beside_m2 <= limit_m**2) & (pairs.along_m + radius_m > limits.nearest_m[eye])
+
+    def _slope(self, rows: Ints, limits: Limits) -> F32:
+        """Radius by depth of the cone around the target's cells, and a hundredth of a cell for rounding."""
+        return self.per_depth[rows] * (limits.farthest[rows] + np.float32(0.01))
+
+    def _beside(self, points_m: F32, rows: Ints, limits: Limits) -> Ints:
+        """Rows of the points that, seen from above, may be before one of these eyes: a superset."""
+        towards = self.towards[rows, :2]
+        angle = np.arctan2(towards[:, 1], towards[:, 0])
+        middle, half = (angle[-1] + angle[0]) / 2, (angle[-1] - angle[0]) / 2
+        behind_m = max(0.0, -float(limits.nearest_m[rows].min())) + _LARGEST_DISC_M
+        widest_m = float((self._slope(rows, limits) * (self.distance_m[rows] + behind_m)).max())
+        widest_m += 2 * _LARGEST_DISC_M
+        flat_m = np.hypot(points_m[:, 0], points_m[:, 1])
+        off = np.abs(np.arctan2(points_m[:, 1], points_m[:, 0]) - middle)
+        off = np.minimum(off, 2 * np.pi - off)
+        ahead = off <= half + np.arcsin(np.minimum(widest_m / np.maximum(flat_m, 1e-6), 1))
+        return np.flatnonzero(ahead | (flat_m <= widest_m + behind_m))
 
     def nearest_m(self, points_m: F32) -> F32:
         """Depth towards the eye of the nearest point of each cell (N, cells, cells), or -inf."""
@@ -175,8 +240,8 @@ class Views:
             np.maximum.at(depths[rows].reshape(-1), cell, along_m[eye, point])
         return depths
 
-    def hide(self, discs: Discs, eye: Ints, disc: Ints, limit_m: F32, hidden: Bools) -> None:
-        """Set the cells of `hidden` (N * cells * cells,) in which a pair's disc is nearer than limit_m.
+    def hide(self, discs: Discs, eye: Ints, disc: Ints, limits: Limits, hidden: Bools) -> None:
+        """Set the cells of `hidden` (N * cells * cells,) in which a pair's disc is nearer than the limits.
 
         A disc projects to an ellipse: in each row of cells it covers those between the roots of a quadratic
         equation. Edge-on it is one cell thick.
@@ -189,7 +254,7 @@ class Views:
         own_x, own_y = np.floor(x), np.floor(y)
         inside = (own_x >= 0) & (own_x < _CELLS) & (own_y >= 0) & (own_y < _CELLS)
         own = np.where(inside, (eye * _CELLS + own_y.astype(np.int64)) * _CELLS + own_x.astype(np.int64), -1)
-        hidden[own[inside & (along_m > limit_m[own])]] = True
+        hidden[own[inside & (along_m > limits.depth_m[own])]] = True
         # The plane's rise towards the eye, by cell.
         normal = discs.normal[disc]
         facing = np.einsum("ij,ij->i", normal, towards)
@@ -200,24 +265,26 @@ class Views:
         cell2, radius_m = cell_m * cell_m, discs.radius_m[disc]
         a, whole = cell2 + rise_x * rise_x, cell2 + rise_x * rise_x + rise_y * rise_y
         reach = radius_m / cell_m * np.sqrt(a / whole)
-        pair, row = _spread(*_within(y, reach))
+        pair, row = _spread(*_within(y, reach, limits.rows, eye))
         dy = row + np.float32(0.5) - y[pair]
         root = (a * radius_m * radius_m)[pair] - (cell2 * whole)[pair] * dy * dy
         half = np.sqrt(np.maximum(root, 0)) / a[pair]
         middle = x[pair] - (rise_x * rise_y / a)[pair] * dy
-        span, column = _spread(*_within(middle, half))
+        span, column = _spread(*_within(middle, half, limits.columns, eye[pair]))
         rows = pair[span]
         cell = ((eye * _CELLS)[pair] + row)[span] * _CELLS + column
         at_m = (along_m[pair] + rise_y[pair] * dy - (rise_x * x)[pair])[span]
         at_m += rise_x[rows] * (column + np.float32(0.5))
-        hidden[cell[(at_m > limit_m[cell]) & (cell != own[rows])]] = True
+        hidden[cell[(at_m > limits.depth_m[cell]) & (cell != own[rows])]] = True
 
 
-def _within(middle: F32, half: F32) -> tuple[Ints, Ints]:
-    """First and last of the cells whose centres lie within `half` of `middle` (K,), in cells."""
-    low = np.clip(np.ceil(middle - half - np.float32(0.5)), 0, _CELLS).astype(np.int32)
-    high = np.clip(np.floor(middle + half - np.float32(0.5)), -1, _CELLS - 1).astype(np.int32)
-    return low, high
+def _within(middle: F32, half: F32, bounds: tuple[F32, F32], of: Ints) -> tuple[Ints, Ints]:
+    """First and last of the cells whose centres lie within `half` of `middle` (K,), in cells, and in the
+    bounds of the eyes `of` (K,).
+    """
+    low = np.clip(np.ceil(middle - half - np.float32(0.5)), bounds[0][of], np.float32(_CELLS))
+    high = np.clip(np.floor(middle + half - np.float32(0.5)), np.float32(-1), bounds[1][of])
+    return low.astype(np.int32), high.astype(np.int32)
 
 
 def _spread(low: Ints, high: Ints) -> tuple[Ints, Ints]:
