@@ -118,7 +118,7 @@ class Limits:
         """Behind `front_m` (N, cells, cells), the target's depths, by the margin."""
         there = front_m > -np.inf
         depth_m = np.where(there, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
-        rows, columns = (_bounds(there.any(axis)) for axis in (2, 1))
+        rows, columns = (_bounds(np.logical_or.reduce(there, axis)) for axis in (2, 1))
         corner = np.abs(np.arange(_CELLS) + 0.5 - _CELLS / 2) + 0.5
         farthest = (there * np.hypot(corner, corner[:, None])).max((1, 2)).astype(np.float32)
         return cls(depth_m.reshape(-1), depth_m.min((1, 2)), farthest, rows, columns)
