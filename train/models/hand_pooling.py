@@ -29,9 +29,9 @@ class HandPooling(nn.Module):
         self.condition = nn.Linear(n_scalars, width)
         self.joined = nn.Sequential(
             nn.LayerNorm(width),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Linear(width, width),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Linear(width, width),
         )
         self.attention = nn.Linear(width, 1)
@@ -41,7 +41,10 @@ class HandPooling(nn.Module):
         measures, axes = poses[..., :N_MEASURES], poses[..., N_MEASURES:]
         room = self.room(measures)[cloud_row]
         seen = from_mount(axes.unflatten(2, (3, 3))[cloud_row], frames)
-        hidden = self.joined(room + self.seen(seen) + self.condition(scalars)[:, None])
+        hidden = self.seen(seen)
+        hidden += room
+        hidden += self.condition(scalars)[:, None]
+        hidden = self.joined(hidden)
         share = torch.softmax(self.attention(hidden), dim=1)
         return torch.cat([hidden.amax(1), hidden.mean(1), (share * hidden).sum(1)], dim=1)
 

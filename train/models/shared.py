@@ -125,7 +125,7 @@ class SharedModel(Model):
         self.pair = nn.Linear(N_PAIR_FEATURES, width, bias=False)
         self.condition = nn.Linear(n_scalars, width, bias=False)
         self.condition_left = nn.Linear(TARGET_VECTORS + TARGET_TENSORS, width, bias=False)
-        self.seen = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        self.seen = nn.Sequential(nn.Linear(width, width), nn.ReLU(inplace=True))
         self.pooled = nn.Sequential(
             nn.Linear(2 * N_KINDS * width, embedding), nn.LayerNorm(embedding), nn.ReLU()
         )
@@ -284,11 +284,16 @@ class SharedModel(Model):
         steering = frames.steering()
         pairs = pair_features(frames, centres_m[:, None])
         weight = self.pair.weight
-        even = same[:, None, 0] + _product(steering, same[:, 1:]) + condition[:, :, None]
-        even = even + pairs[..., 1:] @ weight[:, 1:].T
-        odd = _product(steering, left) + condition_left[:, :, None] + pairs[..., :1] * weight[:, 0]
-        sides = (even + odd, even - odd) if self.sizes.mirrored else (even + odd,)
-        return torch.stack([self._pool_side(torch.relu(side), valid) for side in sides], dim=2)
+        even = _product(torch.nn.functional.pad(steering, (1, 0), value=1.0), same)
+        odd = _product(steering, left)
+        # In place: on a CPU new memory for each step would cost as much as the steps.
+        even += condition[:, :, None]
+        odd += condition_left[:, :, None]
+        rest = pairs[..., 1:].flatten(0, -2).to(even.dtype)
+        even.flatten(0, -2).addmm_(rest, weight[:, 1:].T.to(even.dtype))
+        odd.addcmul_(pairs[..., :1].to(odd.dtype), weight[:, 0].to(odd.dtype))
+        sides = (even + odd, even.sub_(odd)) if self.sizes.mirrored else (even.add_(odd),)
+        return torch.stack([self._pool_side(side.relu_(), valid) for side in sides], dim=2)
 
     def _pool_side(self, tokens: Tensor, valid: Tensor) -> Tensor:
         """Maximum and mean (r, c, F) over each kind of tokens (r, c, J, W)."""
