@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from datagen.train import observed_visibility as ov
@@ -134,6 +134,25 @@ def test_estimate_equals_every_disc_against_every_cell(seed: int) -> None:
     rows = np.flatnonzero(np.linalg.norm(eyes, axis=1) > 1.05 * RADIUS_M)[:6]
     # A cell at a disc's very rim may fall to either side by rounding.
     np.testing.assert_allclose(found[rows], [plain_share(others, eyes[row]) for row in rows], atol=0.02)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 10_000))
+def test_testing_eyes_by_sectors_changes_nothing(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    heaps = np.repeat(rng.normal(0, [0.3, 0.3, 0.15], (8, 3)), 30, axis=0)
+    others = np.concatenate([table(-0.07, 0.05), rng.normal(heaps, 0.03)]).astype(np.float32)
+    eyes = rng.normal(0, [0.5, 0.5, 0.5], (60, 3)).astype(np.float32)
+    eyes[0] = [0, 0, 0.8]  # straight above
+    flat = (sphere() * rng.uniform(0.2, 1, 3)).astype(np.float32)  # fills a part of the window
+    shares: list[np.ndarray] = []
+    for at_once in (1, 7, 60):
+        monkeypatch.setattr(ov, "_EYES_AT_ONCE", at_once)
+        shares.append(visible_share(others, flat, RADIUS_M, eyes))
+    assert shares[0].std() > 0.05
+    # A cell at a disc's very rim may fall to either side by rounding.
+    np.testing.assert_allclose(shares[0], shares[2], atol=0.02)
+    np.testing.assert_allclose(shares[1], shares[2], atol=0.02)
 
 
 def test_a_table_hides_what_stands_on_it_only_from_below() -> None:
