@@ -144,7 +144,7 @@ def _report(
         raise InputError("datagen frontier", "--test", problem, "Name a larger run, of --candidates in-range")
     points = points_of(results, TestSet(label, scene), costs, bootstrap, seed)
     found = study(points, costs, cpu_h, target_accuracy)
-    draw_frontier(found, priced.currency, out / "frontier.svg")
+    draw_frontier(points, priced.currency, out / "frontier.svg")
     counts = {"candidates": len(label), "scenes": int(scene.max()) + 1, "positives": int(label.sum())}
     return frontier_record(found, priced, cpu_h, {"test_set": counts})
 

@@ -8,33 +8,42 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from datagen.frontier.points import METRICS, Point, efficient
-from datagen.frontier.study import Study
 from datagen.schemas.styles import MODEL_COLOURS, MODEL_MARKERS
 
 _WORDS = {"balanced_accuracy": "balanced accuracy within reach (%)", "area_under_roc": "AUC within reach (%)"}
 
 
-def draw_frontier(study: Study, currency: str, file: Path) -> None:
+def draw_frontier(points: Sequence[Point], currency: str, file: Path) -> None:
     """Write the picture; the ending of `file` chooses its format."""
+    metadata = {"Date": None} if file.suffix == ".svg" else None
+    frontier_figure(points, currency).savefig(file, metadata=metadata)
+
+
+def frontier_figure(points: Sequence[Point], currency: str) -> Figure:
+    """The picture, a panel for each metric."""
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     panels = figure.subplots(1, len(METRICS))
-    names = list(dict.fromkeys(point.mixture.name for point in study.points))
+    names = list(dict.fromkeys(point.mixture.name for point in points))
     for ax, metric in zip(panels, METRICS, strict=True):
         for k, name in enumerate(names):
-            points = [point for point in study.points if point.mixture.name == name]
-            _draw_line(ax, points, metric, k)
-        _ring_efficient(ax, study.points, metric)
+            _draw_line(ax, [point for point in points if point.mixture.name == name], metric, k)
+        _ring_efficient(ax, points, metric)
         ax.set(xscale="log", xlabel="core-hours of labels", ylabel=_WORDS[metric])
+        low, high = ax.get_xlim()
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 300 * low else (1,)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.grid(color="#e4e4e4", lw=0.7)
         ax.set_axisbelow(True)
-    dearest = max(study.points, key=lambda point: point.cpu_h)
+    dearest = max(points, key=lambda point: point.cpu_h)
     rate = dearest.money / dearest.cpu_h if dearest.cpu_h else 0.0
     handles, words = panels[0].get_legend_handles_labels()
     title = f"trained on, in this order; 1 core-hour of labels costs about {rate:.3g} {currency}"
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False, title=title)
-    figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
+    return figure
 
 
 def _draw_line(ax: Axes, points: Sequence[Point], metric: str, k: int) -> None:
