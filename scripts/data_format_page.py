@@ -47,27 +47,26 @@ RUN/
 
 Every JSON record ends with the sha256 of all bytes before it: its last key, on a line of its own.
 
-Only commits count: a shard's files mean nothing without one. Shards hold whole scenes and are equally long;
-the last one is computed whole and `data.zarr` is cut to n samples. Rows are sorted by scene, then by
-candidate. [How a run is stored](../explanation/runs.md) says why.
+A shard's files count only once its commit exists. Shards hold whole scenes and are equally long; the last one
+is computed whole, and `data.zarr` is cut to n samples. Rows are sorted by scene, then by candidate
+([how a run is stored](../explanation/runs.md)).
 
 ## Arrays
 
-Every array lies at the root of its group. The first dimension is `scene` or `sample`. Chunks hold
-the rows of one shard, or an equal part of them where a shard's rows exceed {MAX_CHUNK_BYTES // 2**20} MiB.
-Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written,
-so a missing file is damage, and a fill value never stands for rows that were not stored.
-Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`,
-and `flag_meanings`: the words that the codes 0, 1, ... stand for.
+Every array lies at the root of its group; its first dimension is `scene` or `sample`. Chunks hold the rows of
+one shard, or an equal part of them where these exceed {MAX_CHUNK_BYTES // 2**20} MiB.
+Codecs: little-endian bytes (text: vlen-utf8), zstd level {ZSTD_LEVEL}, crc32c. Every chunk is written, so a
+missing file is damage.
+Attributes: `units` (SI, `1` for numbers without one), `long_name`, `frame`, `valid_min`, `valid_max`, and
+`flag_meanings`, the words for the codes 0, 1, ...
 
-`data.zarr` has consolidated metadata. Its root's attributes hold the specification and, by the conventions
-{CONVENTIONS}, `title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`,
-`history` and `comment`; they follow from the specification and n alone. Its arrays also have
-`coordinates`, and `flag_values` with `flag_meanings`. Stores that an older program sealed lack these
-attributes and remain valid; sealing again adds them.
+`data.zarr` has consolidated metadata. Its root attributes hold the specification and, by {CONVENTIONS},
+`title`, `summary`, `source`, `license` and `acknowledgement` of the assets, `references`, `history` and
+`comment`. Its arrays also have `coordinates`, and `flag_values` with `flag_meanings`. Stores that an older
+program sealed lack these attributes and remain valid; sealing again adds them.
 
-A run of selected candidates ([estimate](../guides/estimate.md#select)) has one more array of samples:
-`selection_probability` (float64), the probability with which the candidate, its scene included, was selected.
+A run of selected candidates ([estimate](../guides/estimate.md#select)) also stores `selection_probability`
+(float64) for each sample: the probability with which the candidate, its scene included, was selected. Its
 `scene_index` and `candidate_index` are those of the run that it was selected from.
 
 [Read the data](../guides/read-data.md) opens a store; [Python](../guides/python.md#tables-of-candidates)
