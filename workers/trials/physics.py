@@ -34,7 +34,7 @@ with warnings.catch_warnings():
 THING, STILL, PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
 ARM, SHOULDER, CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
-# With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep (docs/explanation/trials.md).
+# With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep.
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 40, 8
 # Of the arm while nothing is within `NEAR_M` of it: its drives alone need no more.
 FREE_ITERATIONS, NEAR_M = (4, 1), 0.003

@@ -23,7 +23,6 @@ pytestmark = needs_sim
 TINY = {
     "n_points": 64, "tokens": [4, 4, 4], "scales_m": [0.1], "width": 4, "embedding": 8, "head": [8],
 }  # fmt: skip
-# The example of docs/results/benchmark.md is held to this by tests/docs/test_benchmark_card.py.
 SCORER = """
 import numpy as np
 
