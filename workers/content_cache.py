@@ -34,7 +34,7 @@ _ABANDONED_S = 3600.0  # an incomplete file of this age belongs to a killed proc
 def cache_folder() -> Path:
     """`DATAGEN_CACHE`, else `datagen` in the user's cache folder (XDG base directories).
 
-    Where the user has no home, a path that holds nothing: one below /tmp could be another user's.
+    If the user has no home, an unusable path below /dev/null: one in /tmp could be another user's.
     """
     if explicit := os.environ.get("DATAGEN_CACHE"):
         return Path(explicit)
@@ -47,15 +47,15 @@ def cache_folder() -> Path:
 
 @dataclass(frozen=True)
 class CacheFolder:
-    """Named arrays in one folder of the cache, each file under the key of all that decides its content."""
+    """Named arrays in one folder of the cache; a file's key covers everything that decides its content."""
 
     folder: str  # below the cache folder
     layout: Layout
-    most_files: int  # beyond it the least recently used are removed
+    most_files: int  # above it, the least recently used are removed
     most_bytes: int  # a larger file is not read
 
     def load(self, key: str) -> dict[str, npt.NDArray[Any]] | None:
-        """The arrays stored under a key, or None; reading counts as use."""
+        """The arrays stored under a key, or None. Reading counts as use."""
         path = self._path(key)
         found = read_arrays(path, {**self.layout, "key": (np.str_, ())}, self.most_bytes)
         if found is None or str(found.pop("key")) != key:
@@ -64,7 +64,7 @@ class CacheFolder:
         return found
 
     def store(self, key: str, arrays: Arrays) -> None:
-        """Keeps arrays of the layout, where the folder takes them."""
+        """Stores arrays of the layout if the folder can be written."""
         path = self._path(key)
         if write_arrays(path, {**arrays, "key": np.array(key)}):
             drop_unused(path.parent, self.most_files)
@@ -74,7 +74,7 @@ class CacheFolder:
 
 
 def read_arrays(path: Path, layout: Layout, most_bytes: int) -> dict[str, npt.NDArray[Any]] | None:
-    """The arrays of an uncompressed npz file, or None where it is anything but the layout, whole."""
+    """The arrays of an uncompressed npz file; None if it is damaged or does not match the layout."""
     arrays: dict[str, npt.NDArray[Any]] = {}
     try:
         status = path.stat()
@@ -84,7 +84,7 @@ def read_arrays(path: Path, layout: Layout, most_bytes: int) -> dict[str, npt.ND
             if {info.filename for info in archive.infolist()} != {f"{name}.npy" for name in layout}:
                 return None
             for info in archive.infolist():
-                # Compressed, a small file may hold more than memory.
+                # A small compressed file may unpack to more than the memory.
                 if info.compress_type != zipfile.ZIP_STORED:
                     return None
                 content = io.BytesIO(archive.read(info))  # checks the CRC before anything is parsed
@@ -107,7 +107,7 @@ def _fits(arrays: Arrays, layout: Layout) -> bool:
 
 
 def write_arrays(path: Path, arrays: Arrays) -> bool:
-    """Writes what `read_arrays` reads; False where the folder does not take it."""
+    """Writes a file for `read_arrays`; False if the folder cannot be written."""
     contents: Any = dict(arrays)
     try:
         with whole_file(path) as file:
@@ -118,18 +118,18 @@ def write_arrays(path: Path, arrays: Arrays) -> bool:
 
 
 def refresh(path: Path) -> bool:
-    """Marks a file as used now; whether it is there."""
+    """Marks a file as used now; returns whether it exists."""
     try:
         os.utime(path)
     except OSError:
-        return path.is_file()  # also where its time is not ours to change
+        return path.is_file()  # the file may belong to another user
     return True
 
 
 def drop_unused(folder: Path, most: int, idle_s: float = 0.0) -> None:
-    """Where a folder has more than `most` files, drops the longest unused and an eighth more.
+    """Reduces a folder with more than `most` files to 7/8 of `most`, least recently used first.
 
-    Keeps files used within `idle_s`, however many. What killed processes left half written goes too.
+    Keeps files used within `idle_s`, however many. Also removes incomplete files of killed processes.
     """
     try:
         paths = list(folder.iterdir())
@@ -140,7 +140,7 @@ def drop_unused(folder: Path, most: int, idle_s: float = 0.0) -> None:
     files: list[tuple[float, Path]] = []
     now = time.time()
     for path in paths:
-        # Another process may drop the same files meanwhile.
+        # Another process may remove the same files meanwhile.
         with contextlib.suppress(OSError):
             status = path.lstat()
             if not stat.S_ISREG(status.st_mode):
@@ -159,7 +159,7 @@ def drop_unused(folder: Path, most: int, idle_s: float = 0.0) -> None:
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Generator[None]:
-    """Holds off other processes that ask for the same folder. Raises OSError where it cannot be written."""
+    """Locks a folder against other callers. Raises OSError if the folder cannot be written."""
     with (folder / ".lock").open("ab") as file:
         with contextlib.suppress(OSError):  # some network file systems have no locks
             fcntl.flock(file, fcntl.LOCK_EX)

@@ -1,7 +1,7 @@
-"""What each extra of the package brings, and how to get one that is missing.
+"""The libraries of each extra of the package, and how to install a missing one.
 
-The package's name on a public index may belong to others, so advice names where this copy was installed from,
-or else the libraries themselves.
+The package's name on a public index may belong to another project. The command therefore names the source
+of this installation, or else the libraries themselves.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Extra:
     """An extra of pyproject.toml."""
 
     gives: str
-    brings: dict[str, str]  # import name -> what pip calls it
+    brings: dict[str, str]  # import name -> name for pip
 
     def missing(self) -> list[str]:
         """The import names that are not installed."""
@@ -60,9 +60,9 @@ EXTRAS: dict[str, Extra] = {
 
 
 def how_to_get(extra: str) -> str:
-    """The sentence that says how to install what is missing of an extra."""
+    """The sentence with the command that installs the missing libraries of an extra."""
     missing = EXTRAS[extra].missing()
-    # Robots' files of ManiSkill alone: on new versions of Python the extra comes without it.
+    # On new versions of Python the extra lacks ManiSkill, which contains the robots' files.
     if missing == ["mani_skill"]:
         return "Install it: pip install --no-deps mani-skill"
     command = _from_origin(extra)
@@ -72,20 +72,20 @@ def how_to_get(extra: str) -> str:
 
 
 def refuse_missing(extra: str, otherwise: str = "") -> None:
-    """Raise InputError where a library of the extra is not installed; `otherwise` is another way out."""
+    """Raise InputError where a library of the extra is not installed; `otherwise` is an alternative."""
     if missing := EXTRAS[extra].missing():
         fix = ", ".join(filter(None, (how_to_get(extra), otherwise)))
         raise InputError(", ".join(missing), "", "is not installed", fix)
 
 
 def missing_library(error: Exception, preferred: str = "") -> InputError | None:
-    """The one line for a library of an extra that is not installed; None for any other error.
+    """The error for a library of an extra that is not installed; None for any other exception.
 
-    `preferred` is the extra to name where several bring the library.
+    `preferred` is the extra to name if several contain the library.
     """
     lacking = error.__cause__ if isinstance(error.__cause__, ModuleNotFoundError) else error
     name = (lacking.name or "").partition(".")[0] if isinstance(lacking, ModuleNotFoundError) else ""
-    # A distribution whose version is asked for is missed by its own name.
+    # PackageNotFoundError holds the name of the distribution, not of the import.
     found = [key for key, extra in EXTRAS.items() if name in extra.brings or name in extra.brings.values()]
     if not found:
         return None
@@ -94,7 +94,7 @@ def missing_library(error: Exception, preferred: str = "") -> InputError | None:
 
 
 def _from_origin(extra: str) -> str | None:
-    """The pip command that adds an extra to this installation, None where its origin is not known."""
+    """The pip command that adds an extra to this installation; None if its origin is unknown."""
     try:
         text = Distribution.from_name(DISTRIBUTION).read_text("direct_url.json")
         origin: Any = json.loads(text or "{}")

@@ -19,7 +19,7 @@ _MOST_PARTS = 4_000_000
 
 @dataclass(frozen=True)
 class JsonNode:
-    """A JSON value; `place` is the file (and line), `path` where in the document it stands."""
+    """A JSON value; `place` is the file (and line), `path` its location in the document."""
 
     place: str
     path: str
@@ -30,7 +30,7 @@ class JsonNode:
         return InputError(self.place, self.path, problem, fix)
 
     def get(self, key: str) -> JsonNode:
-        """The member of an object; it must be there."""
+        """The member of an object. Raises InputError if it is absent."""
         members = self._members()
         if key not in members:
             raise self.error(f"has no key {key!r}")
@@ -62,9 +62,9 @@ class JsonNode:
         return float(value)
 
     def text(self) -> str:
-        """A string of at most 500 printable characters: records and arrays of a run repeat it."""
+        """A string of at most 500 printable characters, as it is copied into records and arrays."""
         if not isinstance(self.value, str):
-            raise self.error(f"is {_kind(self.value)}, not a text")
+            raise self.error(f"is {_kind(self.value)}, not a string")
         if len(self.value) > _LONGEST_TEXT:
             raise self.error(f"has {len(self.value)} characters, more than {_LONGEST_TEXT}")
         if not self.value.isprintable():
@@ -73,7 +73,7 @@ class JsonNode:
         return self.value
 
     def point(self) -> tuple[float, float, float]:
-        """`{x, y, z}` as it stands, each finite and within 1000 m."""
+        """The unconverted numbers of `{x, y, z}`, each finite and within 1000 m of 0."""
         return (
             self.get("x").number(-EXTENT_M, EXTENT_M),
             self.get("y").number(-EXTENT_M, EXTENT_M),
@@ -109,8 +109,8 @@ def _kind(value: object) -> str:
     names: dict[type, str] = {
         dict: "an object",
         list: "a list",
-        str: "a text",
-        bool: "a truth value",
+        str: "a string",
+        bool: "a boolean",
         int: "a number",
     }
     return "null" if value is None else names.get(type(value), "a number")

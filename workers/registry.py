@@ -15,7 +15,7 @@ from datagen.workers.extras import missing_library
 
 
 def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
-    """Return the entry of a registry. `option` is where the name was given, for the error.
+    """Return the entry of a registry. `option` is the command-line option to name in errors.
 
     Raises InputError for an unknown name, listing the valid ones, and for an engine that cannot be
     imported on this machine.
@@ -37,7 +37,7 @@ def entry(registry: Mapping[str, str], name: str, option: str) -> Any:
 def open_source(registry: Mapping[str, str], ref: str, option: str) -> Any:
     """Open the source of a reference `kind` or `kind:text`.
 
-    Raises InputError as `entry` does, and for a folder without its kind.
+    Raises InputError as `entry` does, and for a folder without a kind.
     """
     kind, _, text = ref.partition(":")
     if kind not in registry and "/" in kind:

@@ -1,6 +1,6 @@
 """Compute one shard, from scene indices to checked arrays. Read this first.
 
-draw a house, a support, a target and clutter   (resampled until it works)
+draw a house, a support, a target and clutter   (resampled until accepted)
 settle them by physics
 sample base candidates
 observe one RGB-D frame                         (or reconstruct scene and candidates from a stored run)
@@ -52,12 +52,11 @@ def run_shard(
     stored: Iterable[SceneRows] | None = None,
     schema_version: int | None = None,
 ) -> ShardResult:
-    """Make the scenes of these indices, or take them from `stored`, and label their candidates.
+    """Generate the scenes of these indices, or read them from `stored`, and label their candidates.
 
     The same specification and index give the same bytes, whatever else is in the shard. Stored
-    scenes keep theirs. What an older `schema_version` does not store is left out. Raises InputError
-    where a stored scene is another one than its index says, or its house and objects are not those of
-    the world.
+    scenes keep their bytes. Fields that an older `schema_version` lacks are left out. Raises InputError
+    if a stored scene does not match its index, or its house and objects are not those of the world.
     """
     source, spec_hash = load_label_source(spec.label_source), spec.hash()
     schema = sized_schema(source.schema, spec, schema_version)
@@ -83,7 +82,7 @@ def run_shard(
     scene_columns = {
         f.name: _stack(f.dtype, [row[f.name] for row in scene_rows]) for f in schema.scene_fields
     }
-    # All that the source gave: a column that no version knows is its defect.
+    # All other columns of the source: the check below rejects one that no schema version has.
     names = [name for name in sample_blocks[0] if name not in schema.later]
     sample_columns = {name: np.concatenate([b[name] for b in sample_blocks]) for name in names}
     schema.check("scene", len(scene_rows), scene_columns)
@@ -143,7 +142,7 @@ def intrinsics_px(camera: Camera) -> tuple[float, float, float, float]:
 def candidate_columns(
     scene_index: int, candidates: SceneCandidates, spec_hash: str, source: LabelSource
 ) -> Columns:
-    """The columns that the candidates alone decide, one row a candidate."""
+    """The columns that depend on the candidates alone, one row per candidate."""
     n, index = len(candidates), candidates.index
     return {
         "sample_id": sample_ids(spec_hash, scene_index, index),

@@ -31,13 +31,13 @@ _TARGETS = CacheFolder("targets", {"names": (np.str_, ("objects",))}, most_files
 
 @dataclass(frozen=True, eq=False)
 class PreparedHouse:
-    """A house with what is derived from it once, when first asked: many a try ends before."""
+    """A house and the geometry derived from it, built on first use: many tries end before."""
 
     house: House
 
     @property
     def rays(self) -> RayMesh:
-        """The hierarchy over the whole house."""
+        """The ray hierarchy over the whole house."""
         return house_rays(self.house)
 
     @cached_property
@@ -69,7 +69,7 @@ class World:
         try:
             prepared = PreparedHouse(self.houses.load(house_id))
         except InputError as error:
-            # A scene may draw it as often as it may retry.
+            # Stored, because later tries may draw the same house.
             self._bad_houses[house_id] = (error.place, error.field, error.problem, error.fix)
             raise
         self._houses[house_id] = prepared
@@ -85,9 +85,9 @@ class World:
     def draw_target(self, rng: np.random.Generator) -> str:
         """A target's name, each equally likely.
 
-        For an arm targets are what its gripper was found to hold. That takes seconds an object, the
-        first time on a machine, so only objects that are drawn are looked at. Raises InputError where
-        there is none.
+        With an arm, targets are the objects that its gripper can grasp. The first check of an object on
+        a machine takes seconds, so only objects that are drawn are checked. Raises InputError if no
+        object can be grasped.
         """
         if self.spec.arm is None:
             return self.target_names[rng.integers(len(self.target_names))]
@@ -119,7 +119,7 @@ class World:
 
 
 def _target_names(objects: ObjectSource) -> list[str]:
-    """The objects that fit a gripper, cached by the source's content: asking loads every object."""
+    """Names of the objects that fit a gripper, cached by the source's content: a check loads them all."""
     key = f"{objects.kind}-{objects.digest}-{GRIPPER_VERSION}"
     stored = _TARGETS.load(key)
     if stored is None:
@@ -132,8 +132,8 @@ def _target_names(objects: ObjectSource) -> list[str]:
 def open_world(spec: Specification, houses: str, objects: str) -> World:
     """Open the sources that `houses` and `objects` name, and check that they are the specified ones.
 
-    Raises InputError where a source has other content than the specification says, or where it
-    holds too few houses, objects or targets.
+    Raises InputError if the content of a source differs from the specification, or if it holds too few
+    houses, objects or targets.
     """
     house_source, object_source = open_houses(houses), open_objects(objects)
     for option, ref, source, wanted in (
@@ -154,7 +154,7 @@ def open_world(spec: Specification, houses: str, objects: str) -> World:
 def assemble_world(
     spec: Specification, houses: HouseSource, objects: ObjectSource, houses_ref: str, objects_ref: str
 ) -> World:
-    """A world over opened sources. Raises InputError where they hold too little for the specification."""
+    """A world over opened sources. Raises InputError if they hold too little for the specification."""
     house_ids = ids_of_split(houses, spec.split)
     if not house_ids:
         raise InputError(

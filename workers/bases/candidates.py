@@ -20,7 +20,7 @@ Bools = npt.NDArray[np.bool_]
 
 # Rounds over all cells, each with new jitter, in which a robot must find its positions.
 ROUNDS = 8
-# Robots drawn for each one that a scene needs, before the scene is rejected.
+# Robots sampled per robot that a scene needs, before the scene is rejected.
 DRAWS_A_ROBOT = 16
 
 
@@ -34,7 +34,7 @@ class SceneCandidates:
     base_height_m: F32  # (N,)
     arm_reach_m: F32  # (N,)
     clearance_m: F32  # (N,), free distance around the robot's body; below 0 it does not fit
-    # (N,), of each candidate in its scene; by default these are all candidates of the scene.
+    # (N,), index of each candidate in its scene; by default 0 to N - 1
     index: npt.NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
 
     def __post_init__(self) -> None:
@@ -79,18 +79,18 @@ def draw_candidates(
     to `robots_per_scene` robots, so that a model encodes a scene once per robot; or each has its own robot,
     as in the paper.
 
-    With `within`, robots are drawn from their ranges, one after another, and those stay that find a position
-    in the set for each of their candidates; so a robot's sizes are distributed as in the ranges, given that
-    this target has room for it. Its positions are in the first cells that serve in `ROUNDS` rounds, each over
-    all cells in random order and with new jitter. The scene's robots share the rounds, and use a cell of a
-    round once. Returns None where of `DRAWS_A_ROBOT` times as many robots too few find their positions.
+    With `within`, robots are sampled from their ranges one after another. A robot is kept if each of its
+    candidates finds a position in the set; its sizes are then distributed as in the ranges, given that this
+    target has room for it. There are `ROUNDS` rounds, each over all cells in random order with new jitter,
+    and a robot uses the first cells in the set. The scene's robots share the rounds and use each cell of a
+    round once. Returns None if too few of `DRAWS_A_ROBOT` times the needed robots are kept.
     """
     n = params.count
     n_robots = n if params.robot_per_candidate else min(params.robots_per_scene, n)
     robot_index = (np.arange(n) % n_robots).astype(np.int16)
     if params.within is None:
         base_xy_m = (target_center_m[:2] + _offsets(params, rng)).astype(np.float32)
-        return _stand(base_xy_m, robot_index, _draw_robots(params, n_robots, rng), obstacles, params)
+        return _with_clearance(base_xy_m, robot_index, _draw_robots(params, n_robots, rng), obstacles, params)
     drawn = _draw_robots(params, DRAWS_A_ROBOT * n_robots, rng)
     rounds = _Rounds(target_center_m, obstacles, params, rng)
     base_xy_m = np.empty((n, 2), np.float32)
@@ -102,7 +102,7 @@ def draw_candidates(
             base_xy_m[own] = found
             kept.append(robot)
             if len(kept) == n_robots:
-                return _stand(base_xy_m, robot_index, drawn.rows(kept), obstacles, params)
+                return _with_clearance(base_xy_m, robot_index, drawn.rows(kept), obstacles, params)
     return None
 
 
@@ -149,7 +149,7 @@ def _stepped(reach_m: F32, params: CandidateParams) -> F32:
     return np.clip(whole, limits.low, limits.high).astype(np.float32)
 
 
-def _stand(
+def _with_clearance(
     base_xy_m: F32,
     robot_index: npt.NDArray[np.int16],
     robots: _SceneRobots,
@@ -165,7 +165,7 @@ def _stand(
 
 
 class _Rounds:
-    """Rounds over the cells around a target, from which robots take the positions that are in the set."""
+    """Rounds over the cells around a target, which give robots positions in the set."""
 
     def __init__(
         self,
@@ -177,28 +177,28 @@ class _Rounds:
         cells = grid_offsets(params)
         self._target_m, self._obstacles, self._params = target_center_m, obstacles, params
         self._n_cells = len(cells)
-        # Of all rounds, one after the other.
+        # The cells of all rounds, one round after the other.
         self._cell = np.concatenate([rng.permutation(len(cells)) for _ in range(ROUNDS)])
         self._xy_m = (target_center_m[:2] + _jittered(cells[self._cell], params, rng)).astype(np.float32)
         self._free = np.ones(len(self._cell), np.bool_)
-        # How far two positions in one cell can be apart.
+        # Largest distance between two positions in one cell.
         step_m = 2 * params.grid_half_width_m / (params.grid_cells - 1)
         self._apart_m = np.sqrt(2.0) * step_m if params.jitter else 0.0
-        # Of the first round, those that any robot can take, or could elsewhere in their cells.
+        # Rows of the first round with a position in the cell that the longest arm reaches; all for "clear".
         first_m = self._xy_m[: len(cells)].astype(np.float64) - target_center_m[:2]
         far_m = np.inf if params.within == "clear" else params.arm_reach_m.high + self._apart_m
         self._first = np.flatnonzero(np.linalg.norm(first_m, axis=1) <= far_m)
         self._around = self._distances(self._xy_m[self._first])
-        # A cell may be indoors in part.
+        # Only part of a cell may be indoors.
         self._unbounded = replace(self._around, indoors=np.ones_like(self._around.indoors))
 
     def take(self, robots: _SceneRobots, robot: int, n: int) -> F32 | None:
-        """Positions (n, 2), world, for a robot, which are not free any more; None where it finds fewer."""
+        """Positions (n, 2), world, for a robot, now marked as used; None if fewer are free and in the set."""
         rows = self._first
         margin_m = self._margins_m(self._xy_m[rows], self._around, robots, robot)
         found = rows[(margin_m >= 0) & self._free[rows]]
         if len(found) < n:
-            # Clearance and distance change by no more than the way between two positions in a cell.
+            # Within a cell, clearance and distance differ by at most the distance between positions.
             is_possible = np.zeros(self._n_cells, np.bool_)
             anywhere_m = self._margins_m(self._xy_m[rows], self._unbounded, robots, robot)
             is_possible[self._cell[rows[anywhere_m >= -self._apart_m]]] = True
@@ -221,7 +221,7 @@ class _Rounds:
         return distances_from_obstacles(xy_m.astype(np.float64), self._obstacles, highest_m, around_m)
 
     def _margins_m(self, xy_m: F32, around: ObstacleDistances, robots: _SceneRobots, robot: int) -> F32:
-        """The lesser of clearance and reach left (N,); not negative for positions in the set."""
+        """The smaller of clearance and remaining reach (N,); not negative for positions in the set."""
         camera_m, mount_m, reach_m = (
             column[robot] for column in (robots.camera_height_m, robots.base_height_m, robots.arm_reach_m)
         )

@@ -48,7 +48,7 @@ def obstacles_of(house: House) -> Obstacles:
 class ObstacleDistances:
     """Distances of N positions from the obstacles around them, computed once for robots of any size."""
 
-    distance_m: F64  # (N, P), negative inside; of obstacles that are near any of the positions
+    distance_m: F64  # (N, P), negative inside; only for obstacles near any of the positions
     low_m: F64  # (P,)
     high_m: F64  # (P,)
     indoors: npt.NDArray[np.bool_]  # (N,)
@@ -60,7 +60,7 @@ class ObstacleDistances:
         base_radius_m: F64 | np.float64,
         mast_radius_m: float,
     ) -> F32:
-        """Clearance (N,) of robots' bodies; each of their sizes is one number, or one a position (N,)."""
+        """Clearance (N,) of robots' bodies, metres; each size is a scalar or one value per position (N,)."""
         mount_m, camera_m, base_m = (
             np.broadcast_to(np.asarray(size, np.float64), len(self.distance_m))[:, None]
             for size in (base_height_m, camera_height_m, base_radius_m)

@@ -1,1 +1,1 @@
-"""Bodies of furniture and small things from the type and size of an asset, for houses that have no meshes."""
+"""Bodies of furniture and small objects from the type and size of an asset, for houses without meshes."""

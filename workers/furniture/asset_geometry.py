@@ -1,4 +1,4 @@
-"""From an asset to its body: the shape of its type, scaled to its size, in a colour of its own."""
+"""Bodies of assets: the shape of the type, scaled to the asset's size, in a colour of its own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CLAY: tuple[Rgb, ...] = ((196, 110, 74), (220, 214, 202), (96, 118, 134), (148,
 _GLASS: tuple[Rgb, ...] = ((96, 140, 110), (150, 176, 186), (110, 70, 48))
 _CARD: tuple[Rgb, ...] = ((186, 146, 100), (170, 130, 88))
 
-# Shape and palette of every type that has its own; the rest are told apart by their proportions.
+# Shape and palette of every type that has its own; proportions decide the shape of other types.
 SHAPES: dict[str, tuple[Shape, tuple[Rgb, ...]]] = {
     "AlarmClock": (s.appliance, _PLASTIC),
     "Apple": (s.pebble, ((178, 42, 40), (120, 160, 60), (206, 160, 60))),
@@ -129,6 +129,6 @@ def asset_geometry(asset: Asset) -> tuple[Mesh, tuple[F32, ...]]:
 
 
 def _by_proportions(asset: Asset) -> Shape:
-    """Round where the footprint is about square, else a box."""
+    """A column if the footprint is about square, else a box."""
     width, depth, _ = asset.size_m
     return s.column if 0.8 < width / depth < 1.25 else s.block

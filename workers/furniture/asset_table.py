@@ -21,8 +21,8 @@ _THINNEST_M = 1e-4
 class Asset:
     """One asset in its own frame: x right, y front, z up, base at z = 0, metres.
 
-    `rest_height_m` is the height above the base on which things stand, None where nothing does or
-    nothing is known; `levels_m` are further heights on which things were seen to stand.
+    `rest_height_m` is the height above the base at which objects rest, None if none do or it is
+    unknown; `levels_m` are further heights at which objects were observed.
     """
 
     asset_id: str
@@ -82,7 +82,7 @@ def _own_entry(key: str, entry: JsonNode) -> Asset:
     basis = entry.find("surface_basis")
     rest_height_m = None if rest is None else rest.number(0.0, 2 * _MAX_SIZE_M)
     if basis is not None and basis.text() == "observed_lifted_5cm_over_bbox_top":
-        rest_height_m = height  # everything seen on it hung in the air
+        rest_height_m = height  # all objects observed on it floated
     found = entry.find("observed_support_levels")
     nodes = [] if found is None else list(found.items(100))
     levels = sorted(n.get("height_m").number(0.0, 2 * _MAX_SIZE_M) for n in nodes)

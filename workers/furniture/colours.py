@@ -1,4 +1,4 @@
-"""Plausible colours: by material name where one is known, else stable per asset."""
+"""Plausible colours: by the name of a known material, else stable per asset."""
 
 from __future__ import annotations
 

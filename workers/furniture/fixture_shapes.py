@@ -42,7 +42,7 @@ def toilet(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def sink(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A basin with a rim, on a pedestal where it stands on the floor."""
+    """A basin with a rim, on a pedestal if it stands on the floor."""
     x, y, height = asset.halves_m
     rim = min(height, 0.86) if height > 0.5 else height
     deep = min(0.16, rim) if rim < 0.3 else 0.16
@@ -73,7 +73,7 @@ def washing_machine(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def stove(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """An oven with a glass door below four plates."""
+    """An oven with a glass door below four hotplates."""
     x, y, height = asset.halves_m
     radii = (0.28 * x, 0.28 * y)
     plates = [

@@ -10,7 +10,7 @@ from datagen.workers.furniture.support_tops import hutch_depth_m, top_height_m, 
 _CUSHION_PILLOW: Rgb = (232, 228, 220)
 _DARK: Rgb = (44, 44, 48)
 _WHITE: Rgb = (236, 236, 234)
-# Height of a sofa's seat where nothing was seen to rest on it, as a share of the whole.
+# Height of a sofa's seat as a share of the sofa's height, if no object was observed on it.
 SOFA_SEAT_SHARE = 0.46
 
 
@@ -64,7 +64,7 @@ def counter(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[ColouredSolid]:
-    """Door leaves in front of the back run, as far as no wing hides it."""
+    """Door leaves in front of the part of the back run that no wing hides."""
     runs = top_rectangles(asset)
     low = runs[2].x[1] if len(runs) == 3 else runs[0].x[0]
     high = runs[1].x[0] if len(runs) > 1 else runs[0].x[1]
@@ -83,7 +83,7 @@ def _cupboard_doors(asset: Asset, top: float, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def desk(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A top on a side panel, a back panel and drawers, open at the front; a hutch where it is higher."""
+    """A top on a side panel, a back panel and drawers, open at the front; a hutch on a higher desk."""
     x, y, height = asset.halves_m
     top = top_height_m(asset)
     board = (top - 0.035, top)
@@ -149,7 +149,7 @@ def tv_stand(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def shelf(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """Sides, a back and boards: where things were seen to stand, else evenly spaced."""
+    """Sides, a back and boards: at heights of observed objects, else evenly spaced."""
     x, y, _ = asset.halves_m
     top = top_height_m(asset)
     seen = sorted({z for z in (*asset.levels_m, asset.rest_height_m or 0.0) if 0.08 < z < top - 0.1})
@@ -182,7 +182,7 @@ def cart(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def seat_height_m(asset: Asset, share: float) -> float:
-    """Height of a seat or mattress: where things rest, if that is below the back, else a share."""
+    """Height of a seat or mattress: the rest height if it is below the back, else a share."""
     height, rest = asset.size_m[2], asset.rest_height_m
     return rest if rest is not None and 0.15 < rest < 0.9 * height else share * height
 
@@ -236,7 +236,7 @@ def ottoman(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def bed(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A mattress on a frame with a headboard and pillows; on posts where it is a loft or bunk bed."""
+    """A mattress on a frame with a headboard and pillows; on posts for a loft or bunk bed."""
     x, y, height = asset.halves_m
     top = seat_height_m(asset, 0.6)
     frame: Rgb = shade((140, 104, 72), 0.8 + 0.4 * hash_bytes(asset.asset_id)[4] / 255)

@@ -1,4 +1,4 @@
-"""Shapes of lamps, plants, screens, containers and small things, from the sizes of their assets."""
+"""Shapes of lamps, plants, screens, containers and small objects, from the sizes of their assets."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def lamp(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def screen(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A flat screen that looks to +y, on a foot where it is deep."""
+    """A flat screen that faces +y, on a foot if it is deep."""
     x, y, height = asset.halves_m
     if y < 0.07:
         return [
@@ -135,7 +135,7 @@ def bowl(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def cup(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A cup; with a handle where it is longer in one direction."""
+    """A cup; with a handle if it is longer in one direction."""
     x, y, height = asset.halves_m
     radius = min(x, y)
     shift = (-(x - radius), -(y - radius))
@@ -171,7 +171,7 @@ def vase(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def pan(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A round pan with a handle along the longer side; two grips where it is nearly round."""
+    """A round pan with a handle along the longer side; two grips if it is nearly round."""
     x, y, height = asset.halves_m
     radius = min(x, y)
     if max(x, y) < 1.2 * radius:
@@ -219,7 +219,7 @@ def toaster(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
 
 
 def coffee_machine(asset: Asset, rgb: Rgb) -> list[ColouredSolid]:
-    """A foot and a head that stands out from a column at the back."""
+    """A foot and a brewing head that protrudes from a column at the back."""
     x, y, height = asset.halves_m
     return [
         box((-x, x), (-y, y), (0.0, 0.12 * height), _DARK),

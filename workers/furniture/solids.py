@@ -1,4 +1,4 @@
-"""Convex solids from which furniture is put together, as plain arrays.
+"""Convex solids from which furniture is assembled, as plain arrays.
 
 Frame of a piece of furniture: x right, y front, z up, origin on the floor below its centre,
 metres. Every solid here is convex, closed and wound outwards, and has 6 to 24 corners.
@@ -53,7 +53,7 @@ def prism(bottom_m: F64, top_m: F64, rgb: Rgb) -> ColouredSolid:
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], rgb: Rgb) -> ColouredSolid:
-    """A box by its intervals along x, y and z."""
+    """A box given by its intervals along x, y and z."""
     ring = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     corners = np.array([(a, b, z[0]) for a, b in ring] + [(a, b, z[1]) for a, b in ring], np.float32)
     return ColouredSolid(corners, _prism_faces(4), rgb)
@@ -70,7 +70,7 @@ def _circle(sides: int) -> F64:
 def mirrored(
     x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], rgb: Rgb
 ) -> list[ColouredSolid]:
-    """A box by its intervals and its mirror image on the left, which comes first."""
+    """A box given by its intervals and its mirror image on the left, which comes first."""
     return [box((-x[1], -x[0]), y, z, rgb), box(x, y, z, rgb)]
 
 
@@ -119,7 +119,7 @@ def _unit_ball(sides: int) -> tuple[F64, I32]:
 def ball(
     centre_m: tuple[float, float, float], radii_m: tuple[float, float, float], rgb: Rgb
 ) -> ColouredSolid:
-    """An ellipsoid of 20 corners that touches its box above, below and about the sides."""
+    """An ellipsoid of 20 corners that touches all six sides of its bounding box."""
     vertices, faces = _unit_ball(6)
     return ColouredSolid((vertices * radii_m + centre_m).astype(np.float32), faces, rgb)
 

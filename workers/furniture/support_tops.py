@@ -1,4 +1,4 @@
-"""Where the tops of carrying furniture lie: shapes and support surfaces are both made from this.
+"""The tops of supporting furniture, from which both shapes and support surfaces are made.
 
 Local frame: x right, y front, z up, origin on the floor below the centre, metres.
 """
@@ -12,7 +12,7 @@ from datagen.workers.furniture.asset_table import Asset
 # Depth of a run of kitchen counter (24 inches, as all straight ones in the table).
 COUNTER_DEPTH_M = 0.61
 
-# Types on whose top things can be put. Not beds, seats, sinks and toilets.
+# Types whose tops support objects. Not beds, seats, sinks and toilets.
 CARRYING_TYPES = frozenset(
     {
         "Cabinet", "Cart", "CoffeeTable", "CounterTop", "Desk", "DiningTable", "Dresser", "Shelf",
@@ -20,17 +20,17 @@ CARRYING_TYPES = frozenset(
     }
 )  # fmt: skip
 
-# Desks that go round a corner, by the depth of their back run and the width of their right wing,
-# as the positions of things seen on them show.
+# Corner desks: depth of the back run and width of the right wing, from the positions of objects
+# observed on them.
 _CORNER_DESKS = {"Desk_302": (0.60, 0.52), "Desk_316": (0.60, 0.55)}
 
-# Below this share of its height a rest height is an inner shelf, or a desk top below a hutch.
+# A rest height below this share of the height is an inner shelf, or a desk top below a hutch.
 _INNER = 0.9
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A horizontal rectangle by its intervals."""
+    """A horizontal rectangle given by its intervals."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -45,7 +45,7 @@ class Rectangle:
 
 
 def top_height_m(asset: Asset) -> float:
-    """Height of the top of furniture: where things rest on it, or its box where that is inside."""
+    """Height of the top of furniture: the rest height, or the box's height if that is an inner shelf."""
     rest = asset.rest_height_m
     height = asset.size_m[2]
     if rest is None or rest <= 0.05:
@@ -56,7 +56,7 @@ def top_height_m(asset: Asset) -> float:
 
 
 def hutch_depth_m(asset: Asset) -> float:
-    """Depth of what rises above the back of a desk; 0 for a plain one."""
+    """Depth of the hutch above the back of a desk; 0 if it has none."""
     above = asset.size_m[2] - top_height_m(asset)
     return 0.25 * asset.size_m[1] if asset.object_type == "Desk" and above > 0.05 else 0.0
 

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 
 def vertex_components(faces: npt.NDArray[np.integer[Any]], n_vertices: int) -> npt.NDArray[np.int32]:
-    """Number (n_vertices,) of the component that each vertex is in, joined by the faces (F, 3)."""
+    """Component index (n_vertices,) of each vertex; faces (F, 3) join their vertices."""
     first, second = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
     joined = coo_matrix((np.ones(len(first), np.bool_), (first, second)), (n_vertices, n_vertices))
     return connected_components(joined, directed=False)[1]

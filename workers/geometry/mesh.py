@@ -1,4 +1,4 @@
-"""A coloured triangle mesh, the only surface that leaves a loader."""
+"""A coloured triangle mesh, the only surface type that loaders return."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with a flat colour each and, where there is one, a texture that overrides it."""
+    """Triangles with a flat colour each and optionally a texture that overrides it."""
 
     vertices_m: F32  # (V, 3)
     faces: I32  # (F, 3)

@@ -16,7 +16,7 @@ def convex_hull(points_m: F64) -> F64:
     """Counter-clockwise convex hull (K, 2) of planar points (N, 2), by two chains (Andrew 1979).
 
     Points on a line, which have no area, give their two ends. For the few corners of a body part
-    this is several times faster than a general hull.
+    this is several times faster than a general algorithm.
     """
     points = sorted({(x, y) for x, y in np.asarray(points_m, np.float64).tolist()})
     if len(points) < 3:
@@ -25,7 +25,7 @@ def convex_hull(points_m: F64) -> F64:
 
 
 def _right_turns_cut(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The chain from the first point to before the last that only turns left."""
+    """The chain of left turns from the first point to the last, which is left out."""
     chain: list[tuple[float, float]] = []
     for x, y in points:
         while len(chain) > 1:

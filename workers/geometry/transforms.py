@@ -8,14 +8,14 @@ from datagen.workers.geometry.mesh import F64
 
 
 def translation(x_m: float, y_m: float, z_m: float) -> F64:
-    """(4, 4) transform that only moves."""
+    """(4, 4) pure translation."""
     T = np.eye(4)
     T[:3, 3] = (x_m, y_m, z_m)
     return T
 
 
 def yaw_pose(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> F64:
-    """(4, 4) pose turned about z, counter-clockwise seen from above."""
+    """(4, 4) pose rotated about z, counter-clockwise seen from above."""
     T = translation(x_m, y_m, z_m)
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     T[:2, :2] = ((c, -s), (s, c))
@@ -31,7 +31,7 @@ def inverse(T: F64) -> F64:
 
 
 def is_pose(T: F64, rounding: float = 1e-5) -> bool:
-    """Whether a matrix (4, 4) turns and moves and does nothing else; no for NaN and for mirrors.
+    """Whether a matrix (4, 4) is a rigid transform; False for NaN and for reflections.
 
     `rounding` bounds the entries of R R^T - I: engines and files give rotations as float32.
     """
@@ -86,8 +86,8 @@ def pose(position_m: F64, q_wxyz: F64) -> F64:
 def look_at(eye_m: F64, target_m: F64) -> F64:
     """(4, 4) camera pose at `eye_m` that looks at `target_m`: x right, y down, z forward.
 
-    The image stays upright. Looking straight up or down, where upright means nothing, the
-    world's x axis points right.
+    The image stays upright. If the camera looks straight up or down, the world's x axis points
+    right.
     """
     forward = np.asarray(target_m, np.float64) - eye_m
     forward = forward / np.linalg.norm(forward)

@@ -6,7 +6,7 @@ from datagen.workers.houses.house import HouseSource
 from datagen.workers.houses.split import ids_of_split, split_of
 from datagen.workers.registry import open_source
 
-# Each opens the source which the text after a reference's colon describes.
+# Each function opens the source that the text after a reference's colon describes.
 HOUSE_SOURCES: dict[str, str] = {
     "builtin": "datagen.workers.procedural_houses.builtin:open_builtin",
     "procthor": "datagen.workers.houses.procthor:open_procthor",

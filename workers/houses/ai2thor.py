@@ -50,15 +50,15 @@ _MAX_SCENE_BYTES = 16 << 20
 _MAX_OBJECTS = 5000
 _KEPT_MESHES = 512
 _SURFACE_HEIGHTS_M = (0.25, 1.5)
-_WALL_TOP_M = 2.2  # parts above it meet no robot
+_WALL_TOP_M = 2.2  # no robot reaches parts above it
 _SMALL_M = 0.35
 _FIX = "Download the scenes again."
 
-# Every file's frame to the world, and what turns the stages of the ProcTHOR set back about the vertical.
+# From every file's frame to the world, and the rotation of ProcTHOR stages back about the vertical.
 _Y_UP_TO_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 _PROCTHOR_STAGE = np.array([[0, 0, -1.0, 0], [0, 1.0, 0, 0], [1.0, 0, 0, 0], [0, 0, 0, 1.0]])
 
-# A room is called after the first of these that stands in it.
+# The first of these object types found in a room decides the room's type.
 _ROOM_BY_TYPE = (
     ("Toilet", "Bathroom"), ("ShowerDoor", "Bathroom"), ("Bed", "Bedroom"), ("Fridge", "Kitchen"),
     ("CounterTop", "Kitchen"), ("Sofa", "LivingRoom"), ("Television", "LivingRoom"),
@@ -67,7 +67,7 @@ _ROOM_BY_TYPE = (
 
 @dataclass(frozen=True, eq=False)
 class _Template:
-    """A mesh of the download, brought to z up, with what is derived from it once."""
+    """A mesh of the download in a z-up frame, with its convex parts and digest."""
 
     mesh: Mesh
     parts_m: tuple[F32, ...]
@@ -76,7 +76,7 @@ class _Template:
 
 @dataclass(frozen=True, eq=False)
 class Ai2thorHouses:
-    """Scenes below one root. The newest meshes are kept, as houses share their furniture."""
+    """Scenes below one root. Recently used meshes are kept, because houses share furniture."""
 
     root: Path
     digest: str
@@ -115,7 +115,7 @@ class Ai2thorHouses:
             digest.update(template.digest)
             T_world = _pose(entry)
             placed.append(self._placed(number, name, template, T_world))
-            digest.update(placed[-1][0].object_type.encode())  # it decides what carries things
+            digest.update(placed[-1][0].object_type.encode())  # the type decides on support surfaces
         bodies, rooms = _walls_and_rooms(mesh, [(b, xy) for b, xy, _, _ in placed])
         owners = room_ids_at(np.array([xy for _, xy, _, _ in placed]).reshape(-1, 2), rooms)
         surfaces: list[Surface] = []
@@ -188,8 +188,8 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
     if not sizes:
         raise InputError(top, "", "has no scenes", fix)
     listing: list[object] = [[i, sizes[i]] for i in sorted(sizes)]
-    places = ((_OBJECTS, "*.glb"), (_STAGES, "*.glb"), (_CONFIGS, "*.object_config.json"))
-    files = sorted(found for part, pattern in places for found in _sizes(root / part, pattern))
+    patterns = ((_OBJECTS, "*.glb"), (_STAGES, "*.glb"), (_CONFIGS, "*.object_config.json"))
+    files = sorted(found for part, pattern in patterns for found in _sizes(root / part, pattern))
     listing += [[p.relative_to(root).as_posix(), n] for p, n in files]
     types = _types(root)
     scenes = {i: top / f"{i}{_SUFFIX}" for i in sorted(sizes)}
@@ -197,7 +197,7 @@ def open_ai2thor(folder: str) -> Ai2thorHouses:
 
 
 def _sizes(folder: Path, pattern: str) -> list[tuple[Path, int]]:
-    """The files below a folder with their sizes. Raises InputError where there are too many, or odd ones."""
+    """The files below a folder with their sizes. Raises InputError for too many or unprintable names."""
     try:
         found = [(p, p.stat().st_size) for p in itertools.islice(folder.rglob(pattern), _MAX_FILES + 1)]
     except OSError as error:
@@ -259,7 +259,7 @@ def _numbers(node: JsonNode, count: int, limit: float) -> list[float]:
 
 
 def _in_world(T: F64) -> F64:
-    """A pose (4, 4) of the files for meshes that are z up already: both sides are turned."""
+    """A pose (4, 4) of the files in the world frame, for meshes that are already z up."""
     return _Y_UP_TO_WORLD @ T @ np.linalg.inv(_Y_UP_TO_WORLD)
 
 
@@ -276,7 +276,7 @@ def _walls_and_rooms(
         polygon = clean_polygon(outline)
         if not isinstance(polygon, str) and len(polygon) <= MAX_CORNERS:
             polygons.append(polygon)
-    if not polygons:  # no floor of its own: the ground below the walls
+    if not polygons:  # the stage has no floor: use the ground below the walls
         low, high = stage.vertices_m.min(0)[:2], stage.vertices_m.max(0)[:2]
         polygons = [np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)]
     plain = [Room(f"room|{k}", "Room", p, ceiling_m) for k, p in enumerate(polygons)]

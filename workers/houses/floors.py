@@ -17,7 +17,7 @@ _SAME_M = 1e-4
 def clean_polygon(corners_m: F64) -> F64 | str:
     """The polygon (K, 2), counter-clockwise, without repeated or straight corners.
 
-    A text names what is wrong where it is not the outline of a floor.
+    If it is not the outline of a floor, a string that names the problem.
     """
     keep = np.linalg.norm(corners_m - np.roll(corners_m, 1, axis=0), axis=1) > _SAME_M
     points = corners_m[keep]

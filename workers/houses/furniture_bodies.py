@@ -1,4 +1,4 @@
-"""Furniture and the small things on it: from the objects of a house document to bodies."""
+"""Bodies of furniture and of the small objects on it, from the objects of a house document."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_CHILDREN = 1000
 MAX_BODIES = 20_000
 _MAX_ANGLE_DEG = 1e6
 _UPRIGHT_DEG = 2.0
-# Files place things up to 5 cm above what they stand on and leave the fall to the simulator.
+# Files place objects up to 5 cm above their support and leave the fall to the simulator.
 _HANGS_M = 0.12
 _SINKS_M = 0.03
 _NARROWEST_M = 0.1
@@ -33,7 +33,7 @@ def object_bodies(
 ) -> tuple[list[tuple[StaticBody, F64]], list[Surface]]:
     """Bodies, each with the point (2,) that decides its room, and support surfaces.
 
-    `room_id` is still empty in both. A child counts to the room of what it stands on.
+    `room_id` is still empty in both. A child belongs to the room of its support.
     """
     out: list[tuple[StaticBody, F64]] = []
     surfaces: list[Surface] = []
@@ -42,7 +42,7 @@ def object_bodies(
         asset = assets.get(entry.get("assetId").text())
         if asset is None:
             skipped["unknown asset"] += 1
-            # What stood on it would hang in the air.
+            # Objects on it would float.
             skipped["on an unknown asset"] += sum(1 for _ in _children(entry))
             continue
         T_asset, tilt_deg = _pose(entry, asset)
@@ -97,7 +97,7 @@ def _pose(node: JsonNode, asset: Asset) -> tuple[F64, float]:
     return T, tilt_deg
 
 
-@lru_cache(maxsize=256)  # most things stand at one of four angles
+@lru_cache(maxsize=256)  # most objects have one of four angles
 def _upright_rotation(yaw_deg: float) -> F64:
     rotation = unity_rotation(0.0, yaw_deg, 0.0)
     rotation.setflags(write=False)
@@ -119,7 +119,7 @@ def _centre_xy(node: JsonNode) -> F64:
 
 
 def _is_inside(node: JsonNode, below: Asset, T_below: F64) -> bool:
-    """Whether a thing's centre lies within a part of what carries it, as food in a closed fridge."""
+    """Whether an object's centre lies within a part of its support, as food in a closed fridge."""
     x, y, z = node.get("position").point()
     local = (np.array([x, z, y]) - T_below[:3, 3]) @ T_below[:3, :3]
     low, high = _part_boxes(below)
@@ -136,7 +136,7 @@ def _part_boxes(asset: Asset) -> tuple[F32, F32]:
 
 
 def _rested(T: F64, small: Asset, below: Asset, T_below: F64) -> F64:
-    """The pose, lowered (or raised) onto the nearest level of what it stands on."""
+    """The pose, lowered (or raised) onto the nearest level of the support."""
     mesh, _ = asset_geometry(small)
     lowest = float((mesh.vertices_m @ T[2, :3]).min() + T[2, 3])
     levels = {top_height_m(below), *below.levels_m}
@@ -151,7 +151,7 @@ def _rested(T: F64, small: Asset, below: Asset, T_below: F64) -> F64:
 
 
 def _surfaces(body_id: str, asset: Asset, T: F64) -> list[Surface]:
-    """Support surfaces of furniture that carries things; frame as the asset's, turned with it."""
+    """Support surfaces of furniture, in frames that turn with the asset; none for other types."""
     if asset.object_type not in CARRYING_TYPES:
         return []
     out: list[Surface] = []

@@ -1,4 +1,4 @@
-"""Meshes from binary glTF files, within limits, with textures reduced to a colour a face."""
+"""Meshes from binary glTF files, within limits, with textures reduced to one colour per face."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _MAX_JSON_BYTES = 16 << 20
 _MAX_TEXTURE_PX = 64_000_000
 _PLAIN = (180, 178, 174)
 _FIX = "Download the asset again, or remove the scenes that use it."
-# What a damaged file makes trimesh raise, which checks little by itself: references to what is not there and
-# values of other types, short buffers, nodes that hold each other, textures that Pillow cannot read (OSError)
-# or refuses for their size, a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
+# Exceptions of trimesh, which checks little itself, for damaged files: dangling references, values of wrong
+# types, short buffers, cyclic nodes, textures that Pillow cannot read (OSError) or refuses for their size,
+# a stride of 0, numbers beyond 64 bits, compressed meshes (NotImplementedError).
 _DAMAGE = (
     ValueError, LookupError, TypeError, AttributeError, OSError, struct.error, RecursionError,
     NotImplementedError, ArithmeticError, Image.DecompressionBombError,
@@ -36,16 +36,16 @@ def read_glb(path: Path) -> Mesh:
 
     Raises InputError for files that are missing, damaged, empty or beyond the limits.
     """
-    # Imported here: robots read their own meshes with this, once.
+    # Imported here: only AI2-THOR houses and robots need it.
     import trimesh
 
     data = read_regular(path, MAX_FILE_BYTES, _FIX)
     _check_header(path, data)
     try:
-        # From memory, so that no address in the file is followed to another one.
+        # From memory, so that no reference to another file is followed.
         scene = cast(Any, trimesh.load_scene(io.BytesIO(data), file_type="glb", skip_materials=False))
         placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-        # Counted before meshes are copied to each of their places.
+        # Counted before meshes are copied for each instance.
         count = sum(len(m.faces) for m in placed if isinstance(m, trimesh.Trimesh))
         if 0 < count <= MAX_FACES:
             return _merged([m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)])
@@ -56,7 +56,7 @@ def read_glb(path: Path) -> Mesh:
 
 
 def _check_header(path: Path, data: bytes) -> None:
-    """Refuse by the counts that the file itself states, before anything is unpacked."""
+    """Raise InputError for counts in the header beyond the limits, before anything is unpacked."""
     if len(data) < 20 or data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise InputError(path, "", "is not a binary glTF file", _FIX)
     length = int.from_bytes(data[12:16], "little")
@@ -65,7 +65,7 @@ def _check_header(path: Path, data: bytes) -> None:
     root = parse_json(data[20 : 20 + length], str(path))
     try:
         counts = [int(a["count"]) for a in root.value.get("accessors", [])]
-        # Each primitive is a mesh of its own, also where many name the same numbers.
+        # Each primitive becomes its own mesh, even if several share accessors.
         for primitive in (p for m in root.value.get("meshes", []) for p in m["primitives"]):
             named = [
                 *primitive["attributes"].values(),
@@ -104,7 +104,7 @@ def _merged(pieces: list[Any]) -> Mesh:
 
 
 def _face_rgb(piece: Any) -> U8:
-    """One colour a face: its vertex colours, the texture at its middle, or the material's factor."""
+    """Face colours (F, 3): vertex colours, the texture at the middle, or the material's factor."""
     count = len(piece.faces)
     visual = piece.visual
     if visual.kind == "vertex" or visual.kind == "face":

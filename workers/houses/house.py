@@ -1,4 +1,4 @@
-"""A house as every source delivers it: world frame, right-handed, z up, metres, floor at z = 0."""
+"""A house as every source returns it: world frame, right-handed, z up, metres, floor at z = 0."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BodyKind = Literal["wall", "furniture", "small"]
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A floor. `polygon_m` is simple, counter-clockwise seen from above, without repeated end."""
+    """A floor. `polygon_m` is simple, counter-clockwise seen from above, without a repeated last corner."""
 
     room_id: str
     room_type: str  # Kitchen, LivingRoom, Bedroom, Bathroom, ...
@@ -23,10 +23,10 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class StaticBody:
-    """One rigid static thing: a wall, a piece of furniture or a small thing standing on one.
+    """One rigid static body: a wall, a piece of furniture or a small object on furniture.
 
-    `visual` is what cameras see and `convex_parts_m` what other things bump into, both in the
-    world frame. Every part is the vertex set of a convex polyhedron with volume.
+    `visual` is rendered and `convex_parts_m` are used for collisions, both in the world frame.
+    Every part is the vertex set of a convex polyhedron with volume.
     """
 
     body_id: str
@@ -40,7 +40,7 @@ class StaticBody:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A horizontal rectangle on a body on which things can be put.
+    """A horizontal rectangle of a body that can support objects.
 
     The frame `T_world_surface` has its origin at the rectangle's centre and z up.
     """
@@ -59,7 +59,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class House:
-    """Static surroundings of a scene. `skipped` counts what the loader left out, by cause."""
+    """Static surroundings of a scene. `skipped` counts the entries that the loader left out, by cause."""
 
     house_id: str
     digest: str  # sha256 of the house's own bytes in its source
@@ -73,7 +73,7 @@ class House:
 
 
 class HouseSource(Protocol):
-    """An ordered collection of houses. Opening one is cheap; loading one takes milliseconds."""
+    """An ordered collection of houses. Opening one is cheap; loading a house takes milliseconds."""
 
     @property
     def kind(self) -> str:
@@ -82,11 +82,11 @@ class HouseSource(Protocol):
 
     @property
     def digest(self) -> str:
-        """Of the content, not of the path."""
+        """Hash of the content, not of the path."""
         ...
 
     def house_ids(self) -> list[str]:
-        """All ids, in an order that the content alone decides."""
+        """All ids, in an order that depends on the content alone."""
         ...
 
     def load(self, house_id: str) -> House:

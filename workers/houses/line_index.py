@@ -1,10 +1,10 @@
 """Random access to the lines of large JSON-lines files, compressed or not, shared by processes.
 
 A compressed file is unpacked once into the cache folder and mapped into memory, so that all
-workers of a machine share its pages. The index (offset, length, sha256 and id of every line) lies
-beside it. Both are named by the digest of the source file and appear by an atomic rename; the
-index comes last, so that its presence means both are whole. Files that are not used for a day are
-dropped, the longest unused first, where there are more than 64.
+workers of a machine share its pages. The index (offset, length, sha256 and id of every line) is
+stored with it. Both are named by the digest of the source file and appear by an atomic rename; the
+index comes last, so that its presence means both are complete. If there are more than 64 files, those
+not used for a day are removed, least recently used first.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from datagen.workers.content_cache import cache_folder, drop_unused, read_arrays
 from datagen.workers.json_document import parse_json
 
 MAX_LINE_BYTES = 16 << 20  # the largest known house has 0.1 MB
-MAX_LINES = 500_000  # fifty times the known sets; each takes half a kilobyte of memory
+MAX_LINES = 500_000  # fifty times the known sets; each needs half a kilobyte of memory
 _MAX_FILE_BYTES = 64 << 30
-# Houses take a twentieth of their size when compressed; what unpacks to far more was made to fill a disk.
+# Houses compress to a twentieth of their size; a file that unpacks to far more is a decompression bomb.
 _MAX_UNPACKED_BYTES, _MAX_RATIO = 256 << 20, 100
 _MAX_IN_MEMORY_BYTES = 2 << 30
 _FORMAT = 2  # raise it when the layout of the cached files changes
@@ -54,7 +54,7 @@ _LAYOUT = {
 
 @dataclass(frozen=True, eq=False)
 class LineIndex:
-    """Lines of one file: `data` holds the bytes, the arrays where each line lies in them."""
+    """Lines of one file: `data` holds the bytes, the arrays locate the lines in them."""
 
     path: Path
     data: mmap.mmap | bytearray
@@ -64,15 +64,15 @@ class LineIndex:
     line_numbers: npt.NDArray[np.int64]  # (N,), from 1
 
     def line(self, row: int) -> bytes:
-        """The bytes of a line, checked against the index: a damaged copy costs time, never a result.
+        """The bytes of a line, checked against the index; read from the source file if the copy is damaged.
 
-        Raises InputError where the source file has lost the line too.
+        Raises InputError if the source file has lost the line too.
         """
         offset, length = (int(v) for v in self.spans[row])
         text = bytes(self.data[offset : offset + length])
         if self._is_row(row, text):
             return text
-        # The unpacked copy was damaged. Skipping the house would silently give other scenes.
+        # The unpacked copy was damaged. Skipping the house would silently change the scenes.
         number = int(self.line_numbers[row])
         text = next((line for n, line in _lines(self.path) if n == number), b"")
         if self._is_row(row, text):
@@ -101,7 +101,7 @@ def open_lines(path: Path, cache: Path | None) -> LineIndex:
 
 
 def houses_cache() -> Path | None:
-    """The cache's folder of unpacked houses; None where it cannot be written."""
+    """The cache's folder of unpacked houses; None if it cannot be written."""
     folder = cache_folder() / "houses"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -116,26 +116,26 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
         yield from _documents(path)
         return
     with open_regular(path, _MAX_FILE_BYTES, _FIX) as file:
-        room, stream = _MAX_FILE_BYTES, cast(IO[bytes], file)
+        left, stream = _MAX_FILE_BYTES, cast(IO[bytes], file)
         if path.suffix == ".gz":
-            room = _MAX_UNPACKED_BYTES + _MAX_RATIO * os.fstat(file.fileno()).st_size
+            left = _MAX_UNPACKED_BYTES + _MAX_RATIO * os.fstat(file.fileno()).st_size
             stream = cast(IO[bytes], gzip.GzipFile(fileobj=file, mode="rb"))
         for number in itertools.count(1):
             line = stream.readline(MAX_LINE_BYTES + 1)
             if not line:
                 return
-            room -= len(line)
-            if len(line) > MAX_LINE_BYTES or number > MAX_LINES or room < 0:
+            left -= len(line)
+            if len(line) > MAX_LINE_BYTES or number > MAX_LINES or left < 0:
                 problem = f"a line of more than {MAX_LINE_BYTES >> 20} MiB"
                 if len(line) <= MAX_LINE_BYTES:
-                    problem = f"more than {MAX_LINES:,} lines" if room >= 0 else "unpacks to too many bytes"
+                    problem = f"more than {MAX_LINES:,} lines" if left >= 0 else "unpacks to too many bytes"
                 raise InputError(f"{path}:{number}", "", problem, _FIX)
             if line := line.strip():
                 yield number, line
 
 
 def _documents(path: Path) -> Iterator[tuple[int, bytes]]:
-    """A .json file is one house, or a list of houses, each of which counts as a line."""
+    """(number, text) of every house of a .json file, which holds one house or a list of them."""
     text = read_regular(path, MAX_LINE_BYTES * 4, "Store one house per line (.jsonl).").strip()
     if not text.startswith(b"["):
         yield 1, text
@@ -154,7 +154,7 @@ def _file_digest(path: Path) -> str:
 
 
 def _own_id(line: bytes) -> str:
-    """The house's own name: its top-level `_id`, "" where there is none or it is not printable."""
+    """The house's own name: its top-level `_id`; "" if there is none or it is not printable."""
     names = _ID_KEY.findall(line)
     if len(names) > 1:
         try:
@@ -169,7 +169,7 @@ def _own_id(line: bytes) -> str:
 
 
 def _copy(path: Path, write: Callable[[bytes], object]) -> dict[str, npt.NDArray[Any]]:
-    """Writes the lines of a file one after another; the index of what was written."""
+    """Writes the lines of a file one after another; returns their index."""
     spans: list[tuple[int, int]] = []
     digests: list[bytes] = []
     ids: list[str] = []
@@ -202,7 +202,7 @@ def _names(cache: Path, digest: str) -> tuple[Path, Path]:
 
 
 def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
-    """None where the cache lacks the file, or holds something that does not fit together."""
+    """The index from the cache; None if a file is missing or the two do not match."""
     data_path, index_path = _names(cache, digest)
     arrays = read_arrays(index_path, _LAYOUT, _MAX_INDEX_BYTES)
     if arrays is None:
@@ -221,13 +221,13 @@ def _from_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
 
 
 def _build_in_cache(path: Path, cache: Path, digest: str) -> LineIndex | None:
-    """Unpacks into the cache; None where the cache cannot take it (full, gone, read-only)."""
+    """Unpacks into the cache; None if the cache cannot be written (full, gone, read-only)."""
     data_path, index_path = _names(cache, digest)
     try:
         with whole_file(data_path) as file:
             arrays = _copy(path, file.write)
     except OSError:
-        return None  # where the source is at fault, reading it into memory reports that
+        return None  # if the source is at fault, reading it into memory reports that
     if not write_arrays(index_path, arrays):
         return None
     drop_unused(cache, _MOST_CACHED, _IDLE_S)

@@ -1,9 +1,9 @@
-"""From a ProcTHOR house document to a House in the world frame.
+"""Builds a House in the world frame from a ProcTHOR house document.
 
 The document is in Unity's frame: left-handed, y up, yaw clockwise seen from above, metres. It is
-brought to the world frame (right-handed, z up) by exchanging y and z, which turns yaw about. An
-object's `position` is the centre of its bounding box. Unknown keys are ignored: files carry much
-that concerns only their simulator.
+converted to the world frame (right-handed, z up) by exchanging y and z, which negates yaw. An
+object's `position` is the centre of its bounding box. Unknown keys are ignored: most concern only
+the simulator of the files.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def build_house(root: JsonNode, house_id: str, digest: str, assets: Mapping[str,
 
 
 def room_ids_at(points_m: F64, rooms: list[Room]) -> list[str]:
-    """The room that holds each point (N, 2), "" where none does."""
+    """Id of the room that contains each point (N, 2); "" if none does."""
     owners = [""] * len(points_m)
     for room in rooms:
         for k in np.flatnonzero(inside_polygon(points_m, room.polygon_m)):
@@ -113,7 +113,7 @@ def _walls(node: JsonNode, skipped: Counter[str]) -> tuple[dict[str, WallSegment
 
 
 def _holes(node: JsonNode | None, walls: Mapping[str, WallSegment], is_door: bool) -> list[Hole]:
-    """Openings, measured along `wall0`, or along `wall1` from its other end where only it exists."""
+    """Openings, measured along `wall0`, or along `wall1` from its other end if only `wall1` exists."""
     holes: list[Hole] = []
     if node is None:
         return holes

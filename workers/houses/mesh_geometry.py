@@ -1,4 +1,4 @@
-"""What a scene needs beside a mesh: convex parts, flat tops, outlines of floors."""
+"""Geometry derived from a mesh: convex parts, flat tops, outlines of floors."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def convex_parts(mesh: Mesh) -> tuple[F32, ...]:
     groups = [np.unique(mesh.faces[labels == k]) for k in range(min(int(labels.max()) + 1, 4096))]
     points = [mesh.vertices_m[g].astype(np.float64) for g in groups]
     points.sort(key=lambda p: -float(np.prod(np.ptp(p, axis=0) + _THINNEST_M)))
-    # Leftovers are screws, knobs and the like: one hull each would be waste, one for all would
-    # span the whole body, so they are dropped once the body has its share of parts.
+    # Smaller components are screws, knobs and the like. They are dropped: one hull each would cost
+    # time, and one hull for all would span the whole body.
     return tuple(hull_of(p) for p in points[:MAX_PARTS])
 
 
@@ -73,7 +73,7 @@ def _directions(count: int) -> F64:
 
 
 def slab_parts(mesh: Mesh, thickness_m: float, below_m: float) -> tuple[F32, ...]:
-    """One thin prism a triangle, behind its face: exact for walls and floors with holes.
+    """One thin prism per triangle, behind its face: exact for walls and floors with holes.
 
     Triangles that lie wholly above `below_m`, or have no area, are left out.
     """
@@ -87,7 +87,7 @@ def slab_parts(mesh: Mesh, thickness_m: float, below_m: float) -> tuple[F32, ...
 def flat_tops(mesh: Mesh, low_m: float, high_m: float) -> list[tuple[float, Rectangle]]:
     """(height, rectangle) of the largest flat tops of a body in its own frame, z up: at most two.
 
-    Upward faces are gathered by height; in each level the largest rectangle is found on a 2 cm
+    Upward faces are grouped by height; the largest rectangle of each level is found on a 2 cm
     raster. Only rectangles of at least 0.3 x 0.3 m count.
     """
     normals, areas = normals_and_areas(mesh)

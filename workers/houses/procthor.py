@@ -19,7 +19,7 @@ from datagen.workers.json_document import parse_json
 
 _MAX_FILES = 100_000
 _SUFFIXES = (".jsonl.gz", ".jsonl", ".json")
-# Tables that may lie beside the houses.
+# Tables that may be stored with the houses.
 _NOT_HOUSES = {
     *TABLE_NAMES, "type_annotations.json", "placement-annotations.json", "receptacles.json",
     "wall-holes.json", "asset_groups.json", "metadata.json",
@@ -28,14 +28,14 @@ _NOT_HOUSES = {
 
 @dataclass(frozen=True, eq=False)
 class ProcthorHouses:
-    """The houses of one folder, found by id in mapped files."""
+    """The houses of one folder, found by id in memory-mapped files."""
 
     digest: str
     folder: Path
     assets: dict[str, Asset]
     files: list[LineIndex]
     rows: dict[str, tuple[int, int]]  # id -> file and row
-    clashes: dict[str, str] = field(default_factory=dict)  # id -> the places that both claim it
+    clashes: dict[str, str] = field(default_factory=dict)  # id -> the lines that share it
     kind: str = "procthor"
 
     def house_ids(self) -> list[str]:
@@ -57,10 +57,10 @@ class ProcthorHouses:
 
 
 def open_procthor(folder: str) -> ProcthorHouses:
-    """The houses below a folder. A broken house is found out when it is loaded, not here.
+    """The houses below a folder. A damaged house is reported when it is loaded, not here.
 
-    The digest covers the ids and bytes of all houses and the size table, not the names of files,
-    so that another compression or another cut into files gives the same digest.
+    The digest covers the ids and bytes of all houses and the size table, not the names of files.
+    The digest is therefore the same if files are compressed or divided differently.
     """
     path = Path(folder)
     fix = "Name it as procthor:DIR, where DIR holds *.jsonl.gz and asset_sizes.json."
@@ -79,7 +79,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
     for name in names:
         if not name.isprintable():
             raise InputError(path, name, "has unprintable characters", "Rename the file.")
-        # Single small files are read where they lie; only what holds many houses is worth unpacking.
+        # Small .json files are read in memory; only files of many houses are worth unpacking.
         files.append(open_lines(path / name, None if name.endswith(".json") else cache))
         houses += len(files[-1].ids)
         if houses > MAX_LINES:
@@ -93,7 +93,7 @@ def open_procthor(folder: str) -> ProcthorHouses:
 
 
 def _rows(files: list[LineIndex]) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
-    """Where each id lies, sorted by id; a house that is there twice, byte for byte, counts once."""
+    """File and row of each id, sorted by id, and clashing ids; identical copies of a house count once."""
     found: dict[str, list[tuple[int, int]]] = defaultdict(list)
     for f, index in enumerate(files):
         stem = index.path.name.split(".")[0]
@@ -102,9 +102,9 @@ def _rows(files: list[LineIndex]) -> tuple[dict[str, tuple[int, int]], dict[str,
     rows: dict[str, tuple[int, int]] = {}
     clashes: dict[str, str] = {}
     for house_id in sorted(found):
-        places = found[house_id]
-        rows[house_id] = places[0]
-        if len({files[f].digests[r].tobytes() for f, r in places}) > 1:
-            named = [f"{files[f].path.name}:{files[f].line_numbers[r]}" for f, r in places[:4]]
+        copies = found[house_id]
+        rows[house_id] = copies[0]
+        if len({files[f].digests[r].tobytes() for f, r in copies}) > 1:
+            named = [f"{files[f].path.name}:{files[f].line_numbers[r]}" for f, r in copies[:4]]
             clashes[house_id] = " and ".join(named)
     return rows, clashes

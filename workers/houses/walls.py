@@ -70,7 +70,7 @@ class _Line:
 
 
 def wall_bodies(walls: Sequence[WallSegment], holes: Sequence[Hole]) -> list[StaticBody]:
-    """Bodies of all walls, one a straight stretch; holes name the wall they are measured along."""
+    """Bodies of all walls, one per straight stretch; holes name the wall they are measured along."""
     by_wall: dict[str, list[Hole]] = defaultdict(list)
     for hole in holes:
         by_wall[hole.wall_id].append(hole)
@@ -156,7 +156,7 @@ def _structure(
 
 
 def _solid_ranges(height_m: float, gaps: tuple[tuple[float, float], ...]) -> list[tuple[float, float]]:
-    """What of [0, height] the gaps leave, slivers below 5 mm dropped."""
+    """Ranges of [0, height] outside the gaps, without slivers below 5 mm."""
     ranges: list[tuple[float, float]] = []
     low = 0.0
     for gap_low, gap_high in gaps:

@@ -8,7 +8,7 @@ from datagen.workers.registry import open_source
 __all__ = ["OBJECT_SOURCES", "ObjectModel", "ObjectSource", "open_objects"]
 
 
-# Each takes what follows the first colon of a reference, "" where there is none.
+# Each function accepts the text after the first colon of a reference, "" if there is none.
 OBJECT_SOURCES: dict[str, str] = {
     "builtin": "datagen.workers.objects.builtin:open_builtin",
     "ycb": "datagen.workers.objects.ycb:open_ycb",

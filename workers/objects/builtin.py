@@ -18,12 +18,12 @@ from datagen.workers.objects.model import ObjectModel
 from datagen.workers.objects.shapes import ParametricSolid
 from datagen.workers.objects.ycb_masses import PUBLISHED_MASS_KG
 
-# Part of every digest: raise it when `shapes` or the assembly here changes what comes out.
+# Part of every digest: raise it when a change of `shapes` or of the assembly here changes an object.
 GENERATOR_VERSION = 1
 
 
 class BuiltinObjects:
-    """All recipes of `builtin_table`, each built once a process, on first use; nothing is read from disk."""
+    """All recipes of `builtin_table`, each built once per process on first use; nothing is read from disk."""
 
     kind = "builtin"
 
@@ -46,7 +46,7 @@ class BuiltinObjects:
 def open_builtin(argument: str) -> BuiltinObjects:
     """The built-in objects; `argument` is empty."""
     if argument:
-        raise InputError(f"builtin:{argument}", "", "the built-in objects take no folder", "Write `builtin`")
+        raise InputError(f"builtin:{argument}", "", "built-in objects accept no folder", "Write `builtin`")
     return BuiltinObjects()
 
 
@@ -77,7 +77,7 @@ def _model(name: str) -> ObjectModel:
 
 
 def _piece(piece: dict[str, Any]) -> ParametricSolid:
-    """The solid that a piece names, by functions of `shapes`."""
+    """The solid of a piece, built by the functions of `shapes` that the piece names."""
     arguments = {key: value for key, value in piece.items() if key not in ("shape", "with", "put")}
     for key in arguments.keys() & {"centres_m", "radii_m"}:
         arguments[key] = np.array(arguments[key], np.float64)

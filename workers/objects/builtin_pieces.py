@@ -1,7 +1,7 @@
 """Pieces of built-in objects as plain data: millimetres and degrees in, metres and radians out.
 
 A piece names a function of `shapes` with its arguments, its paint (a function of `shapes` too) and
-where it is put. Because pieces are data, their hash is an object's digest.
+its pose and scale. Because pieces are data, their hash is an object's digest.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def plain(rgb: Rgb) -> Piece:
 
 
 def bands(*levels: tuple[float, Rgb], axis: int = 2) -> Piece:
-    """Colours up to each level along an axis; the last one beyond."""
+    """Colours up to each level along an axis; the last colour also beyond its level."""
     return {"paint": "bands", "levels": [(level / 1000, rgb) for level, rgb in levels], "axis": axis}
 
 

@@ -2,10 +2,10 @@
 
 Sizes (millimetres, as in the source) and masses are those of the tables of object data in
 B. Calli et al., "Benchmarking in Manipulation Research: The YCB Object and Model Set and
-Benchmarking Protocols", IEEE Robotics & Automation Magazine 22(3), 2015. What the tables do not
-give (wall thicknesses, necks, handles, colours) is chosen to look and weigh like the real thing.
+Benchmarking Protocols", IEEE Robotics & Automation Magazine 22(3), 2015. Values that the
+tables lack (wall thicknesses, necks, handles, colours) are chosen to match the real objects.
 """
-# ruff: noqa: E501 - a table reads best with one piece a line
+# ruff: noqa: E501 - a table reads best with one piece per line
 
 from __future__ import annotations
 

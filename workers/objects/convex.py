@@ -1,4 +1,4 @@
-"""Convex parts: reading them, dropping flat ones, their volume and how a hand fits around them."""
+"""Convex parts: reading, removal of flat parts, volume, and whether a gripper fits around them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from datagen.workers.geometry.components import vertex_components
 from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.objects.obj_file import MAX_FACES, MAX_FILE_BYTES, read_obj
 
-# A part thinner than this cannot be told from a sheet: physics engines reject or explode on it.
+# A part thinner than this counts as a sheet: physics engines reject it or become unstable.
 MIN_THICKNESS_M = 1e-4
 MAX_PARTS = 1024
 
-# Part of a cache key: raise it when `fits_gripper` changes its answers.
+# Part of a cache key: raise it when `fits_gripper` changes its results.
 GRIPPER_VERSION = 1
 GRIPPER_STROKE_M = 0.08
-# Half a millimetre of air on each side while the hand comes down.
+# Half a millimetre of clearance on each side while the hand comes down.
 MAX_GRASP_WIDTH_M = GRIPPER_STROKE_M - 0.001
-# Lower things leave the fingertips no side to hold above the table.
+# Lower objects have no side that fingertips can hold above the table.
 MIN_GRASP_HEIGHT_M = 0.012
 MAX_TARGET_MASS_KG = 1.3
 # A rim can be held when fingers reach this far down into the opening; plates are shallower.
@@ -42,7 +42,7 @@ class ConvexParts:
 
 
 def read_convex_parts(path: Path) -> ConvexParts:
-    """Reads a convex decomposition: OBJ with one `o` group a part, or PLY.
+    """Reads a convex decomposition: OBJ with one `o` group per part, or PLY.
 
     Without groups (PLY, plain OBJ) each connected component is a part, which is how SAPIEN splits
     such files too. Raises InputError naming the file: unreadable, no faces, only flat parts, more
@@ -84,7 +84,7 @@ def convex_parts(points_m: Iterable[npt.NDArray[np.floating]]) -> ConvexParts:
 
 
 def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
-    # Imported here: it takes as long as the rest of a short command, and few objects are PLY files.
+    # Imported here: the import takes as long as a short command, and few objects are PLY files.
     import trimesh
 
     data = read_regular(path, MAX_FILE_BYTES, "Give a PLY file of a simplified mesh")
@@ -92,7 +92,7 @@ def _read_ply(path: Path) -> tuple[F64, list[npt.NDArray[np.int64]]]:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
         vertices = np.asarray(mesh.vertices, np.float64)
         faces = np.asarray(mesh.faces, np.int64)
-    # Broken PLY files surface in the reader in all of these ways.
+    # The reader raises any of these for a damaged PLY file.
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, MemoryError) as error:
         raise InputError(path, "", f"not a PLY mesh ({type(error).__name__})", "Export it again") from error
     if len(faces) == 0 or len(faces) > MAX_FACES:
@@ -119,8 +119,8 @@ def fits_gripper(
 ) -> bool:
     """Whether an 8 cm parallel gripper can pick the object up from a table where it stands upright.
 
-    The fingers close in a horizontal direction, so what must fit is the smallest width of the
-    hull's outline seen from above, or, for open vessels, the rim. The mass limit leaves margin
+    The fingers close in a horizontal direction, so the smallest width of the hull's outline seen
+    from above, or, for open vessels, the rim, must fit. The mass limit leaves margin
     below a Panda's 3 kg payload at a long reach.
     """
     points = np.concatenate(parts.vertices_m).astype(np.float64)
@@ -134,7 +134,7 @@ def fits_gripper(
 
 
 def outline_width(points_m: F64) -> float:
-    """The smallest distance of two parallel lines around (N, 2) points, metres.
+    """The smallest distance between two parallel lines around (N, 2) points, metres.
 
     It is attained with one line along an edge of the convex hull (rotating calipers).
     """

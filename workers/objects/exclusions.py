@@ -1,7 +1,7 @@
-"""Which objects of the YCB set are left out because their data cannot be right, and why.
+"""Objects of the YCB set that are left out because their data cannot be right, with the reasons.
 
 Two rules work on any data: the density of the collision volume, and the by-name table below. Each
-row of the table states what is wrong; the figures were computed from the meshes (volume of the
+row of the table states the error; the figures were computed from the meshes (volume of the
 convex parts) and the masses of the set's data sheet (B. Calli et al., "Benchmarking in
 Manipulation Research", IEEE Robotics & Automation Magazine 22(3), 2015).
 """
@@ -11,14 +11,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # Kitchen sponges weigh about 45 kg/m3 and hollow plastic ware, whose cavity the convex parts may
-# fill, 60; below 20 there is nothing in a household but air with a skin.
+# fill, 60; below 20 there are only inflated objects in a household.
 MIN_DENSITY_KG_M3 = 20.0
 # Steel has 7850; convex parts of thin tools come out up to 15% too small in volume.
 MAX_DENSITY_KG_M3 = 9000.0
 
 
 class Exclusion(NamedTuple):
-    """`mass_only`: the shape is right, so the object is usable with a mass from elsewhere."""
+    """`mass_only`: the shape is right, so the object is usable with a mass from another source."""
 
     reason: str
     mass_only: bool
@@ -48,10 +48,10 @@ EXCLUDED: dict[str, Exclusion] = {
 
 
 def reason_to_exclude(name: str, mass_kg: float, volume_m3: float, mass_is_measured: bool) -> str | None:
-    """Why the object cannot be used, or None.
+    """The reason why the object cannot be used, or None.
 
-    `mass_is_measured` is False where the mass was derived from a density, so that rows about
-    wrong published masses do not apply.
+    `mass_is_measured` is False if the mass was derived from a density; rows about wrong published
+    masses then do not apply.
     """
     row = EXCLUDED.get(name)
     if row is not None and (mass_is_measured or not row.mass_only):

@@ -1,4 +1,4 @@
-"""Convex hulls: with few vertices, sampled on their surfaces, and distances from a union of them."""
+"""Convex hulls: vertex reduction, surface samples, and distances from a union of hulls."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from scipy.spatial import ConvexHull, KDTree
 
 from datagen.workers.geometry.mesh import F32, F64
 
-_ROUNDING_M = 1e-6  # of float32 vertices a few decimetres from the origin
+_ROUNDING_M = 1e-6  # error of float32 vertices a few decimetres from the origin
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull with what it is asked for again and again; metres."""
+    """A convex hull with its often used properties; metres."""
 
     vertices_m: F64  # (V, 3), in lexicographic order
     faces_m: F64  # (F, 3, 3), corners
@@ -26,7 +26,7 @@ class Hull:
 
 
 def hull_of(points_m: F32 | F64) -> Hull:
-    """The hull of points (N, 3) that span a volume; their order changes no bit of it."""
+    """The hull of points (N, 3) that span a volume; bitwise independent of their order."""
     points = np.unique(np.asarray(points_m, np.float64), axis=0)
     hull = ConvexHull(points)
     vertices = points[np.sort(hull.vertices)]
@@ -52,9 +52,9 @@ def extent_m(hulls: Sequence[Hull]) -> float:
 
 
 def few_vertices(vertices_m: F64, limit: int) -> F64:
-    """At most `limit`, 4 or more, of a hull's vertices (V, 3), chosen to come close to spanning it.
+    """At most `limit` (4 or more) of a hull's vertices (V, 3), whose hull approximates it.
 
-    From a tetrahedron on, that is added which lies farthest outside the hull so far.
+    Starts from a tetrahedron and adds the vertex farthest outside the current hull.
     """
     if len(vertices_m) <= limit:
         return vertices_m
@@ -70,7 +70,7 @@ def few_vertices(vertices_m: F64, limit: int) -> F64:
 
 
 def _tetrahedron(points: F64) -> list[int]:
-    """Rows of four points that span a volume: each is farthest from the point, line or plane so far."""
+    """Rows of four points that span a volume: each is farthest from the previous point, line or plane."""
     first = int(points[:, 0].argmin())
     from_first = points - points[first]
     second = int(np.linalg.norm(from_first, axis=1).argmax())
@@ -81,7 +81,7 @@ def _tetrahedron(points: F64) -> list[int]:
 
 
 def surface_points_m(hull: Hull, step_m: float) -> F64:
-    """Points (N, 3) on the faces of a hull: rows along each one's longest edge, at most `step_m` apart."""
+    """Points (N, 3) on the faces of a hull: rows along each longest edge, at most `step_m` apart."""
     edges = np.roll(hull.faces_m, -1, axis=1) - hull.faces_m
     lengths = np.linalg.norm(edges, axis=2)  # (F, 3)
     faces, longest = np.arange(len(lengths)), lengths.argmax(axis=1)
@@ -92,8 +92,8 @@ def surface_points_m(hull: Hull, step_m: float) -> F64:
     n_up = np.maximum(1, np.ceil(height / step_m).astype(int))
     counts = (n_along + 1) * (n_up + 1)
     face = np.repeat(faces, counts)
-    place = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts)
-    up, on = np.divmod(place, n_along[face] + 1)
+    index = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts)
+    up, on = np.divmod(index, n_along[face] + 1)
     u, s = (up / n_up[face])[:, None], (on / n_along[face])[:, None]
     return start[face] + u * to_apex[face] + (1 - u) * s * along[face]
 
@@ -101,7 +101,7 @@ def surface_points_m(hull: Hull, step_m: float) -> F64:
 def distances_m(hulls: Sequence[Hull], points_m: F64, step_m: float, farthest_m: float = np.inf) -> F64:
     """Distances (N,) of the points (N, 3) from the union of hulls, 0 inside, at most `farthest_m`.
 
-    Outside it is that to the nearest of samples of the surfaces: up to 0.8 of `step_m` too large.
+    Outside, it is the distance to the nearest surface sample: up to 0.8 of `step_m` too large.
     """
     outside = np.ones(len(points_m), bool)
     for hull in hulls:

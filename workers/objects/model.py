@@ -1,4 +1,4 @@
-"""A movable object as every source delivers it."""
+"""A movable object as every source returns it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from datagen.workers.geometry.mesh import F32, Mesh
 class ObjectModel:
     """An object in its own frame: origin at the centre of its bounding box, z up at rest, metres.
 
-    `visual` is what cameras see; `convex_parts_m` (each (V, 3), the vertices of a convex
-    polyhedron with volume) is what physics and grasping use. Both share the frame.
+    `visual` is rendered; physics and grasping use `convex_parts_m` (each (V, 3), the vertices of a
+    convex polyhedron with volume). Both share the frame.
     """
 
     name: str  # "011_banana"
@@ -28,7 +28,7 @@ class ObjectModel:
 
 
 class ObjectSource(Protocol):
-    """A named set of objects. `excluded` says which were left out and why."""
+    """A named set of objects. `excluded` maps excluded objects to the reasons."""
 
     kind: str
     digest: str  # of the content, not of the path

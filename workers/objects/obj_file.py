@@ -108,7 +108,7 @@ def read_obj(path: Path) -> ObjMesh:
 
 @dataclass(frozen=True)
 class ObjHeader:
-    """What the materials of an OBJ file are called."""
+    """Names of the material library and the materials of an OBJ file."""
 
     material_library: str
     materials: tuple[str, ...]
@@ -127,7 +127,7 @@ def read_obj_header(path: Path) -> ObjHeader:
 
 
 def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """Yields (number of its first line from 1, kind, text): a run of plain lines, or one line of kind ``."""
+    """Yields (first line number from 1, kind, text) of each run of plain lines, or of one line of kind ""."""
     number = 1
     with open_regular(path, MAX_FILE_BYTES, "Give a text OBJ file of a simplified mesh") as file:
         while block := file.read(_BLOCK_BYTES):
@@ -147,7 +147,7 @@ def _pieces(path: Path) -> Iterator[tuple[int, str, bytes]]:
 
 
 def _numbers(text: bytes, width: int) -> list[float]:
-    """The first `width` numbers. ValueError where there are fewer, or one is not finite."""
+    """The first `width` numbers. Raises ValueError if there are fewer, or one is not finite."""
     words = text.split()[:width]
     try:
         values = [float(word) for word in words]
@@ -161,9 +161,9 @@ def _numbers(text: bytes, width: int) -> list[float]:
 
 
 def _corners(text: bytes, n_vertices: int, n_uv: int) -> tuple[list[int], list[int]]:
-    """Indices from 1 of a face's vertices, and of its texture coordinates (0: none). ValueError.
+    """Indices from 1 of a face's vertices, and of its texture coordinates (0: none).
 
-    Negative ones count back from what precedes the face in the file, `n_vertices` and `n_uv`.
+    Negative ones count back from `n_vertices` and `n_uv`. Raises ValueError for an invalid face.
     """
     shape = _INTEGER.sub(b"0", b" ".join(text.split()))
     if not _CORNERS.fullmatch(shape) or shape.count(b" ") < 2:
@@ -183,7 +183,7 @@ def _from_first(indices: list[int], seen: int) -> list[int]:
 
 
 def _check_indices(path: Path, mesh: ObjMesh) -> None:
-    for what, index, count in (
+    for kind, index, count in (
         ("vertex", mesh.faces, len(mesh.vertices)),
         ("texture coordinate", mesh.uv_faces, len(mesh.uv)),
     ):
@@ -192,6 +192,6 @@ def _check_indices(path: Path, mesh: ObjMesh) -> None:
             raise InputError(
                 path,
                 f"face {int(np.argmax(high >= count)) + 1}",
-                f"refers to {what} {int(high.max()) + 1} of {count}",
+                f"refers to {kind} {int(high.max()) + 1} of {count}",
                 "Export the mesh again; it may be cut off",
             )

@@ -1,4 +1,4 @@
-"""Runs of OBJ lines that are written plainly, as nearly all are: found and read without a loop over them."""
+"""Runs of plain OBJ lines (nearly all are plain), found and parsed without a loop over the lines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-# Numbers so short that they are finite, and whole ones that a face can mean; all else is for the slow reader.
+# Numbers too short to overflow, and indices that a face may have; the slow reader parses other lines.
 _NUMBER = rb" -?\d{1,18}(?:\.\d{1,18})?(?:e[-+]?\d\d?)?"
 _INDEX = rb" [1-9]\d{0,6}"
 _PAIR = _INDEX + rb"/[1-9]\d{0,6}"
@@ -24,7 +24,7 @@ _NAMES = tuple(_KINDS)
 
 
 def plain_run(text: bytes, start: int) -> tuple[str, int]:
-    """The kind of the plain lines that begin here and where they end; kind `` and the line's end for others.
+    """The kind and end of the plain lines that begin at `start`; kind "" and the line's end for others.
 
     Kinds are `v`, `vt`, `f` (triangles of vertices) and `f/` (of vertices and texture coordinates).
     """

@@ -1,4 +1,4 @@
-"""Fewer convex parts for physics: neighbours are joined into their hull where that adds least.
+"""Merging of convex parts for physics: neighbours whose common hull adds least are joined.
 
 A scanned bowl comes with 80 parts, and the time of a physics step grows with their number.
 """
@@ -27,9 +27,9 @@ from datagen.workers.objects.hulls import (
 
 # Part of every cache key: raise it when the same parts may be merged differently.
 MERGER_VERSION = 2
-# Of a joined hull. PhysX takes 255, a GPU no more than 64, and contacts of 64 cost half as much.
+# Vertices of a joined hull. PhysX accepts 255, on a GPU 64, and contacts of 64 cost half as much.
 MAX_VERTICES = 64
-# Pairs that a part is looked at in: those whose bounding boxes are nearest.
+# Number of parts that a part is paired with: those whose bounding boxes are nearest.
 _NEIGHBOURS = 12
 _CELLS_ACROSS = 32  # of the distance grid, along the object's longest side
 # Hulls whose errors differ by less are compared by the volume they add.
@@ -51,15 +51,15 @@ _known: dict[str, tuple[F32, ...]] = {}
 def merge_parts(parts_m: Sequence[F32], limit: int) -> tuple[F32, ...]:
     """Joins convex parts, each (V, 3) with volume, until at most `limit` are left.
 
-    Greedy: at each step the pair is joined whose hull reaches least far out of the union of all
-    original parts, and of equal ones that which adds least volume. So a wall becomes a few even
-    sectors, and an opening, which reaches far, is closed last. By volume alone thin slivers come
-    first, whatever they reach across: the corner between a wall and its floor.
+    Greedy: each step joins the pair whose hull protrudes least from the union of all original
+    parts; among equal pairs, the one that adds least volume. A wall therefore becomes a few even
+    sectors, and an opening is closed last. By volume alone, thin slivers would be joined first, even
+    across the corner between a wall and its floor.
 
-    Every original vertex lies in one of the merged parts, but for what `MAX_VERTICES` cuts off. Where
-    there are `limit` parts or fewer they are returned as they are. Else the result depends neither on
-    the order of the parts nor on that of their vertices; it is kept in memory and in the cache folder,
-    because it takes about a second. Raises ValueError where `limit` is not positive.
+    Every original vertex lies in one of the merged parts, except those that `MAX_VERTICES` cuts off.
+    If there are `limit` parts or fewer, they are returned unchanged. Otherwise the result depends
+    neither on the order of the parts nor on that of their vertices. It is kept in memory and in the cache
+    folder, because it takes about a second. Raises ValueError if `limit` is not positive.
     """
     if limit < 1:
         raise ValueError(f"limit {limit}: at least one part must be left")
@@ -96,7 +96,7 @@ def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:
     queue: list[tuple[int, float, int, int]] = []
     hulls: dict[tuple[int, int], Hull] = {}
 
-    def look_at(k: int) -> None:
+    def add_pairs(k: int) -> None:
         for other in _nearest(alive, k):
             a, b = min(k, other), max(k, other)
             if (a, b) not in hulls:
@@ -106,11 +106,11 @@ def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:
                 heapq.heappush(queue, (round(field.reach_m(hull) / _ERROR_STEP_M), added_m3, a, b))
 
     for k in range(len(originals)):
-        look_at(k)
+        add_pairs(k)
     while len(alive) > limit:
-        if not queue:  # every pair looked at has lost one of its parts
+        if not queue:  # every pair of the queue has lost one of its parts
             for k in sorted(alive):
-                look_at(k)
+                add_pairs(k)
         _, _, a, b = heapq.heappop(queue)
         hull = hulls.pop((a, b))
         if a not in alive or b not in alive:
@@ -119,7 +119,7 @@ def _groups(originals: Sequence[Hull], limit: int) -> list[list[int]]:
         del alive[a], alive[b]
         alive[new] = hull
         groups[new] = sorted(groups.pop(a) + groups.pop(b))
-        look_at(new)
+        add_pairs(new)
     return sorted(groups.values())
 
 
@@ -143,18 +143,18 @@ class _DistanceField:
         self._low_m, high_m = bounds_m(hulls)
         shape = np.ceil((high_m - self._low_m) / self._cell_m).astype(int) + 1
         points = self._low_m + self._cell_m * np.indices(tuple(shape)).reshape(3, -1).T
-        # In the middle of a cup all walls are equally near, which makes the search slow for nothing.
+        # In the middle of a cup all walls are equally near, which makes an unlimited search slow.
         farthest_m = extent_m(hulls) / 6
         self._distance_m = distances_m(hulls, points, self._cell_m, farthest_m).reshape(shape)
 
     def reach_m(self, hull: Hull) -> float:
-        """How far a hull within the bounding box reaches out of the union."""
+        """Largest distance by which a hull within the bounding box protrudes from the union."""
         at = (surface_points_m(hull, self._cell_m) - self._low_m) / self._cell_m
         return float(map_coordinates(self._distance_m, at.T, order=1, mode="nearest").max())
 
 
 def _key(parts_m: Sequence[F32], limit: int) -> str:
-    # The parts in the order of their bytes: another order is the same question.
+    # The parts in the order of their bytes, so that their order does not change the key.
     blobs = sorted(np.unique(np.asarray(part, np.float32), axis=0).tobytes() for part in parts_m)
     digest = hashlib.sha256(f"{MERGER_VERSION} {scipy.__version__} {limit}".encode())
     for blob in blobs:

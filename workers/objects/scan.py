@@ -18,7 +18,7 @@ from datagen.workers.objects.convex import ConvexParts, read_convex_parts
 from datagen.workers.objects.obj_file import MAX_FILE_BYTES, ObjMesh, read_obj
 from datagen.workers.objects.texture import face_colours, read_texture
 
-# Part of every cache key: raise it when the reading changes what comes out.
+# Part of every cache key: raise it when the same files are read differently.
 READER_VERSION = 1
 MIN_SIZE_M = 0.002
 MAX_SIZE_M = 2.0
@@ -70,9 +70,9 @@ def scan_files(visual: Path, texture: Path, collision: Path) -> ScanFiles:
 
 
 def load_scan(files: ScanFiles) -> Scan:
-    """The scan, from the cache where it is, else from the files (and then cached).
+    """The scan, from the cache if it is there, else from the files (and then cached).
 
-    Raises InputError as `read_scan` does; a cache that cannot be used costs time, never a result.
+    Raises InputError as `read_scan` does; an unusable cache costs only time.
     """
     key = f"{files.digest}-{READER_VERSION}"
     stored = _CACHE.load(key)
@@ -84,7 +84,7 @@ def load_scan(files: ScanFiles) -> Scan:
 
 
 def volumes_m3(files: Sequence[ScanFiles]) -> list[float]:
-    """The volume of each scan's convex parts, cached for all together: a worker opens hundreds of scans.
+    """The volume of each scan's convex parts, cached in one file: a worker opens hundreds.
 
     Raises InputError as `read_scan` does.
     """

@@ -39,7 +39,7 @@ def plain(rgb: Rgb) -> Paint:
 
 
 def bands(levels: Sequence[tuple[float, Rgb]], axis: int = 2) -> Paint:
-    """Colours by coordinate: each rgb holds up to its level, the last one beyond."""
+    """Colours by coordinate: each rgb applies up to its level, the last one also beyond."""
     edges = np.array([level for level, _ in levels[:-1]])
     colours = np.array([rgb for _, rgb in levels])
     return lambda centres, _: colours[np.searchsorted(edges, centres[:, axis])]
@@ -246,7 +246,7 @@ def _bulging_runs(outline: F64) -> list[tuple[int, int]]:
 def _painted(
     vertices: F64, faces: Indices, cells: Indices, parts: Sequence[F64], paint: Paint
 ) -> ParametricSolid:
-    """Faces of one cell (the two triangles of a quadrilateral) are painted alike."""
+    """The painted solid; faces of one cell (two triangles of a quadrilateral) have one colour."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     _, of_face = np.unique(cells, return_inverse=True)

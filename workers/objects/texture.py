@@ -15,7 +15,7 @@ from datagen.workers.geometry.mesh import F32, I32, U8
 MAX_FILE_BYTES = 256 * 2**20
 MAX_SIDE_PX = 16_384
 MAX_PIXELS = 8192 * 8192
-# Larger images are reduced to this side: finer than a 640x480 frame can show of an object.
+# Larger images are reduced to this side; a 640x480 frame shows no finer detail of an object.
 KEPT_SIDE_PX = 512
 
 # Barycentric points at which a face's colour is sampled: its centre and half way to each corner.

@@ -17,10 +17,10 @@ from datagen.workers.objects.ycb_layouts import Entry, read_layout
 
 
 class YcbObjects:
-    """The credible objects of one folder (see `ycb_layouts` for the layouts).
+    """The usable objects of one folder (see `ycb_layouts` for the layouts).
 
-    Opening it hashes every object, and reads each content once, so that broken or unbelievable data
-    shows before a job starts; what was read is cached, and later openings take a fraction of a second.
+    Opening it hashes every object and reads each content once, so that damaged or implausible data
+    is reported before a job starts. The content is cached; later openings take a fraction of a second.
     Masses above 50 kg are refused by the index's schema.
     """
 
@@ -60,8 +60,8 @@ class YcbObjects:
         model = self._models.get(name)
         if model is None:
             if name not in self._entries:
-                why = self.excluded.get(name, "there is no such object")
-                raise InputError("ycb objects", name, why, "See `names()` for those that can be used")
+                reason = self.excluded.get(name, "there is no such object")
+                raise InputError("ycb objects", name, reason, "See `names()` for those that can be used")
             entry, mass_kg = self._entries[name]
             model = self._models[name] = _model(entry, mass_kg, load_scan(entry.files))
         return model
@@ -85,7 +85,7 @@ def _model(entry: Entry, mass_kg: float, scan: Scan) -> ObjectModel:
 
 
 def open_ycb(folder: str) -> YcbObjects:
-    """The objects of a folder. Raises InputError where none is named, and as `YcbObjects` does."""
+    """The objects of a folder. Raises InputError if no folder is given, and as `YcbObjects` does."""
     if not folder:
         raise InputError("ycb", "", "has no folder", "Write `ycb:DIR`")
     return YcbObjects(Path(folder).expanduser())

@@ -3,7 +3,7 @@
     DIR/objects.json                          DIR/info_pick_v0.json (or info_raw.json)
     DIR/<key>/textured.obj, collision.obj ..  DIR/models/<key>/textured.obj, collision.ply|obj ..
 
-The right one is ManiSkill's `mani_skill2_ycb`, as its asset download unpacks it.
+The right-hand one is ManiSkill's `mani_skill2_ycb`, as its asset download unpacks it.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ _MODELS = TypeAdapter(Annotated[dict[_Name, _ManiSkillModel], Field(min_length=1
 
 @dataclass(frozen=True)
 class Entry:
-    """One object of a folder: its files and either its mass or, failing that, a density."""
+    """One object of a folder: its files and its mass, or a density if the mass is unknown."""
 
     name: str
-    place: str  # where a message about it points: "<index file>: [12]"
+    place: str  # named in messages: "<index file>: [12]"
     files: ScanFiles
     mass_kg: float | None
     density_kg_m3: float
@@ -141,7 +141,7 @@ def _validated(index: Path, adapter: TypeAdapter[Any]) -> Any:
 
 
 def _inside(folder: Path, place: Path, field: str, relative: str) -> Path:
-    """`folder / relative`, refused where it leaves the folder, also through a link."""
+    """`folder / relative`. Raises InputError if it leaves the folder, also through a link."""
     try:
         path = (folder / relative).resolve()
         inside = path.is_relative_to(folder.resolve()) and "\0" not in relative

@@ -42,7 +42,7 @@ class Stretch:
         return abs(self.end_m[0] - self.start_m[0]) + abs(self.end_m[1] - self.start_m[1])
 
     def at(self, along_m: float) -> tuple[float, float]:
-        """The point so far from the start."""
+        """The point at `along_m` from the start."""
         share = along_m / self.length_m
         (x0, y0), (x1, y1) = self.start_m, self.end_m
         return (x0 + share * (x1 - x0), y0 + share * (y1 - y0))
@@ -88,7 +88,7 @@ def _draw_rooms(rng: np.random.Generator) -> list[PlannedRoom] | None:
     while len(rects) < count:
         largest = max(range(len(rects)), key=lambda k: _area(rects[k]))
         x0, y0, x1, y1 = rects.pop(largest)
-        # The last cut leaves a small room, for a bath.
+        # The last cut leaves a small room for a bathroom.
         share = rng.uniform(0.25, 0.4) if len(rects) == count - 2 and count > 2 else rng.uniform(0.4, 0.6)
         if x1 - x0 > y1 - y0:
             cut = round(x0 + share * (x1 - x0), 3)

@@ -15,7 +15,7 @@ from datagen.workers.procedural_houses.floorplan import WALL_HEIGHT_M
 from datagen.workers.procedural_houses.furniture_sizes import BUILTIN_ASSETS, COUNTER_HEIGHT_M, variants_of
 from datagen.workers.procedural_houses.room_layout import RoomLayout, Spot, spot_at
 
-# Small things that stand about, by the room.
+# Small objects on furniture, by the type of room.
 _SMALL: dict[str, tuple[str, ...]] = {
     "Kitchen": ("Apple", "Bottle", "Bowl", "Cup", "Mug", "Plate", "Pot", "Vase"),
     "LivingRoom": ("Book", "Bowl", "Candle", "Mug", "RemoteControl", "TissueBox", "Vase"),
@@ -30,19 +30,19 @@ Placed = tuple[Spot, dict[str, Any]]  # furniture, and its entry in the house do
 
 @dataclass(eq=False)
 class Furnisher:
-    """One room being furnished; `objects` are entries of a house document."""
+    """Furnishes one room; `objects` are entries of a house document."""
 
     layout: RoomLayout
     rng: np.random.Generator
     objects: list[dict[str, Any]] = field(default_factory=list)
 
     def one_of(self, kind: str) -> Asset:
-        """A variant of a type."""
+        """A random variant of a type."""
         options = variants_of(kind)
         return options[self.rng.integers(len(options))]
 
     def add(self, spot: Spot, base_m: float = 0.0) -> dict[str, Any]:
-        """Enter the asset at its spot, `base_m` above the floor, without claiming the place."""
+        """Add and return an entry at the spot, `base_m` above the floor, without marking it as taken."""
         room = self.layout.room.room_id.split("|")[1]
         entry = _entry(f"{room}|{len(self.objects)}", spot.asset, (spot.x, spot.y), base_m, spot.yaw_deg)
         self.objects.append(entry)
@@ -51,7 +51,7 @@ class Furnisher:
     def place(
         self, spots: list[Spot], front_m: float = 0.0, is_tall: bool = False, is_partner: bool = False
     ) -> Placed | None:
-        """The first spot that fits, taken and entered; None where none does."""
+        """Place an asset at the first spot that fits; None if none does."""
         for spot in spots:
             if self.layout.fits(spot, is_partner, is_tall):
                 self.layout.take(spot, front_m)
@@ -59,13 +59,13 @@ class Furnisher:
         return None
 
     def at_wall(self, kind: str, front_m: float = 0.0, is_tall: bool = False) -> Placed | None:
-        """A variant of the type with its back at a wall."""
+        """Place a variant of the type with its back at a wall; None if none fits."""
         return self.place(self.layout.wall_spots(self.one_of(kind), self.rng), front_m, is_tall)
 
     def put_on(
         self, below: Placed, asset: Asset, right_m: float, front_m: float, height_m: float | None = None
     ) -> None:
-        """Stand an asset on furniture, at a point of the furniture's frame; None is the height of its top."""
+        """Put an asset on furniture at a point of its frame; `height_m` None is the height of the top."""
         spot, entry = below
         base_m = top_height_m(spot.asset) if height_m is None else height_m
         children: list[dict[str, Any]] = entry["children"]
@@ -73,7 +73,7 @@ class Furnisher:
         children.append(_entry(child_id, asset, spot.local(right_m, front_m), base_m, spot.yaw_deg))
 
     def clutter(self, below: Placed, most: int, taken: Sequence[tuple[float, float, float]] = ()) -> None:
-        """Up to `most` small things on furniture; `taken` are circles (right, front, radius) on it."""
+        """Put up to `most` small objects on furniture; `taken` are circles (right, front, radius)."""
         circles = list(taken)
         kinds = _SMALL[self.layout.room.room_type]
         rectangles = top_rectangles(below[0].asset)
@@ -92,7 +92,7 @@ class Furnisher:
                 self.put_on(below, asset, right, front)
 
     def add_pillows(self, sofa: Placed) -> None:
-        """A pillow in each corner of a sofa, now and then."""
+        """Put a pillow in each corner of a sofa, at random."""
         asset = sofa[0].asset
         for side in (-1.0, 1.0):
             if self.rng.random() < 0.6:
@@ -100,7 +100,7 @@ class Furnisher:
                 self.put_on(sofa, self.one_of("Pillow"), side * 0.25 * asset.size_m[0], 0.05, seat_m)
 
     def decorate(self) -> None:
-        """A picture, a plant and a lamp, where they fit."""
+        """Add a picture, a plant and a lamp at random, where they fit."""
         if self.rng.random() < 0.8:
             self._hang_picture()
         if self.rng.random() < 0.7:
@@ -114,7 +114,7 @@ class Furnisher:
         for spot in self.layout.wall_spots(picture, self.rng):
             if self.layout.is_wall_free(spot) and not self.layout.is_behind_tall(spot):
                 self.add(spot, base_m)
-                self.layout.windows.append(spot.rects[0])  # nothing tall is to stand in front of it
+                self.layout.windows.append(spot.rects[0])  # keeps tall furniture away
                 return
 
 
@@ -150,7 +150,7 @@ def kitchen(f: Furnisher) -> None:
 
 
 def _equip(f: Furnisher, run: Placed) -> None:
-    """Sink, appliances and small things on a counter, and cupboards over its back run."""
+    """Sink, appliances and small objects on a counter, and cupboards over its back run."""
     spot, _ = run
     back = top_rectangles(spot.asset)[0]
     depth = spot.asset.size_m[1]
@@ -179,13 +179,13 @@ def _equip(f: Furnisher, run: Placed) -> None:
             cupboards.append(hung)
     for hung in cupboards:
         f.add(hung, COUNTER_HEIGHT_M + 0.5)
-        f.layout.windows.append(hung.rects[0])  # nothing tall is to stand there
+        f.layout.windows.append(hung.rects[0])  # keeps tall furniture away
 
 
 def dining(f: Furnisher, keeps_fronts_free: bool = False) -> bool:
     """A table in the open with chairs along its sides that face it; False where none fits.
 
-    In a kitchen the chairs may stand where one works at the counter.
+    In a kitchen the chairs may occupy the zone in front of the counter.
     """
     best: tuple[Spot, list[Spot]] | None = None
     chair = f.one_of("Chair")
@@ -208,7 +208,7 @@ def dining(f: Furnisher, keeps_fronts_free: bool = False) -> bool:
 
 
 def _seats(spot: Spot, chair: Asset) -> list[Spot]:
-    """Two chairs on each long side of a table, looking at it."""
+    """Two chairs on each long side of a table, facing it."""
     width, depth, _ = spot.asset.size_m
     out: list[Spot] = []
     for side, turned in ((1.0, 180.0), (-1.0, 0.0)):
@@ -226,9 +226,9 @@ def living_room(f: Furnisher) -> None:
     f.at_wall("ShelvingUnit", front_m=0.4, is_tall=True)
     if f.rng.random() < 0.7:
         f.at_wall("ArmChair", front_m=0.4)
-    beside = f.at_wall("SideTable")
-    if beside is not None:
-        f.put_on(beside, f.one_of("DeskLamp"), 0.0, 0.0)
+    side_table = f.at_wall("SideTable")
+    if side_table is not None:
+        f.put_on(side_table, f.one_of("DeskLamp"), 0.0, 0.0)
     if f.rng.random() < 0.5:
         dining(f, keeps_fronts_free=True)
     elif f.rng.random() < 0.6:
@@ -258,16 +258,16 @@ def _television_corner(f: Furnisher) -> bool:
 
 
 def bedroom(f: Furnisher) -> None:
-    """A bed with its head at a wall and tables beside it, a chest, a desk with its chair."""
+    """A bed with its head at a wall and tables on both sides, a chest, a desk with its chair."""
     bed = f.place(f.layout.wall_spots(f.one_of("Bed"), f.rng, 40))
     if bed is not None:
         spot = bed[0]
         width, depth, _ = spot.asset.size_m
         for side in (-1.0, 1.0):
-            beside = f.one_of("SideTable")
-            right = side * (width / 2 + beside.size_m[0] / 2 + 0.05)
-            xy = spot.local(right, -depth / 2 + beside.size_m[1] / 2)
-            placed = f.place([spot_at(beside, *xy, spot.yaw_deg)])
+            side_table = f.one_of("SideTable")
+            right = side * (width / 2 + side_table.size_m[0] / 2 + 0.05)
+            xy = spot.local(right, -depth / 2 + side_table.size_m[1] / 2)
+            placed = f.place([spot_at(side_table, *xy, spot.yaw_deg)])
             if placed is not None and f.rng.random() < 0.6:
                 f.put_on(placed, f.one_of("DeskLamp"), 0.0, -0.05)
             elif placed is not None:
@@ -304,14 +304,14 @@ def _chest(f: Furnisher) -> None:
 
 
 def bathroom(f: Furnisher) -> None:
-    """Toilet, washbasin, and what else finds room."""
+    """Toilet, washbasin, and further furniture that fits."""
     f.at_wall("Toilet", front_m=0.5)
     f.place(f.layout.wall_spots(BUILTIN_ASSETS["Sink_pedestal"], f.rng), front_m=0.5)
     if f.rng.random() < 0.7:
         f.at_wall("WashingMachine", front_m=0.5)
-    beside = f.at_wall("SideTable")
-    if beside is not None:
-        f.clutter(beside, 2)
+    side_table = f.at_wall("SideTable")
+    if side_table is not None:
+        f.clutter(side_table, 2)
     f.at_wall("GarbageCan")
 
 

@@ -87,5 +87,5 @@ BUILTIN_ASSETS: dict[str, Asset] = {**_variants(), **{a.asset_id: a for a in _fi
 
 
 def variants_of(kind: str) -> list[Asset]:
-    """The assets of a type that come in variants."""
+    """The variants of a type."""
     return [BUILTIN_ASSETS[f"{kind}_{k}"] for k in range(_VARIANTS)]

@@ -1,4 +1,4 @@
-"""Free space of one room: what may stand where without blocking doors or cutting the room in two."""
+"""Free space of one room: spots that neither block doors nor cut the room in two."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from datagen.workers.procedural_houses.floorplan import FloorPlan, Opening, Plan
 
 _WALL_GAP_M = 0.02
 _CELL_M = 0.1
-# What moves through the room, and how much room a door wants in front of it.
+# Radius of a body that moves through the room, and depth of the free zone at a door.
 _BODY_RADIUS_M = 0.28
 _DOOR_ZONE_M = 0.9
 _GAP_M = 0.03
 _CHEST_M = 1.3
 
-# Unity yaw by wall side: south, west, north, east; furniture looks into the room.
+# Unity yaw by wall side: south, west, north, east; furniture faces the room.
 _YAW_DEG = (0.0, 90.0, 180.0, 270.0)
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A place for one asset: centre (x, y), Unity yaw in degrees, and the rectangles it covers."""
+    """A position for one asset: centre (x, y), Unity yaw in degrees, and the rectangles it covers."""
 
     asset: Asset
     x: float
@@ -37,7 +37,7 @@ class Spot:
     rects: tuple[Rect, ...]
 
     def local(self, right_m: float, front_m: float) -> tuple[float, float]:
-        """World x, y of a point given to the right of and in front of the centre."""
+        """World x, y of a point `right_m` to the right of and `front_m` in front of the centre."""
         t = np.deg2rad(self.yaw_deg)
         return (
             self.x + right_m * float(np.cos(t)) + front_m * float(np.sin(t)),
@@ -57,7 +57,7 @@ def spot_at(asset: Asset, x: float, y: float, yaw_deg: float) -> Spot:
 
 @dataclass(eq=False)
 class RoomLayout:
-    """A room that fills up. `solid` are footprints, `kept` are zones that stay free."""
+    """Occupied space of a room. `solid` are footprints, `kept` are zones that stay free."""
 
     room: PlannedRoom
     inner: Rect
@@ -80,15 +80,15 @@ class RoomLayout:
         return self._is_joined_with(spot.rects)
 
     def is_wall_free(self, spot: Spot) -> bool:
-        """Whether something may hang there: no door, window or other hanging thing."""
+        """Whether the wall at the spot has no door, window or hanging object."""
         return not any(_overlap(spot.rects[0], z, 0.0) for z in [*self.door_zones, *self.windows])
 
     def is_behind_tall(self, spot: Spot) -> bool:
-        """Whether something taller than a person's chest stands there."""
+        """Whether furniture taller than a person's chest covers the spot."""
         return any(_overlap(spot.rects[0], r, 0.0) for r in self.tall)
 
     def take(self, spot: Spot, front_m: float = 0.0) -> None:
-        """Fill the spot and keep a zone of that depth in front of it free."""
+        """Occupy the spot and keep a zone `front_m` deep in front of it free."""
         self.solid.extend(spot.rects)
         if spot.asset.size_m[2] > _CHEST_M:
             self.tall.extend(spot.rects)
@@ -96,7 +96,7 @@ class RoomLayout:
             self.kept.extend(_front_zone(r, spot.yaw_deg, front_m) for r in spot.rects[:1])
 
     def wall_spots(self, asset: Asset, rng: np.random.Generator, tries: int = 24) -> list[Spot]:
-        """Places with the back at a wall, in random order; a third of them in corners."""
+        """Spots with the back at a wall, in random order; a third of them in corners."""
         width, depth, _ = asset.size_m
         x0, y0, x1, y1 = self.inner
         out: list[Spot] = []
@@ -115,21 +115,21 @@ class RoomLayout:
         return out
 
     def corner_spots(self, asset: Asset, rng: np.random.Generator) -> list[Spot]:
-        """The four places with the back at a wall and the right side in its corner, shuffled."""
+        """The four spots with the back at a wall and the right side in its corner, shuffled."""
         width, depth, _ = asset.size_m
         x0, y0, x1, y1 = self.inner
-        places = [
+        centres = [
             (x1 - width / 2, y0 + depth / 2),
             (x0 + depth / 2, y0 + width / 2),
             (x0 + width / 2, y1 - depth / 2),
             (x1 - depth / 2, y1 - width / 2),
         ]
         # Looking away from the wall, +x (right) is: east, south, west, north.
-        spots = [spot_at(asset, *places[k], _YAW_DEG[k]) for k in range(4)]
+        spots = [spot_at(asset, *centres[k], _YAW_DEG[k]) for k in range(4)]
         return [spots[k] for k in rng.permutation(4)]
 
     def open_spots(self, asset: Asset, rng: np.random.Generator, tries: int = 24) -> list[Spot]:
-        """Places anywhere in the room, turned by 0 or 90 degrees."""
+        """Spots anywhere in the room, turned by 0 or 90 degrees."""
         x0, y0, x1, y1 = self.inner
         return [
             spot_at(asset, rng.uniform(x0, x1), rng.uniform(y0, y1), 90.0 * int(rng.integers(2)))

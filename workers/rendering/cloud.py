@@ -1,4 +1,4 @@
-"""The fixed-size cloud around the target that a scene stores."""
+"""The fixed-size point cloud around the target that a scene stores."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Cloud:
 
 
 def caster_of(frame: Frame) -> PixelCaster:
-    """Looks pixels up in a finished frame, for renderers that make whole frames only."""
+    """A caster that looks pixels up in a finished frame, for renderers of whole frames."""
     rgb, depth_m, body = frame.rgb.reshape(-1, 3), frame.depth_m.ravel(), frame.body.ravel()
     return lambda pixels: Pixels(rgb[pixels], depth_m[pixels], body[pixels])
 
@@ -122,7 +122,7 @@ def farthest_points(points_m: F32, count: int) -> npt.NDArray[np.int64]:
     dx, dy, dz = np.empty_like(x), np.empty_like(x), np.empty_like(x)
     for row in range(1, count):
         last = chosen[row - 1]
-        gap2[last] = -1.0  # never chosen again, also where all that are left equal a chosen one
+        gap2[last] = -1.0  # never chosen again, even if all remaining points equal a chosen one
         np.subtract(x, x[last], out=dx)
         np.subtract(y, y[last], out=dy)
         np.subtract(z, z[last], out=dz)

@@ -43,7 +43,7 @@ def render_embree(scene: SceneGeometry, camera: Camera) -> Frame:
 
 
 def render_rays(scene: RayScene, camera: Camera) -> Frame:
-    """The whole frame of a scene whose hierarchies exist."""
+    """The whole frame of a scene that is ready for rays."""
     h, w = camera.height_px, camera.width_px
     pixels = cast_pixels(scene, camera, np.arange(h * w))
     return Frame(camera, pixels.rgb.reshape(h, w, 3), pixels.depth_m.reshape(h, w), pixels.body.reshape(h, w))

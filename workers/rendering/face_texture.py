@@ -1,4 +1,4 @@
-"""Meshes as engines with one texture a body want them: no shared corners, flat colours as a palette."""
+"""Meshes for engines with one texture per body: no shared corners, flat colours as a palette."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _PALETTE_WIDTH = 256
 
 
 def face_texture(mesh: Mesh) -> tuple[F32, U8]:
-    """Texture coordinates (F, 3, 2) of the faces' corners and the image (H, W, 3) they point into.
+    """Texture coordinates (F, 3, 2) of the faces' corners and their image (H, W, 3).
 
     A textured mesh gives its own. Flat face colours become texels of a palette, with all three
     corners of a face in the middle of the same one. The origin is the image's lower left corner.

@@ -20,7 +20,7 @@ _DPI = 120
 
 
 def new_sheet(title: str, height_in: float) -> Figure:
-    """An empty figure of the common width that lays itself out."""
+    """An empty figure of the common width with automatic layout."""
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)

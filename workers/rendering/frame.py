@@ -44,7 +44,7 @@ class SceneGeometry:
 class Frame:
     """One RGB-D image. `depth_m` is along the camera's z axis; 0 where nothing was measured.
 
-    `body` says what each pixel shows: -1 nothing, 0 the house, 1 + k object k.
+    `body` is the number of the body in each pixel: -1 none, 0 the house, 1 + k object k.
     """
 
     camera: Camera

@@ -2,8 +2,8 @@
 
 Depth comes from matching: disparity = fx * baseline / depth. A matching error of sigma_d pixels
 therefore moves depth by sigma_z = depth^2 * sigma_d / (fx * baseline) (Khoshelham and Elberink 2012,
-Sensors 12(2), eq. 10). Surfaces seen at a grazing angle and the rims of things match badly and
-often give nothing (Nguyen, Izadi and Lovell 2012, 3DIMPVT; Mallick, Das and Majumdar 2014).
+Sensors 12(2), eq. 10). Surfaces seen at a grazing angle and the edges of objects match poorly and
+often give no depth (Nguyen, Izadi and Lovell 2012, 3DIMPVT; Mallick, Das and Majumdar 2014).
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ Mask = npt.NDArray[np.bool_]
 def add_noise(frame: Frame, params: NoiseParams, rng: np.random.Generator) -> Frame:
     """The frame with a stereo camera's errors in its depth; colours and bodies stay.
 
-    A pixel without depth keeps none, and lost pixels have depth 0. Whether noise is wanted at all
-    (`params.enabled`) is the caller's question.
+    A pixel without depth keeps none, and lost pixels have depth 0. The caller checks
+    `params.enabled`.
     """
     exact = frame.depth_m
     measured = exact > 0
-    # All draws happen for every frame in the same order, so that one switched-off effect does not
-    # change what the others draw.
+    # Every frame draws all random numbers in the same order, so that disabling one effect does not
+    # change the others.
     matched = rng.standard_normal(exact.shape, dtype=np.float32)
-    luck = rng.random(exact.shape, dtype=np.float32)
+    edge_draws = rng.random(exact.shape, dtype=np.float32)
     holes = _holes(exact.shape, params.hole_rate, rng)
 
     depth_m = _matched_depth(exact, measured, frame.camera, params, matched)
     edge = _edges(exact)
-    lost = holes | (edge & (luck < params.edge_dropout))
-    # Next to an edge a normal means nothing.
+    lost = holes | (edge & (edge_draws < params.edge_dropout))
+    # Next to an edge the normal is undefined.
     lost |= ~edge & (_facing(exact, frame.camera) < params.grazing_dropout_cos)
     depth_m[lost | ~measured] = 0.0
     return replace(frame, depth_m=depth_m)
 
 
 def _matched_depth(exact: F32, measured: Mask, camera: Camera, params: NoiseParams, matched: F32) -> F32:
-    """Depth (H, W) from the disparity that matching finds: off by a normal error, in whole steps.
+    """Depth (H, W) from the matched disparity: with a normal error, rounded to whole steps.
 
-    No disparity is 0 or less: what would match there is as far as one step can tell.
+    The smallest disparity is one step, which bounds the depth.
     """
     focal_baseline = camera.fx_px * params.baseline_m
     disparity_px = focal_baseline / np.where(measured, exact, 1.0).astype(np.float64)
@@ -62,7 +62,7 @@ def _matched_depth(exact: F32, measured: Mask, camera: Camera, params: NoisePara
 
 
 def _edges(exact: F32) -> Mask:
-    """Pixels (H, W) on either side of a jump in depth, or of the border to what has none.
+    """Pixels (H, W) on either side of a jump in depth, or of the border to pixels without depth.
 
     Inverse depth is linear over a plane, so its second difference shows jumps and not slopes.
     """
@@ -73,7 +73,7 @@ def _edges(exact: F32) -> Mask:
         marks = np.moveaxis(edge, axis, 0)
         step = np.diff(near, axis=0)
         padded = np.concatenate([step[:1], step, step[-1:]])
-        # Compared with both neighbouring steps: only a slope has one that is alike.
+        # A step on a slope resembles a neighbouring step; a step at an edge resembles neither.
         unlike = np.minimum(np.abs(step - padded[:-2]), np.abs(step - padded[2:]))
         jump = unlike > _EDGE_SHARE * np.maximum(near[:-1], near[1:])
         marks[:-1] |= jump

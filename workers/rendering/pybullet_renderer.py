@@ -16,16 +16,16 @@ from datagen.workers.geometry.transforms import inverse, quaternion_wxyz
 from datagen.workers.rendering.face_texture import face_texture
 from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 
-# What is nearer or farther is not drawn. A near plane far off keeps depth sharp.
+# Clipping planes. A larger near distance gives more precise depth.
 _NEAR_M, _FAR_M = 0.02, 60.0
-# Bullet silently drops what exceeds 131,072 vertices of one mesh.
+# Bullet silently drops the vertices of a mesh beyond 131,072.
 _MAX_FACES = 40_000
 _LIGHT_DIRECTION = [0.35, 0.25, 0.90]
 _AMBIENT, _DIFFUSE = 0.7, 0.3
 
 
 def render_pybullet(scene: SceneGeometry, camera: Camera) -> Frame:
-    """The whole frame of a scene, built from scratch. Raises InputError where Bullet cannot."""
+    """The whole frame of a scene, built from scratch. Raises InputError if Bullet opens no world."""
     with Drawing() as drawing:
         drawing.add_scene(scene)
         return drawing.render(camera)
@@ -52,7 +52,7 @@ class Drawing:
 
     def add_scene(self, scene: SceneGeometry) -> None:
         """Draw a house as 0 and its objects from 1 on."""
-        # An eye within a wall or a cupboard sees it from inside.
+        # A camera within a wall or a cupboard sees it from inside.
         self.add(concatenate([body.visual for body in scene.house.bodies]), np.eye(4), 0, both_sides=True)
         for k, model in enumerate(scene.objects):
             self.add(model.visual, scene.T_world_object[k], 1 + k)
@@ -97,7 +97,7 @@ class Drawing:
     def render(self, camera: Camera, near_m: float = _NEAR_M) -> Frame:
         """The frame that a camera sees; its bodies are the labels, -1 for none."""
         rgba, buffer, segments = self._image(camera, near_m)
-        body = np.array([*self._label_of_body, -1], np.int16)[segments]  # -1, the background, takes the last
+        body = np.array([*self._label_of_body, -1], np.int16)[segments]  # -1 is the background
         # The buffer holds OpenGL's window depth, which is not linear in metres.
         depth_m = _FAR_M * near_m / (_FAR_M - (_FAR_M - near_m) * buffer.astype(np.float64))
         depth_m[body < 0] = 0.0
@@ -126,14 +126,14 @@ class Drawing:
 
 
 def _view_matrix(camera: Camera) -> list[float]:
-    """T_camera_world as OpenGL wants it: y up and z backward in the camera frame, by columns."""
+    """T_camera_world in OpenGL's convention: y up and z backward in the camera frame, by columns."""
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     columns: list[float] = (flip @ inverse(camera.T_world_camera)).T.ravel().tolist()
     return columns
 
 
 def _projection_matrix(camera: Camera, near_m: float) -> list[float]:
-    """OpenGL's projection for a pinhole whose principal point need not be the middle, by columns."""
+    """OpenGL's projection for a pinhole with any principal point, by columns."""
     w, h = camera.width_px, camera.height_px
     # TinyRenderer samples a pixel at its lower left corner, not at its centre (measured).
     cx_px, cy_px = camera.cx_px - 0.5, camera.cy_px + 0.5

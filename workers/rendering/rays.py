@@ -1,7 +1,7 @@
 """Ray casting with Embree over bodies that keep their own frames.
 
 Every object and every house has its own bounding volume hierarchy, built once and kept; a ray is
-carried into the frame of each body that it may hit. A scene therefore costs no building at all,
+transformed into the frame of each body that it may hit. A scene therefore builds no hierarchy,
 and the full scan meshes are used, undecimated.
 """
 
@@ -20,7 +20,7 @@ from datagen.workers.geometry.mesh import F32, F64, I32, Mesh, concatenate, face
 from datagen.workers.houses.house import House
 from datagen.workers.objects.model import ObjectModel
 
-MISS = np.float32(1e37)  # what Embree leaves in a ray that hit nothing
+MISS = np.float32(1e37)  # Embree's parameter of a ray that hit nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,12 @@ def ray_mesh(mesh: Mesh) -> RayMesh:
     return rays
 
 
-# As long as the house or object itself is kept.
+# An entry lives as long as its house or object.
 _kept: WeakKeyDictionary[House | ObjectModel, RayMesh] = WeakKeyDictionary()
 
 
 def house_rays(house: House) -> RayMesh:
-    """One hierarchy over everything that stands in a house, world frame; built once for each `house`."""
+    """One hierarchy over all bodies of a house, world frame; built once for each `house`."""
     if house not in _kept:
         _kept[house] = ray_mesh(concatenate([body.visual for body in house.bodies]))
     return _kept[house]
@@ -103,7 +103,7 @@ class Hits:
 
 
 def first_hits(rays: RayMesh, origins_m: F32, directions: F32) -> Hits:
-    """First hits with the face and the place on it; origins and directions are (N, 3)."""
+    """First hits with the face and the point on it; origins and directions are (N, 3)."""
     out = rays.hierarchy.run(origins_m, directions, output=True)
     return Hits(out["tfar"], out["primID"], np.stack([out["u"], out["v"]], axis=1))
 

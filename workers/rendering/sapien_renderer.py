@@ -15,7 +15,7 @@ from datagen.workers.rendering.face_texture import face_texture
 from datagen.workers.rendering.frame import Camera, Frame, SceneGeometry
 
 with warnings.catch_warnings():
-    # SAPIEN warns about a missing Vulkan loader at import; whether one works is found out below.
+    # SAPIEN warns about a missing Vulkan loader at import; `_the_studio` checks whether one works.
     warnings.simplefilter("ignore")
     import sapien
     from sapien import render
@@ -36,7 +36,7 @@ class _Studio:
     camera: render.RenderCameraComponent | None = None
 
 
-# Making a scene compiles shaders (seconds) and is never given back wholly, so there is one.
+# Making a scene compiles shaders (seconds), and it is never freed completely, so there is only one.
 _studio: _Studio | None = None
 
 
@@ -115,8 +115,8 @@ def _photograph(studio: _Studio, camera: Camera, entities: list[sapien.Entity]) 
 
     known = np.array([entity.per_scene_id for entity in entities])
     order = np.argsort(known)
-    place = np.minimum(np.searchsorted(known, scene_ids, sorter=order), len(known) - 1)
-    body = np.where(known[order[place]] == scene_ids, order[place], -1).astype(np.int16)
+    rows = np.minimum(np.searchsorted(known, scene_ids, sorter=order), len(known) - 1)
+    body = np.where(known[order[rows]] == scene_ids, order[rows], -1).astype(np.int16)
     rgb = np.round(np.clip(colour[..., :3], 0.0, 1.0) * 255).astype(np.uint8)
     rgb[body < 0] = _BACKGROUND_RGB
     # Positions are in the OpenGL camera frame, whose z points backward.

@@ -9,20 +9,20 @@ from datagen.workers.geometry.mesh import F32, F64
 from datagen.workers.geometry.transforms import look_at
 from datagen.workers.rendering.rays import MISS, RayMesh, RayScene, nearest, occluded
 
-# A hit on the target counts as seen up to this depth before it, so that what the target stands on
-# does not hide it by rounding.
+# Occluders within this depth before a hit on the target are ignored, so that rounding does not let the
+# target's support hide it.
 _SKIN_M = 5e-4
-# Rays in flight at once; bounds memory at about 25 MB. Many more no longer fit the cache.
+# Rays in flight at once; bounds memory at about 25 MB. Far more rays do not fit the cache.
 _MAX_RAYS = 1 << 16
 
 I32 = npt.NDArray[np.int32]
 
 
 def visible_pixels(scene: RayScene, target: int, eyes_m: F64, window: int) -> tuple[I32, I32]:
-    """Pixels (N,) on the target when alone, and of them those that show it in the full scene.
+    """Numbers (N,) of pixels that show the target alone, and of these that show it in the full scene.
 
     Each eye (N, 3), world, looks at the centre of object `target` through a window of
-    `window` x `window` pixels that touches the target's bounding sphere, so that the share of the
+    `window` x `window` pixels that touches the target's bounding sphere, so that the ratio of the
     two does not depend on image size. An eye inside that sphere sees nothing: (0, 0).
     """
     n = len(eyes_m)
@@ -57,7 +57,7 @@ def _count(scene: RayScene, target: int, eyes_m: F64, distance_m: F64, window: i
     directions = _directions(axes, eye, x[hit], y[hit])
     alone = np.bincount(eye, minlength=n).astype(np.int32)
 
-    # What is left of these rays after the house and each other object that may stand before it.
+    # The rays that neither the house nor another object in front of the target blocks.
     free = ~occluded(scene.house, eyes_m.astype(np.float32).take(eye, axis=0), directions, limits)
     for k in range(len(scene.objects)):
         if k == target:

@@ -2,7 +2,7 @@
 
 from datagen.schemas.specification import Specification
 
-# Raised whenever the same specification would give other scenes: a change in how houses and objects
+# Raise it whenever the same specification would give other scenes: a change in how houses and objects
 # are read, in placement, viewpoints or clouds. Part of every specification.
 VERSION = 1
 # The same for specifications with `candidates.within`. 2: robots are drawn given that the target has room.

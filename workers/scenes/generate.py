@@ -28,7 +28,7 @@ from datagen.workers.settling import load_settler
 from datagen.workers.settling.settler import SettleResult
 from datagen.workers.world import PreparedHouse, World
 
-# Static parts this far from the support can be touched by what rolls off; farther ones cannot.
+# Objects that roll off the support touch no static part farther from it than this.
 _SURROUNDINGS_M = 0.3
 
 
@@ -41,9 +41,9 @@ def generate_scene(world: World, index: int, clock: StageClock) -> tuple[Scene, 
     for retry in range(world.spec.scene.max_retries):
         try:
             return _try_scene(world, index, retry, dict(redraws), clock)
-        except SceneRejected as redraw:
-            redraws[redraw.cause] += 1
-            detail = redraw.detail or detail
+        except SceneRejected as rejection:
+            redraws[rejection.cause] += 1
+            detail = rejection.detail or detail
     causes = ", ".join(f"{cause} {count}" for cause, count in redraws.most_common())
     raise InputError(
         f"scene {index}",
@@ -96,7 +96,7 @@ def _try_scene(
 
 
 def _load_house(world: World, house_id: str) -> PreparedHouse:
-    """The house; one broken record among thousands costs a redraw, not the job."""
+    """The house. Raises SceneRejected if it is damaged, so that the job continues with another."""
     try:
         return world.house(house_id)
     except InputError as error:
@@ -115,7 +115,7 @@ def _draw_names(world: World, rng: np.random.Generator, clock: StageClock) -> li
 def check_settled(
     settled: SettleResult, models: tuple[ObjectModel, ...], surface: Surface, params: SettleParams
 ) -> None:
-    """Raise SceneRejected where the result is no scene: blown up, still moving, sunk in, or fallen off."""
+    """Raise SceneRejected for an unusable result: not finite, moving, penetrating, or fallen off."""
     T = settled.T_world_object
     if not np.isfinite(T).all():
         raise SceneRejected("not_finite")
@@ -152,8 +152,8 @@ def _observe(
     rng: np.random.Generator,
     noise_rng: np.random.Generator,
 ) -> Cloud:
-    # Embree casts single pixels: only those that the cloud draws. Noise looks at neighbours, and
-    # the other renderers make whole frames.
+    # Embree casts only the pixels that the cloud samples. Noise needs neighbouring pixels, and the
+    # other renderers make whole frames.
     single = params.renderer == "embree" and not params.noise.enabled
     cast: PixelCaster = (
         (lambda pixels: cast_pixels(rays, camera, pixels))

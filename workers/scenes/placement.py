@@ -1,4 +1,4 @@
-"""Where target and clutter are dropped: on one support, without overlap."""
+"""Drop poses of target and clutter on one support, without overlap."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from datagen.workers.houses.house import House, Surface
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.scene_rejected import SceneRejected
 
-_GAP_M = 0.004  # kept between things that are dropped side by side
+_GAP_M = 0.004  # kept between objects that are dropped side by side
 _NEAR_TRIES, _FAR_TRIES = 36, 40
 _BLOCK = 8  # tries that are checked together; the first few mostly suffice
-_ABOVE_M = 0.5  # things this far above the surface cannot be in the way of a drop
+_ABOVE_M = 0.5  # objects this far above the surface do not block a drop
 
 Bools = npt.NDArray[np.bool_]
 
 
 def eligible_surfaces(house: House, params: SceneParams) -> list[Surface]:
-    """Surfaces of the asked height on which a target and some clutter find room."""
+    """Surfaces of the specified height with room for a target and some clutter."""
     low, high = params.support_height_m.low, params.support_height_m.high
     return [s for s in house.surfaces if low <= s.height_m <= high and min(s.size_m) >= 0.3]
 
 
 def standing_footprints(house: House, surface: Surface) -> list[F64]:
-    """Convex footprints (K, 2), surface frame, of what already rises above the surface."""
+    """Convex footprints (K, 2), surface frame, of parts that rise above the surface."""
     T = surface.T_world_surface
     half = np.array(surface.size_m) / 2
     footprints = []
@@ -65,7 +65,7 @@ def drop_poses(
 ) -> F64:
     """Start poses (K, 4, 4), world: upright, turned at random, just above the surface, disjoint.
 
-    Object 0, the target, goes anywhere; the others within `clutter_radius_m` of it, then up to
+    Object 0, the target, is placed anywhere; the others within `clutter_radius_m` of it, then up to
     twice as far, and anywhere once that is full.
     `taken` are footprints in the surface frame that are kept free. Raises SceneRejected("no_placement").
     """
@@ -77,14 +77,14 @@ def drop_poses(
         near_tries = 0 if k == 0 else _NEAR_TRIES
         footprints = stack_polygons([*placed, np.zeros((4, 2))])[:-1]  # of at least four corners
         state = rng.bit_generator.state
-        # Each try takes three numbers from the stream: the yaw, then angle and radius, or x and y.
+        # Each try uses three numbers of the stream: the yaw, then angle and radius, or x and y.
         numbers = rng.random((near_tries + _FAR_TRIES, 3))
         positions = _positions(numbers, near_tries, half, target_xy, params.clutter_radius_m)
         outlines = _outlines(model, positions, _between(-np.pi, np.pi, numbers[:, 0]))
         attempt = _first_free(outlines, half, footprints)
         if attempt is None:
             raise SceneRejected("no_placement")
-        # The tries after it are not used up.
+        # The random numbers of later tries are not consumed.
         rng.bit_generator.state = state
         rng.random((attempt + 1, 3))
         xy, yaw = positions[attempt], float(_between(-np.pi, np.pi, numbers[attempt, 0]))
@@ -107,12 +107,12 @@ def _positions(numbers: F64, near_tries: int, half: F64, target_xy: F64, radius_
 
 
 def _between(low: F64 | float, high: F64 | float, numbers: F64 | np.float64) -> F64:
-    """What `Generator.uniform` makes of random numbers in [0, 1)."""
+    """Random numbers in [0, 1) scaled to [low, high), as `Generator.uniform` does."""
     return np.asarray(low + (high - low) * numbers)
 
 
 def _outlines(model: ObjectModel, xy: F64, yaw: F64) -> F64:
-    """Bounding rectangles (T, 4, 2) of an object, turned and moved, with half the gap around it."""
+    """Bounding rectangles (T, 4, 2) of an object at the tries' poses, with half the gap around it."""
     x, y = model.size_m[0] / 2 + _GAP_M / 2, model.size_m[1] / 2 + _GAP_M / 2
     c, s = np.cos(yaw), np.sin(yaw)
     corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
@@ -121,7 +121,7 @@ def _outlines(model: ObjectModel, xy: F64, yaw: F64) -> F64:
 
 
 def _first_free(outlines: F64, half: F64, footprints: F64) -> int | None:
-    """The first of the rectangles (T, 4, 2) that is on the surface and overlaps no footprint (P, K, 2)."""
+    """Index of the first rectangle (T, 4, 2) on the surface that overlaps no footprint (P, K, 2)."""
     on_surface = np.flatnonzero((np.abs(outlines) <= half).all((1, 2)))
     for start in range(0, len(on_surface), _BLOCK):
         rows = on_surface[start : start + _BLOCK]
@@ -137,7 +137,7 @@ def _overlap(a: F64, b: F64) -> Bools:
 
 
 def _separated(a: F64, b: F64) -> Bools:
-    """Whether a side of polygon a (T, J, 2) has polygon b (P, K, 2) beyond it (T, P)."""
+    """Whether a side of polygon a (T, J, 2) separates it from polygon b (P, K, 2); (T, P)."""
     edges = np.roll(a, -1, axis=1) - a
     normals = np.stack([edges[..., 1], -edges[..., 0]], axis=2)  # (T, J, 2), outward
     on_a = normals @ a.transpose(0, 2, 1)  # (T, J, J)

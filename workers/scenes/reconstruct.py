@@ -24,10 +24,10 @@ Record = Mapping[str, Any]  # one row of the scene table, or the samples' column
 
 _PLACE = "stored scenes"
 _FIX = "Make the run with these scenes again"
-# Of rotations, which engines give as float32.
+# Tolerance for rotations, which engines give as float32.
 _ROUNDING = 1e-5
 _EXTENT_M = 1000.0  # no house is larger
-# Farther from the target's centre than this no base is of use, and a record cannot say its distance.
+# Bases farther from the target's centre are of no use, and their distance exceeds the schema's range.
 _NEAR_M = 10.0
 
 
@@ -56,8 +56,8 @@ class ReconstructedScene:
 def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     """Rebuild the geometry of a record from the sources it names.
 
-    Raises InputError where a house or an object is not there any more or has other content, and for
-    poses that no body can have.
+    Raises InputError if a house or an object is missing or has other content, and for impossible
+    poses.
     """
     index, retry = int(record["scene_index"]), int(record["retry"])
     T_world_object = np.asarray(record["T_world_object"], np.float64)
@@ -65,7 +65,7 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
     fx, fy, cx, cy = (float(v) for v in record["intrinsics_px"])
     width, height = (int(v) for v in record["image_size_px"])
     centre_m = np.asarray(record["target_center_m"], np.float64)
-    for name, sound in (
+    for name, is_valid in (
         ("scene_index", index >= 0),
         ("retry", retry >= 0),
         ("T_world_object", all(map(_is_placed, T_world_object))),
@@ -74,14 +74,14 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
         ("image_size_px", 0 < width <= 4096 and 0 < height <= 4096),
         ("target_center_m", np.allclose(centre_m, T_world_object[0, :3, 3], rtol=0, atol=_ROUNDING)),
     ):
-        if not sound:
-            raise _senseless(index, name)
+        if not is_valid:
+            raise _impossible(index, name)
     house = world.house(str(record["house_id"]))
-    _same(house.house.house_id, house.house.digest, str(record["house_digest"]))
+    _check_digest(house.house.house_id, house.house.digest, str(record["house_digest"]))
     names = [str(name) for name in record["object_name"]]
     models = tuple(world.object(name) for name in names)
     for model, digest in zip(models, record["object_digest"], strict=True):
-        _same(model.name, model.digest, str(digest))
+        _check_digest(model.name, model.digest, str(digest))
     camera = Camera(T_world_camera, width, height, fx, fy, cx, cy)
     rays = world.ray_scene(house, names, T_world_object)
     return ReconstructedScene(index, retry, house, models, T_world_object, rays, camera)
@@ -90,10 +90,10 @@ def reconstruct_scene(world: World, record: Record) -> ReconstructedScene:
 def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneCandidates:
     """The candidates of a scene from their stored columns, by field name.
 
-    Raises InputError for numbers that are not finite, or that no robot around the target can have.
+    Raises InputError for numbers that are not finite or out of the range of robots.
     """
     apart_m = np.hypot(*(columns["base_xy_m"] - scene.target_center_m[:2]).T)
-    for name, sound in (
+    for name, is_valid in (
         ("base_xy_m", apart_m < _NEAR_M),
         ("candidate_index", columns["candidate_index"] >= 0),
         ("robot_index", columns["robot_index"] >= 0),
@@ -102,8 +102,8 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
         ("arm_reach_m", _within(columns["arm_reach_m"], 0.0, _NEAR_M)),
         ("base_clearance_m", _within(columns["base_clearance_m"], -_NEAR_M, _NEAR_M)),
     ):
-        if not sound.all():
-            raise _senseless(scene.index, name)
+        if not is_valid.all():
+            raise _impossible(scene.index, name)
     return SceneCandidates(
         base_xy_m=columns["base_xy_m"],
         robot_index=columns["robot_index"],
@@ -116,19 +116,19 @@ def reconstruct_candidates(columns: Record, scene: ReconstructedScene) -> SceneC
 
 
 def _is_placed(T: F64) -> bool:
-    """Whether a matrix (4, 4) turns and moves, within the size of a house, and does nothing else."""
+    """Whether a matrix (4, 4) is a rigid transform to a position within the size of a house."""
     return is_pose(T, _ROUNDING) and bool(np.abs(T[:3, 3]).max() <= _EXTENT_M)
 
 
 def _within(values: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
-    return (values >= low) & (values <= high)  # neither, where it is NaN
+    return (values >= low) & (values <= high)  # False for NaN
 
 
-def _senseless(index: int, name: str) -> InputError:
+def _impossible(index: int, name: str) -> InputError:
     return InputError(_PLACE, f"scene {index}, {name}", "has impossible values", _FIX)
 
 
-def _same(name: str, found: str, stored: str) -> None:
+def _check_digest(name: str, found: str, stored: str) -> None:
     if found != stored:
         raise InputError(
             name,

@@ -16,7 +16,7 @@ from datagen.workers.world import PreparedHouse
 
 
 class SettledScene(Protocol):
-    """The input of a label source: a new `Scene`, or one recalled from a store. Object 0 is the target."""
+    """The input of a label source: a new `Scene`, or one read from a store. Object 0 is the target."""
 
     @property
     def index(self) -> int: ...

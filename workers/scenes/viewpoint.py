@@ -1,4 +1,4 @@
-"""From where a scene is observed."""
+"""Sampling of the camera that observes a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from datagen.workers.rendering.rays import RayScene
 from datagen.workers.rendering.visibility import visible_pixels
 from datagen.workers.scene_rejected import SceneRejected
 
-_WINDOW_PX = 32  # rays a side to judge a viewpoint; coarser than for labels
+_WINDOW_PX = 32  # rays per side to evaluate a viewpoint; coarser than for labels
 _BLOCK = 8
 
 
@@ -28,10 +28,10 @@ def draw_viewpoint(
     robot: CandidateParams,
     rng: np.random.Generator,
 ) -> tuple[Camera, float]:
-    """A camera at a free place on the room's floor, and the share of the target that it sees.
+    """A camera at a free position in the room, and the share of the target that it sees.
 
     The carrier is a column of the robot's base radius up to the camera. Raises
-    SceneRejected("no_viewpoint") when none of `max_viewpoints` places serves.
+    SceneRejected("no_viewpoint") if none of `max_viewpoints` positions is usable.
     """
     n = params.max_viewpoints
     angle = rng.uniform(-np.pi, np.pi, n)

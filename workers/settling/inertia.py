@@ -14,7 +14,7 @@ from datagen.workers.geometry.mesh import F32, F64
 
 @dataclass(frozen=True, eq=False)
 class MassProperties:
-    """How a body's mass is spread. The columns of `R_body_principal` are its principal axes."""
+    """Mass distribution of a body. The columns of `R_body_principal` are its principal axes."""
 
     centre_m: F64  # (3,), body frame
     R_body_principal: F64  # (3, 3), a rotation

@@ -17,11 +17,11 @@ from datagen.workers.objects.model import ObjectModel
 from datagen.workers.settling.inertia import mass_properties
 from datagen.workers.settling.settler import SettleResult
 
-_LOOK_EVERY = 5  # steps between looks at the speeds, as with PhysX: the same counts come out
+_CHECK_EVERY = 5  # steps between checks of the speeds, as with PhysX, so that step counts agree
 _GRAVITY_MPS2 = 9.81
 # PhysX's defaults; Bullet's own would slow falls and rolls down.
 _LINEAR_DAMPING, _ANGULAR_DAMPING = 0.0, 0.05
-# Bullet inflates every hull by 1 mm, so that things would rest 2 mm above each other.
+# Bullet inflates every hull by 1 mm, so that objects would rest 2 mm above each other.
 _MARGIN_M = 0.0
 
 
@@ -30,8 +30,8 @@ def settle_pybullet(
 ) -> SettleResult:
     """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
 
-    Every call has a physics world of its own. Raises InputError where Bullet cannot make one, or
-    a part of an object has no volume.
+    Every call has a physics world of its own. Raises InputError if Bullet cannot make one, or if a
+    part of an object has no volume.
     """
     world = pybullet.connect(pybullet.DIRECT)
     if world < 0:
@@ -66,7 +66,7 @@ def _fill(
     T_world_object: F64,
     params: SettleParams,
 ) -> tuple[list[int], list[F64]]:
-    """Add everything; the objects' body numbers and their T_object_inertial (4, 4) each.
+    """Add all bodies; returns the objects' body numbers and T_object_inertial (4, 4) each.
 
     Bullet reports the pose of the inertial frame: centre of mass and principal axes.
     """
@@ -92,7 +92,7 @@ def _fill(
             baseInertialFramePosition=T_object_inertial[:3, 3].tolist(),
             baseInertialFrameOrientation=_xyzw(T_object_inertial),
         )
-        # What Bullet puts in by itself is the inertia of the bounding box.
+        # By default Bullet uses the inertia of the bounding box.
         pybullet.changeDynamics(
             body, -1, localInertiaDiagonal=properties.inertia_kgm2.tolist(), physicsClientId=world
         )
@@ -104,14 +104,14 @@ def _fill(
 def _add_body(
     world: int, file: Path, parts_m: Sequence[F32], params: SettleParams, **placing: float | list[float]
 ) -> int:
-    """A body of convex parts, by way of an OBJ file: Bullet takes more than 16 parts only from one."""
+    """A body of convex parts, from an OBJ file: Bullet accepts more than 16 parts only from a file."""
     file.write_text(_hulls_as_obj(parts_m), encoding="ascii")
     shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(file), physicsClientId=world)
     body: int = pybullet.createMultiBody(baseCollisionShapeIndex=shape, physicsClientId=world, **placing)
     pybullet.changeDynamics(
         body,
         -1,
-        # Bullet multiplies the frictions of a pair; the root makes the product the one asked for.
+        # Bullet multiplies the frictions of a pair; the root makes the product the specified one.
         lateralFriction=float(np.sqrt(params.friction)),
         restitution=0.0,
         linearDamping=_LINEAR_DAMPING,
@@ -123,7 +123,7 @@ def _add_body(
 
 
 def _hulls_as_obj(parts_m: Sequence[F32]) -> str:
-    """One group a part. Bullet makes a hull of each group's corners, so faces only list the vertices."""
+    """OBJ text, one group per part. Bullet makes a hull of each group's corners: faces only list vertices."""
     lines: list[str] = []
     offset = 1
     for k, part in enumerate(parts_m):
@@ -136,11 +136,11 @@ def _hulls_as_obj(parts_m: Sequence[F32]) -> str:
 
 
 def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, bool, float, float]:
-    """Step until rest; steps made, whether at rest, and the largest speeds at the end (m/s, rad/s)."""
+    """Step until rest; returns steps, whether at rest, and the largest speeds at the end (m/s, rad/s)."""
     steps, resting = 0, 0
     speed = angular = np.inf
     while steps < params.max_steps and resting < params.rest_steps:
-        for _ in range(min(_LOOK_EVERY, params.max_steps - steps)):
+        for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
             pybullet.stepSimulation(physicsClientId=world)
             steps += 1
         velocities = np.array(
@@ -151,7 +151,7 @@ def _fall(world: int, bodies: list[int], params: SettleParams) -> tuple[int, boo
         if not (np.isfinite(speed) and np.isfinite(angular)):
             break
         calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
-        resting = resting + _LOOK_EVERY if calm else 0
+        resting = resting + _CHECK_EVERY if calm else 0
     return steps, resting >= params.rest_steps, speed, angular
 
 

@@ -1,4 +1,4 @@
-"""Bodies of convex parts in a SAPIEN scene: what every use of its physics begins with."""
+"""Bodies of convex parts in a SAPIEN scene, for every use of its physics."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _UNSCALED = [1.0, 1.0, 1.0]
 
 
 def pad_material(object_friction: float, finger_friction: float) -> physx.PhysxMaterial:
-    """What a finger's pad is made of, so that its friction with the object is the geometric mean of both.
+    """Material of a finger's pad whose friction with the object is the geometric mean of both.
 
-    Rubber holds a soapy bottle far worse than a dry one. PhysX takes the arithmetic mean, in which the
-    object's friction hardly counts; the pad gets what makes that the same.
+    Rubber holds a soapy bottle far worse than a dry one. PhysX uses the arithmetic mean, in which the
+    object's friction hardly counts; the pad's friction makes that mean equal to the geometric one.
     """
     pad = max(0.0, 2 * math.sqrt(object_friction * finger_friction) - object_friction)
     return physx.PhysxMaterial(pad, pad, 0.0)
 
 
 def static_body(parts_m: Sequence[F32], material: physx.PhysxMaterial) -> physx.PhysxRigidStaticComponent:
-    """One body that never moves, of convex parts (V, 3) each in the world frame."""
+    """One static body of convex parts (V, 3) each in the world frame."""
     body = physx.PhysxRigidStaticComponent()
     for part in parts_m:
-        # PhysX wants hulls near their own origin: cooking loses precision far from it.
+        # PhysX needs hulls near their own origin: cooking loses precision far from it.
         centre_m = part.mean(axis=0)
         shape = convex_shape(part - centre_m, material)
         shape.set_local_pose(sapien.Pose(centre_m.tolist()))
@@ -43,7 +43,7 @@ def static_body(parts_m: Sequence[F32], material: physx.PhysxMaterial) -> physx.
 
 
 def add_static(scene: sapien.Scene, parts_m: Sequence[F32], material: physx.PhysxMaterial) -> None:
-    """Adds a `static_body`."""
+    """Adds a `static_body` to a scene."""
     entity = sapien.Entity()
     entity.add_component(static_body(parts_m, material))
     scene.add_entity(entity)
@@ -56,7 +56,7 @@ def add_object(
     T_world_object: F64,
     material: physx.PhysxMaterial,
 ) -> physx.PhysxRigidDynamicComponent:
-    """A body that moves freely, of convex parts (V, 3) each in the object's frame, at a pose (4, 4)."""
+    """Add a dynamic body of convex parts (V, 3) each in the object's frame, at a pose (4, 4)."""
     body = object_body(parts_m, mass_kg, material)
     entity = sapien.Entity()
     entity.add_component(body)
@@ -68,7 +68,7 @@ def add_object(
 def object_body(
     parts_m: Sequence[F32], mass_kg: float, material: physx.PhysxMaterial
 ) -> physx.PhysxRigidDynamicComponent:
-    """A body of convex parts (V, 3) each, in no scene yet."""
+    """A dynamic body of convex parts (V, 3) each, in no scene yet."""
     body = physx.PhysxRigidDynamicComponent()
     for part in parts_m:
         body.attach(convex_shape(part, material))
@@ -87,7 +87,7 @@ def convex_shape(part_m: F32, material: physx.PhysxMaterial) -> physx.PhysxColli
 
 
 def sapien_pose(T: F64) -> sapien.Pose:
-    """A transform (4, 4) as SAPIEN writes it."""
+    """A transform (4, 4) as a SAPIEN pose."""
     return sapien.Pose(T[:3, 3].tolist(), quaternion_wxyz(T[:3, :3]).tolist())
 
 

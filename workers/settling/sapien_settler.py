@@ -19,7 +19,7 @@ with warnings.catch_warnings():
     import sapien
     from sapien import physx
 
-_LOOK_EVERY = 5  # steps between looks at the speeds: reading them costs as much as a step
+_CHECK_EVERY = 5  # steps between checks of the speeds: reading them costs as much as a step
 
 
 def settle_sapien(
@@ -27,8 +27,8 @@ def settle_sapien(
 ) -> SettleResult:
     """Let the objects fall until all have rested for `rest_steps` steps, or `max_steps` are over.
 
-    A new physics scene is built each time: a reused one keeps contacts and sleep counters, so that outcomes
-    would depend on earlier calls.
+    A new physics scene is built each time: a reused one keeps contacts and sleep counters, so outcomes would
+    depend on earlier calls.
     """
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
@@ -43,7 +43,7 @@ def settle_sapien(
     steps, resting = 0, 0
     speed = angular = np.inf
     while steps < params.max_steps and resting < params.rest_steps:
-        for _ in range(min(_LOOK_EVERY, params.max_steps - steps)):
+        for _ in range(min(_CHECK_EVERY, params.max_steps - steps)):
             scene.step()
             steps += 1
         speed = max((float(np.linalg.norm(b.linear_velocity)) for b in bodies), default=0.0)
@@ -51,7 +51,7 @@ def settle_sapien(
         if not (np.isfinite(speed) and np.isfinite(angular)):
             break
         calm = speed < params.rest_speed_mps and angular < params.rest_angular_speed_radps
-        resting = resting + _LOOK_EVERY if calm else 0
+        resting = resting + _CHECK_EVERY if calm else 0
 
     final = np.stack([pose_of(b) for b in bodies]) if bodies else np.zeros((0, 4, 4))
     return SettleResult(

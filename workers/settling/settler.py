@@ -13,11 +13,11 @@ from datagen.workers.objects.model import ObjectModel
 
 @dataclass(frozen=True, eq=False)
 class SettleResult:
-    """Where the objects came to rest.
+    """Final poses of the objects and their motion at the end.
 
     `penetration_m` is the depth of the deepest contact at the end, `residual_*` the largest
-    speeds then. `at_rest` says that they stayed below the limits for `rest_steps` steps.
-    Poses may hold NaN when the physics blew up; callers must look.
+    speeds then. `at_rest` is True if they stayed below the limits for `rest_steps` steps.
+    Poses may hold NaN if the physics became unstable; callers must check.
     """
 
     T_world_object: F64  # (K, 4, 4)

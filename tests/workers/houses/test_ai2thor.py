@@ -245,7 +245,7 @@ BAD_INSTANCES = {
     "translation short": ({"translation": [1, 2]}, "has 2 numbers, not 3"),
     "translation NaN": ({"translation": [1, float("nan"), 3]}, r"translation\[1\]: nan"),
     "rotation zero": ({"rotation": [0, 0, 0, 0]}, "not a unit quaternion"),
-    "rotation text": ({"rotation": "none"}, "a text, not a list"),
+    "rotation text": ({"rotation": "none"}, "a string, not a list"),
     "scale zero": ({"uniform_scale": 0}, "uniform_scale: 0"),
     "escape": ({"template_name": "objects/../../secret"}, "not a path below"),
 }
