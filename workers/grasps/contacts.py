@@ -1,8 +1,7 @@
-"""Where two fingers can press on a union of convex parts from opposite sides.
+"""Pairs of contacts of two fingers on opposite sides of a union of convex parts.
 
-Parts of a decomposition overlap, so rays against their faces meet walls that are not there. A line is
-therefore cut with every part as a whole, and the intervals are joined: what is left are the ends of solid
-stretches, and those are true surface.
+Parts of a decomposition overlap, so rays also hit faces inside the object. Each line is therefore clipped
+against every part as a whole, and the intervals are joined: their ends lie on the true surface.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from datagen.workers.geometry.mesh import F32, F64
 
 Ints = npt.NDArray[np.int64]
 
-# Half the angle of the cone in which a contact's force may lie; friction 0.6, as objects have in physics.
+# Half-angle of the friction cone; friction 0.6, as objects have in physics.
 CONE_RAD = float(np.arctan(0.6))
 # Cracks between neighbouring parts are closed up to this width.
 _CRACK_M = 5e-4
@@ -28,7 +27,7 @@ _LINES_AT_ONCE = 256
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaces:
-    """The half-spaces of P convex parts: n . x + c <= 0 for all M rows of a part inside it."""
+    """P convex parts as M half-spaces: a point x is inside a part where n . x + c <= 0 for all its rows."""
 
     planes: F64  # (M, 4), unit normals outwards
     first: Ints  # (P,), row of each part's first plane
@@ -50,7 +49,7 @@ class Contacts:
 
     @property
     def width_m(self) -> F64:
-        """Distances (N,) of the two points."""
+        """Distances (N,) between the two points."""
         return np.linalg.norm(self.second_m - self.first_m, axis=1)
 
 
@@ -62,7 +61,7 @@ def solid_of(parts_m: Sequence[F32]) -> HalfSpaces:
     for part in parts_m:
         points = part.astype(np.float64)
         hull = ConvexHull(points)
-        # One row for each triangle: faces with many corners repeat theirs.
+        # Qhull gives one row for each triangle: faces with many corners repeat their plane.
         unique = np.unique(np.round(hull.equations, 9), axis=0, return_index=True)[1]
         planes.append(hull.equations[np.sort(unique)])
         triangles.append(points[hull.simplices])
@@ -124,8 +123,8 @@ def perpendicular(axes: F64) -> tuple[F64, F64]:
 def contact_pairs(solid: HalfSpaces, points_m: F64, directions: F64, max_width_m: float) -> Contacts:
     """The pairs on the lines that enter the union at the points (N, 3) along unit directions (N, 3).
 
-    A line may leave and enter it again: the first end gives a grasp of the wall alone, as of a rim, the
-    last one within `max_width_m` a grasp around everything between.
+    A line may leave the union and enter it again. Its first end gives a grasp of the wall alone, such as a
+    rim; its last end within `max_width_m` gives a grasp around everything between.
     """
     first: list[F64] = []
     second: list[F64] = []
@@ -142,7 +141,7 @@ def contact_pairs(solid: HalfSpaces, points_m: F64, directions: F64, max_width_m
 
 
 def _ends(solid: HalfSpaces, p: F64, d: F64, max_width_m: float) -> tuple[Ints, F64, F64]:
-    """Rows (K,) of the lines, how far (K,) along they leave the union, and the normals (K, 3) there."""
+    """Rows (K,) of the lines, distances (K,) at which they leave the union, and normals (K, 3) there."""
     into = d @ solid.planes[:, :3].T  # (N, M)
     height = p @ solid.planes[:, :3].T + solid.planes[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -181,7 +180,7 @@ def _ends(solid: HalfSpaces, p: F64, d: F64, max_width_m: float) -> tuple[Ints, 
 
 
 def _argmax_so_far(values: F64) -> Ints:
-    """For each entry of a row, the column of the largest up to there; (N, P)."""
+    """Column (N, P) of the largest entry of the row up to each entry."""
     columns = np.arange(values.shape[1])
     best = np.maximum.accumulate(values, axis=1)
     earlier = np.concatenate([np.full((len(values), 1), -np.inf), best[:, :-1]], axis=1)

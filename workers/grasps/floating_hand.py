@@ -32,10 +32,10 @@ _FINGER_INERTIA_KGM2 = 1e-4
 
 @dataclass(frozen=True)
 class HandTest:
-    """How one trial goes: close without gravity, then pull the object each way, the hand standing still.
+    """Parameters of a trial: a fixed hand closes without gravity, then the object is pulled each way.
 
-    In the hand's frame a lift is a pull: gravity and the acceleration of the lift. The object is off the
-    pose that was meant by a normal draw, as an arm would have it.
+    In the hand's frame a lift is a pull: gravity and the acceleration of the lift. The object's pose has a
+    normal error, as with an arm.
     """
 
     grip_force_n: float = 40.0  # of each finger
@@ -49,7 +49,7 @@ class HandTest:
     position_error_m: float = 0.002
     turn_error_rad: float = 0.035
     timestep_s: float = 1 / 240
-    # With 10 flat cans slip from grasps that hold with more: the test of real flat things fails.
+    # With 10, flat cans slip from grasps that hold with more: the test of real flat objects fails.
     position_iterations: int = 20
     velocity_iterations: int = 2
     contact_offset_m: float = 0.002
@@ -72,9 +72,8 @@ def held_trials(
     """Whether the grasps (N, 4, 4) hold the object in each of `PULLS`; (N, 3).
 
     A hand closes once, and the pulls follow each other. Held means that the object's frame moves by less than
-    `max_slip_m` in the hand during the pull. Physics that ends in NaN holds nothing. Hands stand side by side
-    in scenes of their own, far enough apart that none meets another: the results of the first n of N
-    grasps are those of n alone.
+    `max_slip_m` in the hand during the pull. Poses that are not finite count as not held. Hands share scenes,
+    too far apart to touch each other: the first n of N grasps have the same results as n grasps alone.
     """
     n = len(T_object_tcp)
     held = np.zeros((n, len(PULLS)), bool)
@@ -118,7 +117,7 @@ def _slips(
     pulls_mps2: F64,
     test: HandTest,
 ) -> F64:
-    """How far (N, K) the objects move in their hands in each pull (K, N, 3), metres; inf if physics broke."""
+    """Distances (N, K), metres, that the objects move in each pull (K, N, 3); inf where not finite."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(test.timestep_s)
     rubber = pad_material(test.object_friction, test.finger_friction)
@@ -161,11 +160,11 @@ def _add_hand(
     rubber: physx.PhysxMaterial,
     test: HandTest,
 ) -> None:
-    """A hand whose palm stands still, its fingers `opening_m` apart and closing.
+    """Add a hand with a fixed palm and fingers `opening_m` apart that close.
 
-    As an articulation: free bodies on drives hold next to nothing. A finger is driven by force =
-    damping x (speed wanted - speed), with no spring: against an object that is `grip_force_n`
-    exactly, and an object off the middle is not carried away, as in a hand whose fingers are coupled.
+    It is an articulation, because free bodies on drives hold almost nothing. A finger is driven by force =
+    damping x (target speed - speed), with no spring: a blocked finger pushes with exactly `grip_force_n`. An
+    object off the middle is not carried away, as in a hand whose fingers are coupled.
     """
     builder = scene.create_articulation_builder()
     palm = builder.create_link_builder()
@@ -201,7 +200,7 @@ def _attach(link: physx.PhysxArticulationLinkComponent, parts: Parts, rubber: ph
 def _tune(body: physx.PhysxRigidBodyComponent, test: HandTest) -> None:
     body.set_disable_gravity(True)
     for shape in body.collision_shapes:
-        # The default of a centimetre makes contacts of everything near a finger.
+        # The default, 1 cm, makes contacts with everything near a finger.
         shape.set_contact_offset(test.contact_offset_m)
     if isinstance(body, physx.PhysxRigidDynamicComponent):
         body.set_solver_position_iterations(test.position_iterations)

@@ -12,15 +12,15 @@ from datagen.workers.geometry.mesh import F32, F64
 class GraspSet:
     """G grasps, best first. The TCP frame is the gripper's (`datagen.workers.robots.gripper.Gripper`).
 
-    Scores are shares of floating-hand pulls that held, 0 to 1. Those of the first S grasps are known, and at
-    least `min_score`; of the others one is worked out when it is asked for, and may be too low.
+    Scores are shares of floating-hand pulls that held, 0 to 1. The scores of the first S grasps are known and
+    at least `min_score`. Each other score is computed on first use and may be lower.
     """
 
     T_object_tcp: F64  # (G, 4, 4)
-    opening_m: F32  # (G,), at which the hand comes in: the object's width there and some air
+    opening_m: F32  # (G,), of the hand on its approach: the object's width there plus a gap
     score: F32  # (S,)
     min_score: float = 0.0
-    later_score: Callable[[int], float] | None = None  # of a row from S on
+    later_score: Callable[[int], float] | None = None  # by row - S
 
     def __len__(self) -> int:
         return len(self.opening_m)

@@ -38,25 +38,25 @@ _POSES = CacheFolder(
     most_bytes=20_000_000,
 )
 _SCORES = CacheFolder("grasps", {"score": (np.float32, ("n",))}, most_files=65_536, most_bytes=10_000)
-# Grasps of an object that are scored before any arm asks for one.
+# Grasps of an object that are scored in advance; the others only when an arm has a plan to them.
 SCORED_FIRST = 128
-# Searches of one object, one after the other until there are poses enough.
+# Most searches of one object; fewer where they find enough poses.
 _MOST_SEARCHES = 16
-# What moves a bit of the result beside our own code.
+# Packages whose version can change bits of the result.
 _ENGINES = ("sapien", "coal", "scipy", "numpy")
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredGrasps:
-    """The first G poses of one object's order, with their scores. None where `reason` says why."""
+    """The first G poses of one object, in order, with their scores. Where G is 0, `reason` is the cause."""
 
     T_object_tcp: F64  # (G, 4, 4)
     opening_m: F32  # (G,)
     score: F32  # (G,), share of floating-hand pulls that held
     is_clear: Bools  # (G,), the hand stays above the plane that the upright object stands on
     n_tried: int  # poses of the first search that were checked against the object
-    n_free: int  # those in which the hand touches nothing of it
-    n_clear: int  # and stays above that plane
+    n_free: int  # of these, the hand does not touch the object
+    n_clear: int  # of the free ones, the hand stays above that plane
     reason: str
 
     def __len__(self) -> int:
@@ -65,7 +65,7 @@ class ScoredGrasps:
 
 @dataclass(eq=False)
 class _Known:
-    """What this process knows of the grasps of one object by one hand."""
+    """Grasps of one object by one hand that this process has loaded or computed."""
 
     searches: list[HandPoses] = field(default_factory=list)
     scores: dict[tuple[int, int], F32] = field(default_factory=dict)  # by search and block
@@ -76,14 +76,14 @@ _kept: OrderedDict[str, _Known] = OrderedDict()
 
 
 def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: int = 0) -> GraspSet:
-    """The grasps worth offering to an arm: of the first `per_object` those with `min_score`.
+    """The grasps offered to an arm: those of the first `per_object` that score at least `min_score`.
 
-    The first `SCORED_FIRST` are scored now, and the good ones of them come best first. The others follow in
-    the object's order, and are scored when an arm has a plan to one: most scenes need none of them.
+    The first `SCORED_FIRST` are scored now, and the good ones come first, by score. The others follow in the
+    object's order and are scored when an arm has a plan to one: most scenes need none of them.
 
     A pure function of the object's collision parts and mass, the gripper and the parameters: equal
-    content gives equal bits in every process and order. None where the object cannot be grasped. `draw` is
-    another draw of all that is random.
+    content gives equal bits in every process and order. Empty where the object cannot be grasped. `draw`
+    seeds all random numbers.
     """
     digest = content_digest(model, gripper, draw)
     known, key = _known(digest), (params.per_object, params.min_score)
@@ -121,8 +121,8 @@ def grasps_of(model: ObjectModel, gripper: Gripper, params: GraspParams, draw: i
 def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -> ScoredGrasps:
     """The first `n` grasps of an object, or all that `_MOST_SEARCHES` searches find.
 
-    The first of more grasps are those of fewer. Poses and scores come from memory, from the cache folder, or
-    are computed and then cached. A cache that is broken or cannot be written costs seconds, never a result.
+    A larger `n` extends the list of a smaller one. Poses and scores come from memory, from the cache folder,
+    or are computed and then cached. A broken or read-only cache costs time and changes no result.
     """
     digest = content_digest(model, gripper, draw)
     known = _known(digest)
@@ -155,7 +155,7 @@ def scored_grasps(model: ObjectModel, gripper: Gripper, n: int, draw: int = 0) -
 
 
 def content_digest(model: ObjectModel, gripper: Gripper, draw: int = 0) -> str:
-    """sha256 over all that decides the grasps: it seeds their draws and names their files."""
+    """sha256 over everything that decides the grasps: it seeds random numbers and names the files."""
     hand = (gripper.max_opening_m, gripper.pad_size_m, gripper.palm_depth_m)
     other = {"draw": draw} if draw else {}
     return digest_of(
@@ -201,8 +201,8 @@ def _score(known: _Known, digest: str, model: ObjectModel, gripper: Gripper, sea
     return known.scores[search, block]
 
 
-def _generator(of: list[Any]) -> np.random.Generator:
-    return np.random.Generator(np.random.PCG64(int(digest_of(of), 16)))
+def _generator(key: list[Any]) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(int(digest_of(key), 16)))
 
 
 def _parts_digest(parts_m: Parts) -> str:
@@ -213,9 +213,9 @@ def _parts_digest(parts_m: Parts) -> str:
     return hasher.hexdigest()
 
 
-def _file_digest(of: list[Any]) -> str:
-    """Names a file also by the engines, so that a newer one does not answer with what an older one found."""
-    return digest_of([*of, *map(_version_of, _ENGINES)])
+def _file_digest(key: list[Any]) -> str:
+    """File name that includes the engines' versions: results of other versions are not read."""
+    return digest_of([*key, *map(_version_of, _ENGINES)])
 
 
 @cache
@@ -245,9 +245,9 @@ def _restored(stored: Arrays) -> HandPoses | None:
         str(stored["reason"]),
     )
     R = found.T_object_tcp[:, :3, :3]
-    turned_right = np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+    are_rotations = np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     finite = np.isfinite(found.T_object_tcp).all() and np.isfinite(found.opening_m).all()
-    return found if turned_right and finite else None
+    return found if are_rotations and finite else None
 
 
 def _are_scores(score: F32, n: int) -> bool:

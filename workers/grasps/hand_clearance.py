@@ -1,6 +1,6 @@
-"""Whether a hand that comes in straight touches the object, or what the object stands on."""
+"""Collision checks of a hand on a straight approach, with the object and with the plane below it."""
 
-# coal fills itself at import time, which type checkers do not see.
+# coal defines its names at import time, which type checkers do not see.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from datagen.workers.robots.hulls import polyhedron
 
 Bools = npt.NDArray[np.bool_]
 
-# The last way of the hand, along its approach: it is checked as one swept body.
+# Length of the approach, along which the hand is checked as one swept body.
 APPROACH_M = 0.08
 
 
 class HandClearance:
-    """One object's convex parts in a bounding-box tree, asked about many poses of one hand."""
+    """Collision checks of many poses of one hand with one object's convex parts, in a bounding-box tree."""
 
     def __init__(self, parts_m: Sequence[F32], gripper: Gripper) -> None:
         self._tree = coal.DynamicAABBTreeCollisionManager()
@@ -34,32 +34,32 @@ class HandClearance:
         left, right = gripper.finger_parts_m
         self._hand = [
             (coal.CollisionObject(polyhedron(swept(part))), side)
-            # The palm first: on its way in it is the part that touches most often.
+            # The palm first: it collides most often.
             for parts, side in ((gripper.palm_parts_m, 0.0), (left, 0.5), (right, -0.5))
             for part in parts
         ]
 
     def free(self, T_object_tcp: F64, opening_m: F64 | F32) -> Bools:
-        """Which poses (N, 4, 4) keep the hand, also on its way in, free of the object; (N,)."""
+        """Whether the hand, its approach included, is free of the object at each pose (N, 4, 4); (N,)."""
         return np.array(
             [self._is_free(T, float(o)) for T, o in zip(T_object_tcp, opening_m, strict=True)], bool
         )
 
     def _is_free(self, T: F64, opening_m: float) -> bool:
         R, p, y = T[:3, :3], T[:3, 3], T[:3, 1]
-        answer = coal.CollisionCallBackDefault()
+        callback = coal.CollisionCallBackDefault()
         for part, side in self._hand:
             part.setRotation(R)
             part.setTranslation(p + side * opening_m * y)
             part.computeAABB()
-            self._tree.collide(part, answer)
-            if answer.data.result.isCollision():
+            self._tree.collide(part, callback)
+            if callback.data.result.isCollision():
                 return False
         return True
 
 
 def swept(part_m: F32) -> F32:
-    """Corners (2V, 3) whose hull is the part (V, 3) together with its last `APPROACH_M` of way."""
+    """Corners (2V, 3) of the hull that the part (V, 3) sweeps in its last `APPROACH_M` of approach."""
     return np.concatenate([part_m, part_m - np.array([0, 0, APPROACH_M], np.float32)])
 
 

@@ -1,4 +1,4 @@
-"""Poses of a hand around pairs of contacts: directions of approach, depths, tilts, and a varied choice."""
+"""Poses of a hand around pairs of contacts: directions of approach, depths, tilts, diverse selection."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import numpy.typing as npt
 from datagen.workers.geometry.mesh import F64
 from datagen.workers.grasps.contacts import Contacts, perpendicular
 
-# How far the contacts lie in front of the pads' middle, in half pad lengths: pulled back, the finger tips do
-# not dig below flat things. Beyond 1 the pads would miss the contacts.
+# How far the contacts lie ahead of the pads' middle, in half pad lengths. Pulled back, the finger tips do not
+# reach below flat objects. Beyond 1 the pads would miss the contacts.
 RETREATS = (-0.5, 0.0, 0.5, 0.8, 0.95)
 # From straight down, about the axis along which the fingers close.
 TILTS_RAD = (0.0, np.radians(15), np.radians(-15), np.radians(30), np.radians(-30))
 # Grasps from above need a closing axis no steeper than this.
 _LEVEL_Z = np.sin(np.radians(35))
 _FREE_TURNS = 4  # approaches all around the closing axis, besides those from above
-# A radian of another direction counts as much as this distance.
+# A radian between two directions weighs as much as this distance.
 _METRES_PER_RAD = 0.03
 
 
 def hand_poses(contacts: Contacts, pad_length_m: float, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Poses T_object_tcp (K, 4, 4) of every pair, approach and depth in drawn order; widths (K,), metres.
+    """Poses T_object_tcp (K, 4, 4) of every pair, approach and depth in random order; widths (K,), metres.
 
-    Approaches are drawn all around the closing axis and, where it is level enough with the object
-    standing upright, from above with `TILTS_RAD`. The contacts lie on pads of `pad_length_m` along the
-    approach, the same distance left and right of the hand's middle, at one of `RETREATS`.
+    Approaches are drawn all around the closing axis and, where it is level enough for the upright object,
+    from above with `TILTS_RAD`. The contacts lie on pads of `pad_length_m` along the approach, at the same
+    distance left and right of the hand's middle, at one of `RETREATS`.
     """
     n = len(contacts)
     y = contacts.closing * np.where(rng.random(n) < 0.5, 1.0, -1.0)[:, None]
@@ -58,10 +58,10 @@ def hand_poses(contacts: Contacts, pad_length_m: float, rng: np.random.Generator
 
 
 def varied(T_object_tcp: F64, n: int) -> npt.NDArray[np.int64]:
-    """Rows of at most n poses, each as far as can be from those before it; the first pose comes first.
+    """Rows of at most n poses by farthest-point sampling, from the first pose on.
 
-    Distance is that of positions and of directions of approach and closing, taking a grasp and its
-    flip as one (farthest-point sampling: Gonzalez 1985, Theor. Comput. Sci. 38).
+    The distance adds those of positions and of directions of approach and closing; a grasp and its flip
+    count as one (Gonzalez 1985, Theor. Comput. Sci. 38).
     """
     if len(T_object_tcp) == 0 or n < 1:
         return np.zeros(0, np.int64)

@@ -22,23 +22,23 @@ Bools = npt.NDArray[np.bool_]
 VERSION = 4
 # Poses that are scored together: a score depends on the poses of its block, which are always the same.
 BLOCK = 32
-# Room between the open fingers and the object, both sides together: the first that lets the hand in.
+# Gaps between the open fingers and the object, both sides together; the first that the hand fits in counts.
 AIR_M = (0.02, 0.006)
 _LEAST_AIR_M = 0.004
-# The hand stays this far above what an upright object stands on.
+# The hand stays this far above the plane that the upright object stands on.
 TABLE_GAP_M = 0.002
-_ROUNDS, _POINTS = 3, 800  # and points drawn on the surface in each
-_MORE_ROUNDS, _FEW_CLEAR = 10, 60  # where hardly a pose keeps above the table
+_ROUNDS, _POINTS = 3, 800  # rounds, and points sampled on the surface in each
+_MORE_ROUNDS, _FEW_CLEAR = 10, 60  # rounds while fewer poses than this are clear of the table
 _CLEAR_POSES, _OTHER_POSES = 1500, 1000  # checked against the object in each round
 _ENOUGH_FREE, _ENOUGH_CLEAR = 800, 300
-_CLEAR_IN_FOUR = 3  # of four poses in a row, where there are enough of both kinds
+_CLEAR_IN_FOUR = 3  # clear poses among four in a row, where there are enough of both kinds
 
 
 @dataclass(frozen=True, eq=False)
 class HandPoses:
-    """N poses in which the hand touches nothing of one object. Any first n of them are spread over it.
+    """N poses in which the hand does not touch the object. The first n, for any n, are spread over it.
 
-    None where `reason` says why.
+    Where N is 0, `reason` is the cause.
     """
 
     T_object_tcp: F64  # (N, 4, 4)
@@ -52,9 +52,9 @@ class HandPoses:
 
 
 def hand_poses_of(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> HandPoses:
-    """Poses of the hand around an object, all that one search finds: some hundred to two thousand.
+    """All hand poses around an object that one search finds: a few hundred to two thousand.
 
-    An object that cannot be grasped gives none and a reason, and so does one whose parts have no volume.
+    An object that cannot be grasped, or whose parts have no volume, gives no poses and a reason.
     """
     if not model.convex_parts_m or not all(np.isfinite(part).all() for part in model.convex_parts_m):
         return _none(0, "no collision parts, or a corner that is not finite")
@@ -82,7 +82,7 @@ def score_block(
 
 
 def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) -> tuple[F64, F64, int]:
-    """Poses (N, 4, 4) and openings (N,) that keep the hand free of the object, and how many were tried."""
+    """Poses (N, 4, 4) and openings (N,) with the hand free of the object, and the number of poses tried."""
     solid = solid_of(model.convex_parts_m)
     hand = HandClearance(model.convex_parts_m, gripper)
     poses: list[F64] = [np.zeros((0, 4, 4))]
@@ -94,7 +94,7 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
             solid, points_m, cone_directions(normals, rng), gripper.max_opening_m - _LEAST_AIR_M
         )
         T, width_m = hand_poses(pairs, gripper.pad_size_m[1], rng)
-        # Few poses around a flat thing keep above the table: those are looked at first.
+        # Few poses around a flat object are clear of the table: these are checked first.
         clear = _is_clear(model, gripper, T, np.minimum(width_m + AIR_M[0], gripper.max_opening_m))
         rows = np.concatenate([np.flatnonzero(clear)[:_CLEAR_POSES], np.flatnonzero(~clear)[:_OTHER_POSES]])
         T, width_m = T[rows], width_m[rows]
@@ -113,16 +113,16 @@ def _free_poses(model: ObjectModel, gripper: Gripper, rng: np.random.Generator) 
 
 
 def _is_clear(model: ObjectModel, gripper: Gripper, T_object_tcp: F64, opening_m: F64) -> Bools:
-    """In which poses (N, 4, 4) the hand stays above what the upright object stands on."""
+    """Whether the hand at each pose (N, 4, 4) stays above the plane that the upright object stands on."""
     return lowest_m(gripper, T_object_tcp, opening_m) > TABLE_GAP_M - model.size_m[2] / 2
 
 
 def _spread(T_object_tcp: F64, is_clear: Bools) -> npt.NDArray[np.int64]:
-    """An order of all poses (N,) such that any first n are varied, most of them clear of the table."""
+    """An order (N,) of all poses: the first n, for any n, are varied and mostly clear of the table."""
     clear, other = np.flatnonzero(is_clear), np.flatnonzero(~is_clear)
     clear = clear[varied(T_object_tcp[clear], len(clear))]
     other = other[varied(T_object_tcp[other], len(other))]
-    # The k-th of each kind has its place among both; what is left of one kind comes last.
+    # Interleave the two kinds; the rest of the longer one comes last.
     rank = np.concatenate(
         [np.arange(len(clear)) / _CLEAR_IN_FOUR, np.arange(len(other)) / (4 - _CLEAR_IN_FOUR) + 0.5]
     )

@@ -15,12 +15,12 @@ from datagen.workers.objects.convex import MAX_TARGET_MASS_KG
 from datagen.workers.objects.model import ObjectModel
 from datagen.workers.robots.gripper import Gripper
 
-# The first of an object's grasps decide whether it is a target, however many arms are offered.
+# Only the first grasps of an object decide whether it is a target; arms may be offered more.
 JUDGED_GRASPS = 64
 MIN_CLEAR_GRASPS = 20
 MIN_HELD_SHARE = 0.25
 PER_FAMILY = 2
-# Things that come in sizes and fit into one another: "065-a_cups" to "065-j_cups".
+# Objects that come in several sizes and nest: "065-a_cups" to "065-j_cups".
 _FAMILY = re.compile(r"^(\d+)-[a-z]_(.+)$")
 
 
@@ -30,11 +30,11 @@ class Graspability:
 
     name: str
     n_tried: int  # poses of the hand checked against the object
-    n_free: int  # those that touch nothing of it
-    n_clear: int  # and also keep above what it stands on, upright
-    n_scored: int  # varied ones of them, tried in physics
-    n_clear_held: int  # of these, clear of the table and with `min_score` or more
-    held_share: float  # of those scored and clear of the table
+    n_free: int  # of these, the hand does not touch the object
+    n_clear: int  # of the free ones, the hand is above the upright object's support
+    n_scored: int  # free poses that were scored in physics
+    n_clear_held: int  # scored ones that are clear and have at least `min_score`
+    held_share: float  # n_clear_held over the scored ones that are clear
     reason: str
 
     @property
@@ -43,7 +43,7 @@ class Graspability:
 
 
 def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> Graspability:
-    """What the grasps of one object come to. Never raises for what an object is."""
+    """Count the grasps of one object and decide whether it is a target. Never raises for any object."""
     scored = scored_grasps(model, gripper, min(params.per_object, JUDGED_GRASPS))
     good = scored.score >= params.min_score
     n_clear_held = int((good & scored.is_clear).sum())
@@ -63,8 +63,8 @@ def graspability(model: ObjectModel, gripper: Gripper, params: GraspParams) -> G
 class Targets:
     """The objects of a source that can be targets of one gripper, each computed on first use.
 
-    Of a family of sizes at most `PER_FAMILY` are: the smallest and the largest that are graspable, and
-    so on inwards. Those in between are never computed.
+    A family of sizes has at most `PER_FAMILY` targets: its smallest and its largest graspable object, then
+    the next ones inwards. The others are never computed.
     """
 
     def __init__(
@@ -84,17 +84,17 @@ class Targets:
         return name in self._known[family]
 
     def draw(self, rng: np.random.Generator) -> str | None:
-        """A target, each with the same chance; None where there is none.
+        """A random target, all equally likely; None where there is none.
 
-        Looks at objects in drawn order until one is a target, so that a short run pays for few.
+        Checks objects in random order until one is a target, so that a short run computes few.
         """
         names = [name for family in self._families.values() for name in family]
         return next((names[k] for k in rng.permutation(len(names)) if self.is_target(names[k])), None)
 
     def names(self) -> list[str]:
-        """All targets, sorted; works out every object.
+        """All targets, sorted; computes every object.
 
-        Processes that start together begin at different places and find what the others have kept.
+        Processes that start together begin at different objects and read the others' results from the cache.
         """
         families = list(self._families.values())
         begin = os.getpid() % max(len(families), 1)

@@ -1,8 +1,8 @@
 """Plan and trials of one candidate, shared by the label sources `plan` and `sim`.
 
-base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here,
-   and where it is disturbed plans again from `repeats` poses where a robot arrived nearby)
--> executed in physics once, or `repeats` times where a robot arrived nearby   (`sim`)
+base clear -> within reach -> a grasp free of the scene -> arm, path, approach, lift   (`plan` ends here;
+   with disturbances it plans again from `repeats` arrival poses near the candidate)
+-> executed in physics once, or with disturbances from `repeats` arrival poses   (`sim`)
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from datagen.workers.trials.execute import run_trial
 from datagen.workers.trials.trial import Disturbance, TrialResult
 from datagen.workers.trials.trial_scene import TrialScene, prepare_trials
 
-_PROGRESS = tuple(OUTCOMES)  # later outcomes of failed attempts came further; success is first
+_PROGRESS = tuple(OUTCOMES)  # failures in order of progress, after success
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ class CandidateTrial:
     """The results for one candidate."""
 
     outcome: str
-    report: PlanReport | None = None  # of the plan that `plan` is; None where no planning was needed
-    plan: MotionPlan | None = None  # that of the first execution
+    report: PlanReport | None = None  # of planning at the candidate; None where no planning was needed
+    plan: MotionPlan | None = None  # that of the report
     results: tuple[TrialResult, ...] = ()  # of the executions
-    T_world_base: tuple[F64, ...] = ()  # (4, 4) each, where the mount stood in them
+    T_world_base: tuple[F64, ...] = ()  # (4, 4) each, poses of the mount in them
     successes: int = 0
-    trials: int = 0  # what the label is a rate of: 1, or the disturbed repeats; 0 where nothing was planned
-    retry_outcome: str | None = None  # of the last grasp that was executed after a first that failed
+    trials: int = 0  # attempts of which `successes` succeeded: 1, or the disturbed repeats; 0 if none
+    retry_outcome: str | None = None  # of the last grasp executed after the first one failed
 
 
 @dataclass(eq=False)
@@ -63,7 +63,7 @@ class ArmInScene:
     arm: ArmParams
     base_radius_m: float
     clock: StageClock = field(default_factory=StageClock)
-    draw: int = 0  # of all that is drawn for labels; benchmarks.repeatability compares others with 0
+    draw: int = 0  # seeds all random numbers of labels; benchmarks.repeatability compares others with 0
 
     @cached_property
     def planning(self) -> PlanningScene:
@@ -169,9 +169,9 @@ def _plan_arrivals(
     spec: Specification,
     rng: np.random.Generator,
 ) -> CandidateTrial:
-    """Plan again from where each disturbance lets the robot arrive; the label stays that of the candidate.
+    """Plan again from the arrival pose of each disturbance; the label stays that of the candidate.
 
-    Candidates without a plan are planned from too: a robot that misses them may succeed.
+    This includes candidates without a plan: a robot that arrives near one may succeed.
     """
     if not disturbances:
         return CandidateTrial(
@@ -195,9 +195,9 @@ def _attempt(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Execute the plan. Where it fails, further grasps, each in a new scene, until one lifts the target.
+    """Execute the plan; after a failure execute further grasps, each in a new scene, until one succeeds.
 
-    The label is that of the first: a robot that has dropped the target has changed the world.
+    The label is that of the first grasp: a robot that drops the target changes the scene.
     """
     trial = at.arm.trial
     assert trial is not None
@@ -229,10 +229,10 @@ def _repeat(
     rng: np.random.Generator,
     record: bool,
 ) -> CandidateTrial:
-    """Arrive near the candidate once per disturbance; positive where at least half of the trials lift.
+    """Plan and execute from the arrival pose of each disturbance; positive where at least half succeed.
 
-    The robot knows its pose and plans again from there. Where `fits` (K,) is false its body is not clear; it
-    does not know the other disturbances.
+    The robot knows its arrival pose, but not the other disturbances. Where `fits` (K,) is false, its body
+    collides.
     """
     planning, trials, clock = at.planning, at.trials, at.clock
     results: list[TrialResult] = []
@@ -279,7 +279,7 @@ def fits_at(
 
 
 def disturbances_of(at: ArmInScene, index: int, spec: Specification) -> list[Disturbance]:
-    """The worlds that candidate `index` of its scene is tried in; none where it is the planned one."""
+    """The disturbances of candidate `index` of its scene; empty where the specification has none."""
     if at.arm.disturbance is None:
         return []
     rng = generator(spec.seed, Stream.DISTURBANCE, at.scene.index, at.scene.retry, index)
@@ -289,7 +289,7 @@ def disturbances_of(at: ArmInScene, index: int, spec: Specification) -> list[Dis
 def draw_disturbances(
     params: DisturbanceParams, T_world_target: F64, rng: np.random.Generator
 ) -> list[Disturbance]:
-    """`repeats` worlds that differ from the planned one; target and base slide and turn on their planes."""
+    """`repeats` random disturbances of the planned world; target and base slide and turn in their planes."""
     centre = translation(*T_world_target[:3, 3])
     drawn: list[Disturbance] = []
     for _ in range(params.repeats):
@@ -316,6 +316,6 @@ def _planar(normal: F64, position_std_m: float, yaw_std_rad: float) -> F64:
 
 
 def target_tcp(at: ArmInScene, T_world_base: F64, plan: MotionPlan) -> F64:
-    """Pose (4, 4) of the TCP in the target's frame at the grasp that was planned."""
+    """Pose (4, 4) of the TCP in the target's frame at the planned grasp."""
     T_world_tcp = T_world_base @ at.robot.T_base_tcp(plan.q_approach_rad[-1])
     return inverse(at.scene.T_world_object[0]) @ T_world_tcp

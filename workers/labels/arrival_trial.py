@@ -1,4 +1,4 @@
-"""One arrival of a closed loop: a robot that was sent to a candidate plans from beside it, and executes."""
+"""One arrival of a closed loop: a robot plans and executes from the pose near a candidate that it reached."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Offset = tuple[float, float, float]  # x ahead (m), y to the left (m), yaw (rad)
 
 
 def arrival_specification(spec: Specification, executes: bool) -> Specification:
-    """The specification of a run with the arm of arrivals: where it `executes`, with trials and disturbances.
+    """The specification of a run's arrivals: where it `executes`, with trials and disturbances.
 
-    Sections that the run has are kept. InputError where the run has no arm.
+    Sections that the run has are kept. Raises InputError where the run has no arm.
     """
     arm = arm_of(spec)
     trial = (arm.trial or TrialParams()) if executes else None
@@ -43,7 +43,7 @@ def try_arrival(
 
     The robot knows where it stands and plans from there. With a `world` the plan is executed in it; the robot
     knows neither its target pose nor its friction and mass, and its `T_base_moved` is not used. Depends on
-    these arguments alone. Without offset and world it is the candidate's outcome in a run of `plan`.
+    these arguments alone. Without offset and world it equals the candidate's outcome in a run of `plan`.
     """
     T_arrived = at.base_pose(candidates, row) @ yaw_pose(offset[0], offset[1], 0.0, offset[2])
     if not fits_at(at, [T_arrived], candidates, row, spec)[0]:

@@ -23,7 +23,7 @@ from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.motion.motion_plan import MotionPlan
 from datagen.workers.scenes.scene import SettledScene
 
-# 3: four seeds of inverse kinematics a grasp, which differ.
+# 3: four different seeds of inverse kinematics for each grasp.
 VERSION = 3
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 
@@ -46,7 +46,7 @@ def label_with_trials(
     clock: StageClock,
     rows: Sequence[int] | None = None,
 ) -> tuple[Columns, list[CandidateTrial]]:
-    """The columns of `plan`, and the trials they were read from, one a candidate of `rows` (default: all)."""
+    """The columns of `plan`, and the trials behind them, one for each candidate of `rows` [all]."""
     columns = heuristic_source.label(scene, candidates, spec, clock)
     if rows is None:
         rows = range(len(candidates))

@@ -15,7 +15,7 @@ from datagen.workers.labels.source import Columns, LabelSource
 from datagen.workers.scenes.scene import SettledScene
 
 # 2: the first grasp alone decides, lift and slip are measured at the grasp, thrown objects are `unstable`.
-# 3: four seeds of inverse kinematics a grasp, which differ.
+# 3: four different seeds of inverse kinematics for each grasp.
 VERSION = 3
 _RETRY_CODES = {name: code for code, name in enumerate(RETRY_OUTCOMES)}
 

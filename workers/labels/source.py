@@ -24,8 +24,8 @@ class LabelSource:
 
     `label` returns, one row per candidate, the columns of the schema that depend on the scene: `label` and
     its explanation. `schema` names the record schema of its store, and `version` is raised when the same
-    input may give another label. Where labels are slow, `label_rows` computes those of some candidates, with
-    equal values.
+    input may give another label. Slow sources have `label_rows`, which computes the labels of some candidates
+    alone, with equal values.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Straight lines of the hand: joints along a row of poses, smooth, near the line and free."""
+"""Straight-line motions of the hand: joints along a row of poses, smooth, near the line and free."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.arm_collision import Surroundings
 from datagen.workers.motion.rrt_connect import dense
 
-_OFF_LINE_M = 0.002  # between neighbouring points, where joints and not the hand move evenly
+_OFF_LINE_M = 0.002  # between neighbouring points, where joints are interpolated
 
 
 def follow_line(
@@ -26,7 +26,7 @@ def follow_line(
         if k == last and q_last is not None:
             found = q_last
         else:
-            # On towards the known end, or as the joints went so far.
+            # The seed: a step towards the known end, or the last step again.
             step = (q_last - q[-1]) / (last - k + 1) if q_last is not None else q[-1] - q[max(k - 2, 0)]
             found = scene.robot.ik(T_base_tcp[k], q[-1] + step)
         if found is None or np.abs(found - q[-1]).max() > scene.params.max_joint_jump_rad:

@@ -4,7 +4,7 @@ Poses are handled together: bounding boxes of all of them are compared as arrays
 overlap are given to GJK. Parts are solid, so a part inside another one is a contact too.
 """
 
-# coal fills itself at import time, which type checkers do not see.
+# coal defines its names at import time, which type checkers do not see.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Ints = npt.NDArray[np.int64]
 
 
 class Shape:
-    """A convex part as coal's polyhedron, built when it is first asked for: most parts never are."""
+    """A convex part as coal's polyhedron, built on first use: most parts are never used."""
 
     __slots__ = ("_built", "_corners_m")
 
@@ -60,7 +60,7 @@ class Hulls:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """F convex parts that stand still, with their boxes along the world's axes."""
+    """F static convex parts, with their boxes along the world's axes."""
 
     shapes: tuple[Shape, ...]
     poses: tuple[Any, ...]  # coal's transforms
@@ -140,10 +140,10 @@ def hits(
     allowed: Bools | None = None,
     first_only: bool = False,
 ) -> Bools:
-    """Which of M poses (M, O, 4, 4) of the owners come nearer than `margin_m` to a part that stands still.
+    """Whether each of M poses (M, O, 4, 4) of the owners comes nearer than `margin_m` to a static part; (M,).
 
-    A negative margin forgives contacts up to that depth. `allowed` (P, F) are pairs that may touch.
-    With `first_only` the first of them alone is told.
+    A negative margin ignores contacts up to that depth. `allowed` (P, F) are pairs that may touch.
+    With `first_only` only the first such pose is marked.
     """
     found = np.zeros(len(T_world_owner), np.bool_)
     if len(moving) == 0 or len(still) == 0 or len(found) == 0:
@@ -164,7 +164,7 @@ def hits(
     m, p, f = np.unravel_index(np.flatnonzero(overlap), overlap.shape)  # twice as fast as nonzero
     if len(m) == 0:
         return found
-    # The same boxes along the moving part's own axes: long parts held at a slant leave most pairs here.
+    # The same boxes along the moving part's own axes: this drops most pairs of long, tilted parts.
     middle, extent = (near_high + near_low)[f] / 2, (near_high - near_low)[f] / 2
     axes = R[m, p]
     away = np.abs(np.matmul((middle - center[m, p])[:, None, :], axes)[:, 0])

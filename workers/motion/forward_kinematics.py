@@ -12,7 +12,7 @@ from datagen.workers.motion.collision import Ints
 from datagen.workers.robots.robot import Robot
 
 _MOVES = 1e-9
-_HERE = np.eye(4)
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class ForwardKinematics:
     def poses(self, q_rad: F64) -> F64:
         """Poses (M, F, 4, 4) in the base frame at the joints (M, A)."""
         out = np.empty((len(q_rad), *self.T_base_frame.shape))
-        before = _HERE[None]
+        before = _IDENTITY[None]
         for joint in range(len(self.first) + 1):
             rows = np.flatnonzero(self.depth == joint)
             if len(rows):
@@ -44,20 +44,20 @@ class ForwardKinematics:
 
     def tcp(self, q_rad: F64) -> F64:
         """Poses (M, 4, 4) of the TCP in the base frame at the joints (M, A)."""
-        T = _HERE[None]
+        T = _IDENTITY[None]
         for joint in range(len(self.first)):
             T = np.matmul(T, self._step(joint, q_rad[:, joint]))
         return np.matmul(T, self.T_base_frame[-1])
 
     def _step(self, joint: int, q: F64) -> F64:
         a, b = (np.sin(q), 1 - np.cos(q)) if self.turns[joint] else (q, np.zeros_like(q))
-        return _HERE + a[:, None, None] * self.first[joint] + b[:, None, None] * self.second[joint]
+        return _IDENTITY + a[:, None, None] * self.first[joint] + b[:, None, None] * self.second[joint]
 
 
 def forward_kinematics(robot: Robot) -> ForwardKinematics:
-    """The robot's kinematics, read off its poses at zero and with one joint moved by one.
+    """The robot's kinematics, computed from its poses at zero and with each joint moved by 1 (rad or m).
 
-    Raises ValueError where its frames do not hang in one row on the arm's joints.
+    Raises ValueError where its links are not one chain of the arm's joints.
     """
     count = len(robot.joint_names)
 

@@ -1,4 +1,4 @@
-"""The gripper alone in a scene: which grasps of the target it can come to, and lift from."""
+"""Collision checks of the gripper without an arm: which grasps of the target it can reach and lift."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from datagen.workers.geometry.mesh import F64
 from datagen.workers.motion.collision import Bools, Hulls, Placed, hits, hulls_of
 from datagen.workers.robots.gripper import Gripper
 
-# Poses found by inverse kinematics are this near to the asked ones: 0.5 mm, and 0.5 degrees at the palm.
+# Largest error of poses by inverse kinematics: 0.5 mm, and 0.5 degrees at the palm.
 IK_SLACK_M = 0.0015
-# What the hand keeps from everything but the target while it is at the grasp.
+# Distance that the hand keeps from everything but the target while it is at the grasp.
 HAND_MARGIN_M = 0.002
-# Depth to which hand and target may overlap on the last way: convex parts are thicker than the object.
+# Depth to which hand and target may overlap on the approach: convex parts are thicker than the object.
 TOUCH_M = 0.002
 LINE_STEP_M = 0.02
-# The target leaves what it stands on within this rise; only beyond it are contacts counted.
+# The target leaves its support within this rise; contacts count only beyond it.
 LIFT_OFF_M = 0.01
 
 
@@ -71,10 +71,10 @@ def raised(T_world: F64, rise_m: float) -> F64:
 def free_grasps(
     hand: Hand, T_world_tcp: F64, opening_m: F64, around: Placed, target: Placed, params: MotionParams
 ) -> Bools:
-    """Grasps (G,) that the hand can come to along the line from the pregrasp, and lift from.
+    """Grasps (G,) that the hand can reach along the line from the pregrasp, and lift.
 
     `around` is all but the target: the hand keeps `HAND_MARGIN_M` from it, and `margin_m` at the
-    pregrasp, where the arm's path ends. Fingers may touch the target on the way in.
+    pregrasp, where the arm's path ends. Fingers may touch the target on the approach.
     """
     free = np.ones(len(T_world_tcp), np.bool_)
 
@@ -98,8 +98,8 @@ def free_grasps(
 def can_be_lifted(target: Hulls, T_world_target: F64, static: Placed, lift_m: float) -> bool:
     """Whether the target, moved straight up, stays clear of the house.
 
-    The first `LIFT_OFF_M`, in which it parts from its support, is left out, and so are the other objects,
-    which it may push aside.
+    The check leaves out the first `LIFT_OFF_M`, in which the target leaves its support, and the other
+    objects, which it may push aside.
     """
     rises = line_offsets_m(lift_m)
     T = np.repeat(T_world_target[None, None], len(rises), axis=0)

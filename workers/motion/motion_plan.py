@@ -1,4 +1,4 @@
-"""What the kinematic stage finds out about one base pose."""
+"""Results of motion planning from one base pose."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ class PlanReport:
 
     outcome: str
     plan: MotionPlan | None
-    grasps_free: int  # grasps of the target that the hand alone can take in this scene
-    grasps_tried: int  # those for which IK was asked
+    grasps_free: int  # grasps of the target that the hand without an arm can reach in this scene
+    grasps_tried: int  # those for which IK was tried

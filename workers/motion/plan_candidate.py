@@ -21,27 +21,27 @@ from datagen.workers.motion.planning_scene import PlanningScene
 from datagen.workers.motion.rrt_connect import connect, dense, is_line_free, shortened, straight
 
 # The order of checks of a grasp, cheap ones first: a path is searched only for grasps with approach and
-# lift. A later cause came further.
+# lift. A later cause of failure means more progress.
 STAGES = ("no_ik", "arm_collision", "no_start", "no_approach", "no_lift", "no_path", "success")
 _STARTS = 3  # tucked poses from which a straight line is tried
-_SEARCHES = 4  # grasps for which a path is searched where none is straight
+_SEARCHES = 4  # grasps for which a path is searched where no straight path is free
 _SHORTCUTS = 20
 _CLEARANCE_POSES = 8
 _FIRST_BATCH, _LARGEST_BATCH = 2, 64  # grasps checked together
-# Poses sorted by distance together; each portion has as many as all before, and these.
+# Poses are sorted by distance in portions; each has this many more than all before it.
 _FIRST_PORTION = 24
 _FILTERED_AT_ONCE = 200
-_SAME_RAD = 0.05  # joints of one grasp that differ by less are one way to take it
+_SAME_RAD = 0.05  # solutions of one grasp that differ by less count as one
 
 
 @dataclass(eq=False)
 class _Search:
-    """What the grasps of one candidate share."""
+    """State of the search for one candidate, shared by its grasps."""
 
     scene: PlanningScene
     T_world_base: F64
     T_base_world: F64
-    far: list[_Reachable] = field(default_factory=list)  # to which no straight path leads
+    far: list[_Reachable] = field(default_factory=list)  # without a free straight path
     furthest: str = "no_ik"
 
     @cached_property
@@ -49,11 +49,11 @@ class _Search:
         return surroundings(self.scene, self.T_world_base)
 
     def reached(self, stage: str) -> None:
-        """Note how far a try came."""
+        """Record a stage if it is the furthest so far."""
         self.furthest = max(self.furthest, stage, key=STAGES.index)
 
     def holds(self, k: int) -> bool:
-        """Whether the hand holds the object in kept grasp `k`; physics where no arm has asked before."""
+        """Whether the hand holds the object in kept grasp `k`; simulated on first use."""
         return self.scene.around.holds(int(self.scene.around.grasp[k]))
 
 
@@ -64,7 +64,7 @@ class _Goal:
     k: int
     T_base_tcp: F64  # (4, 4)
     seeds_rad: F64  # (S, A)
-    limit: str  # no try of it comes further
+    limit: str  # furthest stage that it can reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class _Way:
 
 @dataclass(frozen=True, eq=False)
 class _Reachable:
-    """A grasp with all of a plan but the path to its pregrasp."""
+    """A grasp with all of a plan except the path to its pregrasp."""
 
     k: int
     q_approach_rad: F64  # (K, A)
@@ -89,10 +89,10 @@ class _Reachable:
 def plan_candidate(
     prepared: PlanningScene, T_world_base: F64, rng: np.random.Generator, skip: frozenset[int] = frozenset()
 ) -> PlanReport:
-    """Look for a whole plan from the base pose (4, 4) to any kept grasp but those in `skip`.
+    """Search for a whole plan from the base pose (4, 4) to any grasp except those in `skip`.
 
-    `skip` are rows of the GraspSet. Depends on the arguments alone: neither on candidates before nor on
-    time. `rng` is drawn from only where no grasp has a straight path.
+    `skip` are rows of the GraspSet. The result depends on the arguments alone: neither on earlier candidates
+    nor on time. `rng` is used only where no grasp has a straight path.
     """
     around = prepared.around
     kept, rest = (rows[~np.isin(around.grasp[rows], sorted(skip))] for rows in (around.kept, around.rest))
@@ -114,8 +114,8 @@ def plan_candidate(
 def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -> Iterator[list[_Goal]]:
     """At most `max_grasps_tried` of the free poses `kept` and `rest` with seeds near by, in growing batches.
 
-    `kept` come in their own order, best first and such that neighbours differ much; of each portion of them
-    those nearest to a seed come first. Of `rest` those nearest of all come first.
+    `kept` come first, in portions of their order, in which neighbours differ much; in each portion, the poses
+    nearest to a seed come first. `rest` are sorted by that distance as a whole.
     """
     table, left, batch = prepared.moving.table, prepared.params.max_grasps_tried, _FIRST_BATCH
     for rows, portion in ((kept, _FIRST_PORTION), (rest, len(rest))):
@@ -131,7 +131,7 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
             near = _is_wrist_within_reach(prepared, T_base_world, T, table.limit_m).all(axis=0)
             k, T = k[near], T[near]
             nearest = _nearest_first(prepared, T_base_world, T, table.distance(T))
-            # The hand's way is looked at for few at a time: most candidates need no more.
+            # The hand's motion is checked for few at a time: most candidates need no more.
             while left > 0 and (some := list(islice(nearest, _FILTERED_AT_ONCE))):
                 free = np.array(some)[prepared.around.is_free(k[some])][:left]
                 left -= len(free)
@@ -146,10 +146,10 @@ def _goals(prepared: PlanningScene, T_base_world: F64, kept: Ints, rest: Ints) -
 def _nearest_first(
     prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, distance: F64
 ) -> Iterator[int]:
-    """Rows of the poses (G, 4, 4) with joints known near by, nearest first; `distance` (G,) is theirs.
+    """Rows of the poses (G, 4, 4) with a sample near by, nearest first; `distance` (G,) is theirs.
 
-    Joints must be known near the pregrasp and the end of the lift too: the farthest of the three counts. It
-    is found for few at a time, since no later pose can be nearer than the first of the three.
+    The pregrasp and the end of the lift need a sample near by too: the largest of the three distances counts.
+    It is computed for few poses at a time, because it is never smaller than `distance`.
     """
     order = np.argsort(distance, kind="stable")[: int(np.isfinite(distance).sum())]
     waiting: list[tuple[float, int]] = []
@@ -173,7 +173,7 @@ def _line_ends(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> t
 
 
 def _limits(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> list[str]:
-    """How far a try of each grasp (G, 4, 4) can come at most, by the length of the arm up to its wrist."""
+    """The furthest stage that each grasp (G, 4, 4) can reach, by the length of the arm up to its wrist."""
     grasp, pregrasp, lifted = _is_wrist_within_reach(prepared, T_base_world, T_base_tcp, 0.0)
     return np.where(grasp & pregrasp, np.where(lifted, "success", "no_lift"), "no_ik").tolist()
 
@@ -181,13 +181,13 @@ def _limits(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> list
 def _is_wrist_within_reach(
     prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64, beyond_m: float
 ) -> Bools:
-    """Whether the wrist is in reach, or `beyond_m` beyond (3, G): at grasp, pregrasp and end of the lift."""
+    """Whether the wrist is at most `beyond_m` beyond reach (3, G): at grasp, pregrasp and end of the lift."""
     poses = (T_base_tcp, *_line_ends(prepared, T_base_world, T_base_tcp))
     return np.array([prepared.robot.is_wrist_within_reach(T, beyond_m) for T in poses])
 
 
 def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64) -> Bools:
-    """Where the TCP is within the reach: at the grasp, at the pregrasp and at the end of the lift."""
+    """Whether the TCP is within reach (G,) at the grasp, at the pregrasp and at the end of the lift."""
     robot, params = prepared.robot, prepared.params
     to_grasp = T_base_tcp[:, :3, 3] - robot.shoulder_m
     ways = (0.0, -params.pregrasp_m * T_base_tcp[:, :3, 2], params.lift_m * T_base_world[:3, 2])
@@ -196,9 +196,9 @@ def _is_within_reach(prepared: PlanningScene, T_base_world: F64, T_base_tcp: F64
 
 
 def _try_goals(search: _Search, goals: list[_Goal]) -> MotionPlan | None:
-    """Look for a plan to some grasps: collisions are checked together, all else one by one.
+    """Search for a plan to some grasps: collisions are checked together, all else one by one.
 
-    Grasps that can come no further than those before are left out.
+    Grasps that cannot get further than earlier ones are left out.
     """
     so_far = STAGES.index(search.furthest)
     goals = [goal for goal in goals if STAGES.index(goal.limit) > so_far]
@@ -238,7 +238,7 @@ def _ways(scene: PlanningScene, goal: _Goal) -> list[_Way]:
 
 
 def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
-    """On from joints that are free at a grasp and its pregrasp: both lines and a straight path."""
+    """Plan approach, lift and a straight path from joints that are free at a grasp and its pregrasp."""
     at, scene = search.at, search.scene
     params, robot = scene.params, scene.robot
     k, T_base_tcp = way.goal.k, way.goal.T_base_tcp
@@ -250,7 +250,7 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
     )
     search.reached("no_approach")
     T_back = np.stack([backed(T_base_tcp, float(b)) for b in line_offsets_m(params.pregrasp_m)])
-    # The end of the lift is asked for first: where the arm is too short for it, the lines cost most.
+    # The end of the lift is checked first: where the arm is too short for it, the lines cost most.
     if way.goal.limit == "no_lift" or robot.ik(T_up[-1], way.q_grasp) is None:
         search.reached("no_lift")
         return None
@@ -277,7 +277,7 @@ def _try_way(search: _Search, way: _Way) -> MotionPlan | None:
 
 
 def _search_paths(search: _Search, rng: np.random.Generator) -> MotionPlan | None:
-    """RRT-Connect to the first grasps that no straight path leads to; they share the iterations evenly."""
+    """Run RRT-Connect to the first grasps without a straight path; they share the iterations evenly."""
     scene = search.scene
     robot, params = scene.robot, scene.params
     left, far = params.path_iterations, search.far[:_SEARCHES]

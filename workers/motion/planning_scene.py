@@ -38,11 +38,11 @@ _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.02  # between the pedestal's top and the mount
 ROOM_AROUND_M = 0.25  # how far elbows and the hand reach out beyond the TCP
 _SAME_PART_M = 1e-4
-# Deeper in another object than any settled one; settling allows 5 mm, by hulls of its own.
+# Penetration deeper than that of any settled object; settling allows 5 mm, by its own hulls.
 _SUNK_M = 0.01
-# Half the side of the cube of static parts, for every arm that is no longer than 1.25 m.
+# Half the side of the cube of static parts, for arms that reach up to 1.25 m.
 _AROUND_M = 3.0
-# How far from the target's middle a hand or a lifted target can be, beside the length of its way.
+# Largest distance of the hand or the lifted target from the target's middle, less pregrasp or lift.
 _HAND_ROOM_M = 0.6
 _MOVINGS_KEPT = 128
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -51,14 +51,14 @@ _NOTHING = place([])
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """A robot's shape for planning, built once a robot.
+    """A robot's shape for planning, built once per robot.
 
-    Owners of `arm` and `standing` are the frames of `kinematics`. The hand is in neither: it comes as `hand`,
-    with its fingers as far apart as the grasp asks.
+    Owners of `arm` and `fixed` are the frames of `kinematics`. Neither contains the hand: `hand` has it, with
+    its fingers as far apart as each grasp needs.
     """
 
     kinematics: ForwardKinematics
-    standing: Hulls  # the links that no joint moves
+    fixed: Hulls  # the links that no joint moves
     arm: Hulls  # the others
     arm_depth: Ints  # (P,), number of joints that move each part of `arm`
     hand: Hand
@@ -66,38 +66,38 @@ class Moving:
 
 
 class FreePoses:
-    """Which of N poses are free; each is looked at when it is first asked for."""
+    """Whether each of N poses is free; each is checked on first use."""
 
-    def __init__(self, count: int, look: Callable[[Ints], Bools]) -> None:
+    def __init__(self, count: int, check: Callable[[Ints], Bools]) -> None:
         self._state = np.zeros(count, np.int8)  # 1 free, -1 not, 0 not known
-        self._look = look
+        self._check = check
 
     def __call__(self, rows: Ints) -> Bools:
         """Whether the poses of some rows are free."""
         new = rows[self._state[rows] == 0]
         if len(new):
-            self._state[new] = np.where(self._look(new), 1, -1)
+            self._state[new] = np.where(self._check(new), 1, -1)
         return self._state[rows] == 1
 
 
 @dataclass(frozen=True, eq=False)
 class HandScene:
-    """A scene and a hand: what stands around, and the target's grasps that the hand alone can take.
+    """A scene and a hand: the parts around the target, and its grasps that the hand without an arm can reach.
 
-    It depends on no arm, so that all robots with one hand share it. The K poses are those of the GraspSet,
-    each as it is and turned by half a turn about its approach.
+    It does not depend on the arm: all robots with the same hand share it. The K poses are those of the
+    GraspSet, each as it is and turned by half a turn about its approach.
     """
 
-    static: Placed  # convex parts of the house around
-    floor: Bools  # of the static parts, which are low enough to stand on
+    static: Placed  # convex parts of the house near the target
+    floor: Bools  # which static parts are low enough for a base to stand on
     objects: Placed  # the target's parts, then those of the other objects
     target_parts: int
     grasp: Ints  # (K,), row of the GraspSet
     T_world_tcp: F64  # (K, 4, 4)
     opening_m: F64  # (K,)
     is_free: FreePoses
-    kept: Ints  # rows of the poses that are free among the grasps that are looked at in every scene
-    rest: Ints  # rows of the poses of all other grasps, which may be free
+    kept: Ints  # rows of the free poses among the grasps that are checked in every scene
+    rest: Ints  # rows of the poses of all other grasps, checked on first use
     grasps_free: int  # grasps of `kept`
     holds: Callable[[int], bool]  # whether a row of the GraspSet holds the object
 
@@ -114,7 +114,7 @@ class PlanningScene:
 
     @property
     def grasps_free(self) -> int:
-        """Grasps of the target that the hand alone can take."""
+        """Number of grasps of the target that the hand without an arm can reach."""
         return self.around.grasps_free
 
 
@@ -127,9 +127,9 @@ def prepare(
     base_radius_m: float,
     draw: int = 0,
 ) -> PlanningScene:
-    """A robot among the scene's parts, with the grasps that its hand can take there.
+    """Prepare a scene and a robot for planning, with the grasps that the hand can reach.
 
-    The hand's way is looked at for the first `per_scene` grasps, and for others when a candidate needs them.
+    The hand's motion is checked for the first `per_scene` grasps, and for others when a candidate needs them.
     `base_radius_m` is the radius of the pedestal of a robot that has no base of its own.
     """
     around = _hand_scene(scene, robot, grasps, params, per_scene)
@@ -137,7 +137,7 @@ def prepare(
     return PlanningScene(robot, params, moving_of(robot, draw), around, pedestal_m)
 
 
-# By scene, for as long as it lives; the key holds the GraspSet, so that its identity stays its own.
+# By scene, for as long as it lives. The key holds the GraspSet, so that its id is not used again.
 _HandSceneKey = tuple[str, GraspSet, MotionParams, int, float]
 _hand_scenes: WeakKeyDictionary[SettledScene, dict[_HandSceneKey, HandScene]] = WeakKeyDictionary()
 
@@ -156,33 +156,33 @@ def _hand_scene(
 def hand_scene(
     scene: SettledScene, hand: Hand, grasps: GraspSet, params: MotionParams, per_scene: int, around_m: float
 ) -> HandScene:
-    """Place the scene's parts up to `around_m` from the target, and look at the first `per_scene` grasps.
+    """Place the scene's parts up to `around_m` from the target, and check the first `per_scene` grasps.
 
-    Where none of them is free, all are looked at.
+    Where none of them is free, all are checked.
     """
     target, T_world_target = scene.models[0], scene.T_world_object[0]
     static, floor = _static_around(scene, around_m)
     placed_target = place_object(target, T_world_target)
     others = [place_object(m, T) for m, T in zip(scene.models[1:], scene.T_world_object[1:], strict=True)]
-    # The hand is never farther from the target than this: the other parts need not be looked at.
+    # The hand is never farther from the target than this: the other parts need no check.
     center, room_m = scene.target_center_m, _HAND_ROOM_M + max(params.pregrasp_m, params.lift_m)
     near = static.rows(static.within(center - room_m, center + room_m))
     around = joined([near, *others])
     hulls = object_hulls(target)
-    # A target within another thing can be held by nothing, whatever the hand alone may do there.
+    # A target that penetrates another object has no grasp, even where the hand is free.
     is_sunk = (
         bool(hits(hulls, T_world_target[None, None], joined(others), -_SUNK_M).any()) if others else False
     )
     turned = _turned_grasps(hand, grasps, target, params)
     T_world_tcp = np.matmul(T_world_target, turned.T_object_tcp)
 
-    def look(rows: Ints) -> Bools:
+    def check(rows: Ints) -> Bools:
         free = turned.is_free(rows)
         some = rows[free]
         free[free] = free_grasps(hand, T_world_tcp[some], turned.opening_m[some], around, _NOTHING, params)
         return free
 
-    is_free = FreePoses(len(T_world_tcp), look)
+    is_free = FreePoses(len(T_world_tcp), check)
     every = np.arange(len(T_world_tcp))
     if is_sunk or not can_be_lifted(hulls, T_world_target, near, params.lift_m):
         every = every[:0]
@@ -220,7 +220,7 @@ _turned: WeakKeyDictionary[GraspSet, dict[tuple[str, MotionParams], _TurnedGrasp
 
 
 def _turned_grasps(hand: Hand, grasps: GraspSet, target: ObjectModel, params: MotionParams) -> _TurnedGrasps:
-    """Built once an object: no scene changes them."""
+    """Poses of the target's grasps, built once per object: they do not depend on the scene."""
     known, key = _turned.setdefault(grasps, {}), (hand.digest, params)
     if key not in known:
         grasp = np.repeat(np.arange(len(grasps)), 2)
@@ -229,16 +229,16 @@ def _turned_grasps(hand: Hand, grasps: GraspSet, target: ObjectModel, params: Mo
         opening_m = grasps.opening_m[grasp].astype(np.float64)
         placed = place_object(target, np.eye(4))
 
-        def look(rows: Ints) -> Bools:
+        def check(rows: Ints) -> Bools:
             return free_grasps(hand, T[rows], opening_m[rows], _NOTHING, placed, params)
 
-        known[key] = _TurnedGrasps(grasp, T, opening_m, FreePoses(len(T), look))
+        known[key] = _TurnedGrasps(grasp, T, opening_m, FreePoses(len(T), check))
     return known[key]
 
 
 def moving_of(robot: Robot, draw: int = 0) -> Moving:
     """The robot's kinematics, shape and reach table; built once for all mount heights of an arm."""
-    # Copies of an arm at other heights share their parts; the robot kept here keeps their identity.
+    # Copies of an arm at other heights share their parts. The stored robot keeps the id of its parts in use.
     key = (id(robot.link_parts_m), draw)
     if key in _movings:
         _movings.move_to_end(key)
@@ -276,7 +276,7 @@ def pose_of_base(base_xy_m: F64, base_height_m: float, target_center_m: F64) -> 
 
 
 def _is_of_hand(parts: tuple[F32, ...], T_base_link: F64, T_base_tcp: F64, hand: tuple[F32, ...]) -> bool:
-    """Whether every part of a link is one of the open hand's, seen from the TCP with all joints at zero."""
+    """Whether every part of a link is a part of the open hand, in the TCP frame with all joints at zero."""
     R = T_base_tcp[:3, :3]
 
     def box(points: F64) -> F64:
@@ -292,7 +292,7 @@ def _is_of_hand(parts: tuple[F32, ...], T_base_link: F64, T_base_tcp: F64, hand:
 
 
 def _static_around(scene: SettledScene, around_m: float) -> tuple[Placed, Bools]:
-    """The house's parts within a cube around the target, and which of them a base stands on."""
+    """The house's parts within a cube around the target, and which of them a base can stand on."""
     center = scene.target_center_m
     parts, low_m, high_m = _house_parts(scene.house.house)
     near = ((low_m < center + around_m) & (high_m > center - around_m)).all(axis=1)

@@ -1,4 +1,4 @@
-"""Random joint vectors of an arm with the hand poses they lead to: where to look for inverse kinematics."""
+"""Random joint vectors of an arm and their hand poses, as seeds of inverse kinematics."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from datagen.workers.robots.robot import Robot
 
 _SAMPLES = 65536
 _PROBES = 2048
-# Poses further from all samples than this share of reachable ones are not asked for.
+# Inverse kinematics skips poses farther from all samples than this quantile of reachable poses.
 _QUANTILE = 0.97
-_LENGTHS_PER_UNIT = 0.25  # weight of a unit difference of directions beside positions, in arm lengths
-_DETOUR = 1.0  # by how much a distance may be larger than that of the nearest: halves the time to find it
-_NOT_NEAREST = 0.3  # the same for seeds
+_LENGTHS_PER_UNIT = 0.25  # weight of a unit difference of directions, in arm lengths
+_DISTANCE_EPS = 1.0  # largest relative error of the nearest distance: halves the time of a query
+_SEED_EPS = 0.3  # the same for seeds
 _PER_SEED = 6  # samples near a pose among which each of its seeds is chosen
 _APART_RAD = 1.0  # seeds with all joints nearer than this often lead to one solution
-_DIGITS = 6  # of an arm's numbers, in its own length: arms that are scaled copies share them
+_DIGITS = 6  # of an arm's numbers, in units of its length: scaled copies of an arm share samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +52,17 @@ class ReachTable:
 
     @property
     def limit_m(self) -> float:
-        """Wrists that are farther than this from all reachable ones are farther than the limit too."""
+        """The limit in metres: a wrist that is farther from all reachable ones is beyond the limit."""
         return self.samples.limit * self.length_m
 
     def distance(self, T_base_tcp: F64) -> F64:
-        """Distances (G,) of poses to a sample that may be `_DETOUR` farther than the nearest, in arm lengths.
+        """Distances (G,) of poses to an approximately nearest sample, in arm lengths.
 
-        They are infinite beyond the limit, where inverse kinematics is not worth asking.
+        They are infinite beyond the limit, where inverse kinematics is not tried.
         """
         features, _ = self._features(T_base_tcp)
-        found = self.samples
-        return found.tree.query(features, eps=_DETOUR, distance_upper_bound=found.limit)[0]
+        tree, limit = self.samples.tree, self.samples.limit
+        return tree.query(features, eps=_DISTANCE_EPS, distance_upper_bound=limit)[0]
 
     def seeds(self, T_base_tcp: F64, count: int) -> F64:
         """Joints (G, count, A) of samples near each pose that differ from each other.
@@ -71,11 +71,11 @@ class ReachTable:
         from those before by `_APART_RAD` in some joint, or where there is none the one that differs most.
         """
         features, azimuth = self._features(T_base_tcp)
-        found = self.samples
-        row = found.tree.query(features, k=list(range(1, _PER_SEED * count + 1)), eps=_NOT_NEAREST)[1]
-        near = found.q_rad[row]
-        if found.turns:
-            near[:, :, 0] += azimuth[:, None] - found.azimuth_rad[row]
+        samples = self.samples
+        row = samples.tree.query(features, k=list(range(1, _PER_SEED * count + 1)), eps=_SEED_EPS)[1]
+        near = samples.q_rad[row]
+        if samples.turns:
+            near[:, :, 0] += azimuth[:, None] - samples.azimuth_rad[row]
             near[:, :, 0] = (near[:, :, 0] + np.pi) % (2 * np.pi) - np.pi
         near = np.clip(near, self.lower_rad, self.upper_rad)
         every, best = np.arange(len(near)), np.zeros(len(near), np.int64)
@@ -93,7 +93,7 @@ class ReachTable:
 
 
 def reach_table(robot: Robot, kinematics: ForwardKinematics, draw: int = 0) -> ReachTable:
-    """The table of a robot; equal robots have equal tables. `draw` is another draw of its samples."""
+    """The table of a robot; equal robots have equal tables. `draw` seeds its samples."""
     lower = np.maximum(robot.q_lower_rad, -np.pi)
     upper = np.minimum(robot.q_upper_rad, np.pi)
     T_tcp = kinematics.T_base_frame[-1]
@@ -127,7 +127,7 @@ def _samples(
     upper_rad: bytes,
     draw: int,
 ) -> _Samples:
-    """Made of the rounded numbers alone, so that it matters not which scale was asked for first."""
+    """Samples of an arm by its rounded numbers alone: the scale that is opened first does not matter."""
     P, S, T = (np.frombuffer(m).reshape(-1, 4, 4) for m in (first, second, T_wrist))
     kinematics = ForwardKinematics(P, S, turns, T, np.array([len(turns)]))
     rng = np.random.Generator(np.random.PCG64(draw))
@@ -138,7 +138,7 @@ def _samples(
     poses = kinematics.tcp(q)
     features, azimuth = _features(poses[:, :3, 3], poses[:, :3, :3], is_upright)
     tree = KDTree(features[:_SAMPLES])
-    gaps, _ = tree.query(features[_SAMPLES:], eps=_DETOUR)
+    gaps, _ = tree.query(features[_SAMPLES:], eps=_DISTANCE_EPS)
     limit = float(np.quantile(gaps, _QUANTILE))
     return _Samples(q[:_SAMPLES], azimuth[:_SAMPLES], tree, is_upright, limit)
 

@@ -1,7 +1,7 @@
 """RRT-Connect (Kuffner and LaValle 2000) over whole edges, its shortcuts, and straight lines in joint space.
 
-Own code in place of ompl: ompl's Python interface takes no sampler and draws from one generator for the
-whole process, and it asks about configurations one by one, where an edge is checked here in one go.
+It replaces ompl, whose Python interface accepts no sampler, has one random generator for the whole process,
+and checks configurations one by one. Here an edge is checked as a whole.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def dense(corners_rad: F64, step_rad: float) -> F64:
 
 
 def is_line_free(q_from: F64, q_to: F64, first_blocked: FirstBlocked, step_rad: float) -> bool:
-    """Whether nothing on the straight line after `q_from` collides; a sparse look first, then the rest."""
+    """Whether nothing on the straight line after `q_from` collides; checks a sparse subset first."""
     q = straight(q_from, q_to, step_rad)[1:]
     if len(q) > 2 * _FIRST_LOOK:
         sparse = np.zeros(len(q), np.bool_)
@@ -77,12 +77,12 @@ def connect(
     iterations: int,
     rng: np.random.Generator,
 ) -> tuple[F64 | None, int]:
-    """Corners (K, A) of a free path between two free configurations, and how many samples it took.
+    """Corners (K, A) of a free path between two free configurations, and the number of samples used.
 
-    None after `iterations` samples.
+    The path is None after `iterations` samples.
 
-    Each sample extends one tree by an edge of at most 1 rad towards it; the other tree then runs
-    straight for the new end as far as it is free. The trees take turns. The same `rng` gives the same path.
+    Each sample extends one tree by an edge of at most 1 rad towards it; the other tree then grows straight
+    towards the new end as far as the line is free. The trees take turns. The same `rng` gives the same path.
     """
     capacity = 2 * iterations + 1
     trees = (_SearchTree(q_start, capacity), _SearchTree(q_goal, capacity))
@@ -121,9 +121,9 @@ def _advance(
 def shortened(
     path_rad: F64, first_blocked: FirstBlocked, step_rad: float, tries: int, rng: np.random.Generator
 ) -> F64:
-    """A dense path (M, A) with detours cut off: straight lines between random rows of it, where free.
+    """A dense path (M, A) with shortcuts: straight lines between random rows of it, where free.
 
-    Never longer than before, and every row of it was looked at. The same `rng` gives the same path.
+    It is never longer than before, and every row is checked. The same `rng` gives the same path.
     """
     path = path_rad
     for _ in range(tries):

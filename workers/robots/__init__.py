@@ -34,7 +34,7 @@ def robot_limits(name: str) -> RobotLimits:
 def open_robot(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     """A robot of the registry at one mount height; the last 64 are kept.
 
-    `reach_m` None takes the robot's own reach, which `panda-scaled` has not. Raises InputError naming
+    `reach_m` None is the robot's own reach; `panda-scaled` has none. Raises InputError naming
     `--robot` for an unknown name, a reach or a height outside the robot's range, and naming the file
     for a URDF or a mesh that cannot be used.
     """
@@ -73,10 +73,10 @@ def _mounted(name: str, reach_m: float | None, base_height_m: float) -> Robot:
     return _built(name, reach_m, 0.0).at_height(base_height_m)
 
 
-# More than a scaled arm has reaches in whole centimetres.
+# A scaled arm has fewer reaches in whole centimetres.
 @lru_cache(maxsize=128)
 def _built(name: str, reach_m: float | None, base_height_m: float) -> Robot:
-    # Imported when asked for, so that limits can be read without a simulator.
+    # Imported on first use, so that limits can be read without a simulator.
     build = entry({name: "datagen.workers.robots.robot:Robot"}, name, "--robot")
     return build(_description(name), reach_m, base_height_m)
 

@@ -1,4 +1,4 @@
-"""An arm as it is built: the URDF's links from the mount to the flange, scaled, with the hand on it."""
+"""Assembly of a robot: the URDF's links from the mount to the flange, scaled, with the hand on it."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _REACH_TOLERANCE_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LinkBody:
-    """A link that carries shape, with all that is fixed to it."""
+    """A link with a shape, together with all links that are fixed to it."""
 
     name: str
     inertial: Inertial | None
     parts_m: Parts  # link frame
-    unscaled_m: Parts  # the same before the scale
-    visuals: tuple[Shape, ...]  # meshes to look at, link frame, before the scale
+    unscaled_m: Parts  # the same, unscaled
+    visuals: tuple[Shape, ...]  # visual meshes, link frame, unscaled
     scale: float
-    drawn_m: Parts  # parts to look at where no visual shows them
+    drawn_m: Parts  # parts to draw where there are no visuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Assembly:
 
 
 def assemble(description: RobotDescription, reach_m: float | None, lift_m: float) -> Assembly:
-    """Reads the URDFs and puts the robot together.
+    """Read the URDFs and assemble the robot.
 
     `reach_m` is for a robot that is scaled to its reach; `lift_m` for one with a torso. Raises InputError
     naming the file and what is wrong in it.
@@ -96,7 +96,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
     mount = tree.joint(description.arm_joints[0])
     T_root_mount = np.eye(4)
     if description.lift:
-        # The arm's base frame is where its first joint sits; elsewhere it is the root link itself.
+        # With a torso the mount is the origin of the first joint; elsewhere it is the root link.
         T_root_mount[:3, 3] = (clusters[0][mount.parent][1] @ mount.T_parent_child)[:3, 3]
     return Assembly(
         tuple(links),
@@ -111,7 +111,7 @@ def assemble(description: RobotDescription, reach_m: float | None, lift_m: float
     )
 
 
-_Cluster = dict[str, tuple[Link, F64]]  # links that do not move against the head, with their poses in it
+_Cluster = dict[str, tuple[Link, F64]]  # links that are fixed to the head, with their poses in its frame
 
 
 def _cluster(tree: UrdfTree, head: str, stops: set[str], held: dict[str, float]) -> _Cluster:
@@ -177,7 +177,7 @@ def _scale_for(
     extension_m: float,
     reach_m: float,
 ) -> float:
-    """The scale at which the arm reaches so far, by the secant method: reach is nearly linear in it."""
+    """The scale at which the arm reaches `reach_m`, by the secant method: reach is nearly linear in it."""
 
     def reach_at(scale: float) -> float:
         return largest_reach_m(_joints(description, tree, clusters, scale, extension_m)[2])
@@ -212,7 +212,7 @@ def _body(
     inertial = _combined([(link.inertial, T) for link, T in cluster.values() if link.inertial])
     if inertial is not None:
         inertial = scaled_inertial(inertial, scale)
-    # Other formats than glTF are not read to look at; the hulls stand in for them.
+    # Visual meshes are read from glTF alone; hulls replace those of other formats.
     if any(shape.mesh is None or shape.mesh.suffix != ".glb" for shape in visuals):
         visuals = []
     drawn = () if visuals else tuple(parts)

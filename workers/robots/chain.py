@@ -1,4 +1,4 @@
-"""A chain of joints as plain matrices: how far it reaches, and the scale at which it reaches so far."""
+"""A chain of joints as plain matrices, and its largest reach."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def largest_reach_m(chain: Chain) -> float:
     return _largest_reach_m(*(part.tobytes() for part in parts))
 
 
-# Scaled arms ask for the same chains again: those that their scale is looked for between, and the one found.
+# Scaled arms need the same chains again: the bounds of the search for their scale, and its result.
 @lru_cache(maxsize=256)
 def _largest_reach_m(*parts: bytes) -> float:
     T, axes, lower_rad, upper_rad, tcp_m = map(np.frombuffer, parts)

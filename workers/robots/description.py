@@ -1,4 +1,4 @@
-"""What the file of one robot states: constants alone, so that limits can be read without a simulator."""
+"""Descriptions of robots: constants alone, so that limits can be read without a simulator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from datagen.workers.geometry.mesh import F64
 
 @dataclass(frozen=True)
 class RobotLimits:
-    """What may be asked of a robot. A range whose ends are equal is a single value."""
+    """Ranges that a robot supports. A range whose ends are equal is a single value."""
 
     reach_m: tuple[float, float]
     base_height_m: tuple[float, float] | None  # None: a pedestal of any height
@@ -29,7 +29,7 @@ class HandDescription:
     name: str
     urdf: str  # below ManiSkill's folder of robots
     palm_link: str
-    finger_joints: tuple[str, str]  # that on the side of +y of the TCP first
+    finger_joints: tuple[str, str]  # first the one on the +y side of the TCP
     T_palm_tcp: F64  # (4, 4)
     pad_size_m: tuple[float, float]  # along x and along z of the TCP
 
@@ -57,7 +57,7 @@ class RobotDescription:
 
     name: str
     urdf: str  # below ManiSkill's folder of robots
-    root_link: str  # what lies above it in the URDF is left out
+    root_link: str  # links above it in the URDF are left out
     arm_joints: tuple[str, ...]  # (A,), from the base on
     flange_link: str
     T_flange_palm: F64  # (4, 4)
@@ -72,7 +72,7 @@ class RobotDescription:
     # Meshes far from convex, by link: heights along z between which each slab gets a hull of its own.
     cuts_m: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     shapeless: tuple[str, ...] = ()  # links whose shapes are left out
-    held: dict[str, float] = field(default_factory=dict[str, float])  # other joints, where they are held
+    held: dict[str, float] = field(default_factory=dict[str, float])  # fixed positions of other joints
 
 
 def turned_homes(

@@ -44,7 +44,7 @@ _LEFT_OUTLINE_M = (
 FETCH = RobotDescription(
     name="fetch",
     urdf="fetch/fetch.urdf",
-    # The joints above it, which drive the base over the floor, are left out: the base stands.
+    # The joints above it, which drive the base over the floor, are left out: the base is fixed.
     root_link="base_link",
     arm_joints=(
         "shoulder_pan_joint",
@@ -68,15 +68,15 @@ FETCH = RobotDescription(
         reach_m=(1.11, 1.11),
         # Heights of shoulder_pan_joint above the floor over torso_lift_joint's range, 0 to 0.38615 m.
         base_height_m=(0.727, 1.112),
-        # Of the base's hull around shoulder_pan_joint's axis, which is not its middle.
+        # Radius of the base's hull around shoulder_pan_joint's axis, which is not its middle.
         base_radius_m=0.32,
         footprint_m=_LEFT_OUTLINE_M + tuple((x, -y) for x, y in reversed(_LEFT_OUTLINE_M)),
     ),
     # torso_lift_joint and shoulder_pan_joint, 0.37743 + 0.34858 m; base_link stands on the floor.
     lift=TorsoLift(joint="torso_lift_joint", mount_at_zero_m=0.72601),
-    # A shelf for the arm and a neck stand out of it, between which the arm turns.
+    # The arm turns between a shelf and a neck that protrude from the link.
     cuts_m={"torso_lift_link": (0.18, 0.304, 0.47)},
-    # They lie within the base's outline, and their treads dip 5 mm into the floor.
+    # The wheels lie within the base's outline, and their treads reach 5 mm into the floor.
     shapeless=("r_wheel_link", "l_wheel_link"),
     held={"head_pan_joint": 0.0, "head_tilt_joint": 0.0},
 )

@@ -22,7 +22,7 @@ class Gripper:
     """
 
     name: str
-    digest: str  # of all that follows: grasps are kept by it
+    digest: str  # of all other fields; a key of caches
     max_opening_m: float
     pad_size_m: tuple[float, float]  # of the rubber that touches: along x and along z
     palm_depth_m: float  # from the TCP back to the palm's surface, along -z

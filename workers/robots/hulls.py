@@ -1,6 +1,6 @@
 """Convex parts of links: hulls of collision meshes, reduced outwards to a few corners."""
 
-# coal fills itself at import time, which type checkers do not see.
+# coal defines its names at import time, which type checkers do not see.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from datagen.workers.geometry.mesh import F32, F64, I32
 from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.urdf import Shape
 
-# PhysX on a GPU takes hulls of at most 64 corners, and coal is faster on fewer.
+# PhysX on a GPU accepts hulls of at most 64 corners, and coal is faster on fewer.
 MAX_CORNERS = 64
 _MAX_BYTES = 64 << 20
 _FIX = "Install mani_skill again, or correct the file"
@@ -64,7 +64,7 @@ def mesh_hulls(path: Path, cuts_m: tuple[float, ...] = ()) -> tuple[F64, ...]:
 
 def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
     """Vertices (V, 3) and edges (E, 2) of a mesh. Raises InputError naming the file."""
-    # Imported here: collision bodies of objects need none of it.
+    # Imported here: collision bodies of objects do not need it.
     import trimesh
 
     data = read_regular(path, _MAX_BYTES, _FIX)
@@ -72,7 +72,7 @@ def read_points(path: Path) -> tuple[F64, npt.NDArray[np.int64]]:
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type=path.suffix, process=False)
         points = np.asarray(mesh.vertices, np.float64)
         edges = np.asarray(mesh.edges, np.int64)
-    # Broken meshes surface in the reader in all of these ways.
+    # The reader raises any of these for a broken mesh.
     except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise _wrong(path, f"is not a mesh ({type(error).__name__})") from error
     if len(points) < 4 or not np.isfinite(points).all():
@@ -95,9 +95,9 @@ def _slab(points: F64, edges: npt.NDArray[np.int64], low: float, high: float) ->
 def outer_hull(points: F64) -> F64:
     """Corners (V, 3) of a polytope that contains all points; their hull itself where it has few corners.
 
-    Takes the points furthest out in 26 directions, then again and again those furthest outside of the
-    hull of those taken, each over a face of its own. What still stands out of a face pushes the face's
-    corners along its normal until nothing does.
+    Takes the extreme points in 26 directions, then repeatedly the points farthest outside the hull of those
+    taken, each over another face. Where points remain outside a face, its corners move along its normal until
+    none remain.
     """
     hull = ConvexHull(points)
     if len(hull.vertices) <= MAX_CORNERS:
@@ -116,7 +116,7 @@ def outer_hull(points: F64) -> F64:
         if outside.max() < _TOUCHING_M:
             break
         pushed = np.zeros_like(corners)
-        # Faces that stand further back write last.
+        # Faces with points farther outside overwrite the others.
         for face in np.argsort(outside):
             if outside[face] > 0.0:
                 pushed[hull.simplices[face]] = hull.equations[face, :3] * outside[face]

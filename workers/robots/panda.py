@@ -56,6 +56,6 @@ PANDA_SCALED = replace(
     name="panda-scaled",
     # The span of d_arm in the paper's Sec. IV-A.
     limits=RobotLimits(reach_m=(0.3, 1.0), base_height_m=None, base_radius_m=None),
-    # Below half a metre the links shrink so far that the hand, which keeps its size, meets the forearm.
+    # Below half a metre the links shrink so far that the hand, which keeps its size, hits the forearm.
     extension=WristExtension(longest_m=0.05, radius_m=0.02, none_from_reach_m=0.5),
 )

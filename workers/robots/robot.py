@@ -26,7 +26,7 @@ from datagen.workers.robots.self_collision import SelfCollision
 # Its binary modules have no types.
 pin: Any = pinocchio
 _GREY = 190
-_ROUNDING_M = 0.001  # far more than lengths and tolerances are off by
+_ROUNDING_M = 0.001  # far more than the rounding errors of lengths and tolerances
 _read_visual = lru_cache(maxsize=64)(read_glb)
 
 
@@ -93,12 +93,12 @@ class Robot:
     def urdf(self) -> Path:
         """Path of its URDF for physics engines, with paths of meshes that resolve.
 
-        The files are written when asked for and stay for an hour at least: read them soon, and ask again.
+        The files are written on first use and stay for at least an hour. Get `urdf` again to read them later.
         """
         return self._files.urdf()
 
     def at_height(self, base_height_m: float) -> Robot:
-        """The same arm on a pedestal of another height; both share what they are made of."""
+        """The same arm on a pedestal of another height; both share all other data."""
         other = copy.copy(self)
         other.base_height_m = base_height_m
         return other
@@ -122,9 +122,9 @@ class Robot:
         return solve(self._model, self._data, self._tcp, T_base_tcp, q_seed_rad)
 
     def is_wrist_within_reach(self, T_base_tcp: F64, beyond_m: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Which TCP poses (N, 4, 4) have the last joint at most `beyond_m` beyond its reach.
+        """Whether the last joint is at most `beyond_m` beyond its reach at each TCP pose (N, 4, 4); (N,).
 
-        Where it is beyond by anything, `ik` fails.
+        `ik` fails at all poses where it is beyond its reach.
         """
         wrist_m = T_base_tcp[:, :3, :3] @ self._tcp_wrist_m + T_base_tcp[:, :3, 3]
         return np.linalg.norm(wrist_m - self.shoulder_m, axis=1) <= self._wrist_reach_m + beyond_m
@@ -134,12 +134,12 @@ class Robot:
         return self._self_collision.touches(q_rad)
 
     def link_meshes(self) -> tuple[Mesh, ...]:
-        """(L,) meshes to look at, link frames."""
+        """Visual meshes (L,), link frames."""
         return tuple(_mesh_of(body) for body in self._assembly.bodies)
 
 
 def _model_of(assembly: Assembly, T_base_root: F64) -> Any:
-    """Joints of the arm alone; then a frame for every body, fingers open, and one for the TCP."""
+    """A model with the arm's joints, a frame for every body, fingers open, and one for the TCP."""
     model = pin.Model()
     at = 0
     placements = [T_base_root]

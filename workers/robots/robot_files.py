@@ -1,4 +1,4 @@
-"""The robot as files for physics engines: URDF, SRDF and convex parts in a folder of the user's."""
+"""The robot as files for physics engines: URDF, SRDF and convex parts in a cache folder of the user."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from datagen.workers.robots.gripper import Parts
 from datagen.workers.robots.hulls import hull_faces
 from datagen.workers.robots.urdf import Inertial, Joint, rotation_rpy
 
-# Files of the cache's folder; a robot has two of its own and shares the others with its family.
+# Most files in the cache folder; a robot has two of its own and shares the others with its family.
 _MOST_FILES = 8192
-# Longer than any reader takes from asking for the path to reading the files.
+# Longer than any reader takes from getting the path to reading the files.
 _IDLE_S = 3600.0
-# Old files are removed at the first robot that a process writes, and after this many more.
+# Robots that a process writes from one removal of old files to the next; the first robot starts with one.
 _WRITTEN_BETWEEN_PRUNINGS = 256
 
 
 class RobotFiles:
-    """The files of one robot, written when they are asked for: planning needs none.
+    """The files of one robot, written on first use: planning needs none.
 
     Collision shapes are convex STL files, one a part; visuals are left out, because building their materials
     needs a render device. `disabled` are pairs of links that an engine must not let collide.
@@ -46,10 +46,10 @@ class RobotFiles:
         self._paths: tuple[Path, ...] = ()  # the URDF last
 
     def urdf(self) -> Path:
-        """Path of `<name>-<digest>.urdf`, the `.srdf` beside it; both stay an hour at least.
+        """Path of `<name>-<digest>.urdf`, stored with its `.srdf`; both stay for at least an hour.
 
         They lie in the cache, or else in a temporary folder of this process. Raises OSError where neither
-        takes them.
+        is writable.
         """
         try:
             return self._kept_in(cache_folder() / "robots")
@@ -58,7 +58,7 @@ class RobotFiles:
 
     def _kept_in(self, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
-        # No process removes a file between the check and the mark of its use.
+        # Locked: no process removes a file between the check and the mark of its use.
         with alone_in(folder):
             known = bool(self._paths) and self._paths[-1].parent == folder
             if not (known and all(refresh(path) for path in self._paths)):
@@ -77,7 +77,7 @@ class RobotFiles:
             _add_joint(root, joint)
         semantic = ElementTree.Element("robot", name=self._name)
         for first, second in self._disabled:
-            # SAPIEN reads the reason: it honours "Default" alone.
+            # SAPIEN disables collisions only for the reason "Default".
             pair = {"link1": first, "link2": second, "reason": "Default"}
             ElementTree.SubElement(semantic, "disable_collisions", pair)
         ElementTree.indent(root)
@@ -119,11 +119,11 @@ def _part_file(corners_m: F32, folder: Path) -> Path:
 
 
 def _add_link(root: ElementTree.Element, body: LinkBody, folder: Path) -> list[Path]:
-    """Adds the link and returns the files of its parts."""
+    """Add the link and return the files of its parts."""
     link = ElementTree.SubElement(root, "link", name=body.name)
     if body.inertial is not None:
         _add_inertial(link, body.inertial)
-    # Parts are written before their scale, so that a family of scaled arms shares them.
+    # Parts are written unscaled, so that a family of scaled arms shares them.
     files = [_part_file(part, folder) for part in body.unscaled_m]
     for file in files:
         geometry = ElementTree.SubElement(ElementTree.SubElement(link, "collision"), "geometry")

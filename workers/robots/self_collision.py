@@ -1,4 +1,4 @@
-"""Which links of a robot may touch, found from its geometry, and whether they do."""
+"""Self-collision of a robot: the pairs of links to check, found from its geometry, and whether any touch."""
 
 from __future__ import annotations
 
@@ -22,9 +22,8 @@ _MOST = 0.5
 class SelfCollision:
     """Narrow-phase checks of pairs of bodies, each made of convex parts fixed to a joint.
 
-    Bodies that are fixed to one another and bodies on both sides of one joint always may touch. Of the
-    rest, pairs that touch in most of 300 random configurations (fixed seed) are taken to overlap by
-    the coarseness of their hulls and are left out too.
+    Bodies that are fixed to one another and bodies on both sides of one joint may always touch. Other pairs
+    that touch in most of 300 random configurations (fixed seed) are left out too: their coarse hulls overlap.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class SelfCollision:
             found = zip(pairs, results.collisionResults, strict=True)
             for pair in {pair for pair, result in found if result.isCollision()}:
                 touched[pair] = touched.get(pair, 0) + 1
-            # No pair can come to most of the samples any more, or has already.
+            # Stop when the remaining samples cannot change the result of any pair.
             most = _MOST * _SAMPLES
             if left <= most and all(not most - left < count <= most for count in touched.values()):
                 break

@@ -1,4 +1,4 @@
-"""Reading a robot from URDF with every number checked, and writing one for physics engines."""
+"""Read a robot from URDF and check every number; conversions to write one for physics engines."""
 
 from __future__ import annotations
 
@@ -73,13 +73,13 @@ class UrdfTree:
     joints: dict[str, Joint]
 
     def joint(self, name: str) -> Joint:
-        """Raises InputError naming the file where the joint is missing."""
+        """The joint of that name. Raises InputError naming the file where it is missing."""
         if name not in self.joints:
             raise _wrong(self.path, f"joint {name}", "is missing")
         return self.joints[name]
 
     def link(self, name: str) -> Link:
-        """Raises InputError naming the file where the link is missing."""
+        """The link of that name. Raises InputError naming the file where it is missing."""
         if name not in self.links:
             raise _wrong(self.path, f"link {name}", "is missing")
         return self.links[name]
@@ -174,7 +174,7 @@ class _Reader:
             raise _wrong(self.path, where, f"mass {mass} is negative")
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         R = T[:3, :3]
-        # Links that only carry frames say so by a mass of 0.
+        # A mass of 0 marks links that only carry frames.
         return Inertial(mass, T[:3, 3], R @ inertia @ R.T) if mass > 0 else None
 
     def shape(self, element: ElementTree.Element, where: str) -> Shape:
@@ -246,7 +246,7 @@ def rotation_rpy(R: F64) -> F64:
 
 
 def scaled_inertial(inertial: Inertial, scale: float) -> Inertial:
-    """The body `scale` times as long and as heavy as before, so that its inertia grows with the square.
+    """The body `scale` times as long with the same mass: its inertia grows with the square of the scale.
 
     At equal density the hand would weigh many times what a short arm does, and PhysX's drives, solved in
     few iterations, would sag under it by degrees.

@@ -15,7 +15,7 @@ XARM7 = RobotDescription(
     root_link="link_base",
     arm_joints=tuple(f"joint{k}" for k in range(1, 8)),
     flange_link="link_eef",
-    # ManiSkill brings no gripper of UFACTORY's, only a five-fingered hand.
+    # ManiSkill has no gripper by UFACTORY, only a five-fingered hand.
     T_flange_palm=np.eye(4),
     hand=FRANKA_HAND,
     homes_rad=turned_homes(

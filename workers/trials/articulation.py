@@ -1,4 +1,4 @@
-"""A robot's moving bodies, read once from its URDF: what a physics engine builds an arm from."""
+"""A robot's moving bodies, read once from its URDF, from which a physics engine builds the arm."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from datagen.workers.geometry.transforms import translation
 from datagen.workers.robots.robot import Robot
 from datagen.workers.robots.urdf import Joint, UrdfTree, read_urdf
 
-# Bodies that carry no mass of their own still need some: a speck at the joint.
+# Bodies without mass still need a little, at the joint.
 _LEAST_MASS_KG, _LEAST_INERTIA_KGM2 = 1e-3, 1e-6
 
 
@@ -46,7 +46,7 @@ class Articulation:
 
 
 def articulation_of(robot: Robot) -> Articulation:
-    """Reads the URDF, in which the arm's and the fingers' joints alone move.
+    """Read the URDF, in which only the joints of the arm and the fingers move.
 
     Raises InputError where it is broken or lacks a joint.
     """
@@ -71,7 +71,7 @@ def articulation_of(robot: Robot) -> Articulation:
 
 
 def _rigid_links(tree: UrdfTree, link: str, moving: tuple[str, ...]) -> list[tuple[str, F64]]:
-    """The link and all that hangs on it by joints that do not move, with their poses in its frame."""
+    """The link and all links fixed to it by joints that do not move, with their poses in its frame."""
     found = [(link, np.eye(4))]
     for name, T in found:
         for joint in tree.children(name):

@@ -13,7 +13,7 @@ from datagen.workers.robots.robot import Robot
 from datagen.workers.trials.time_parameterization import lag_compensated, time_parameterized
 
 PHASES = ("reach", "approach", "close", "lift", "hold")
-# Share of the joints' speed limits at which the arm travels: what arms are run at beside people and things.
+# Share of the joints' speed limits at which the arm moves, as is usual near people and objects.
 SPEED_SHARE = 0.5
 _ARRIVE_S = 0.1  # for the drives to catch up before the next phase
 _CLOSING_SHARE = 0.8  # of close_s, in which the fingers' targets travel; then they press
@@ -24,19 +24,19 @@ FINGER_STIFFNESS, FINGER_DAMPING = 4000.0, 200.0
 
 @dataclass(frozen=True, eq=False)
 class ControlPeriod:
-    """One control period: where the drives' targets go to, evenly, in its course."""
+    """One control period: the drives' targets at its end, towards which they move evenly."""
 
     phase: str
     arm_rad: F64  # (A,)
     finger_m: float | None  # of both fingers; None presses with the grip's force
-    joints_rad: F64  # (A,) where the arm shall be
+    joints_rad: F64  # (A,) planned at its end
     ends_phase: bool = False
 
 
 def drive_targets(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[ControlPeriod]:
-    """The plan as ticks.
+    """The plan as control periods.
 
-    The reach takes as long as the speed limits ask for, approach and lift at least their seconds.
+    The reach takes as long as the speed limits require, approach and lift at least `approach_s` and `lift_s`.
     Targets are ahead of the path by the drives' lag.
     """
     speed, period_s = robot.speed_limit_radps * SPEED_SHARE, params.control_period_s
@@ -77,7 +77,7 @@ def drive_targets(plan: MotionPlan, robot: Robot, params: TrialParams) -> list[C
 
 
 def planned_rise_m(plan: MotionPlan, robot: Robot) -> float:
-    """How far the plan lifts the hand."""
+    """Height in metres by which the plan lifts the hand."""
     grasp, lifted = (robot.T_base_tcp(path[-1]) for path in (plan.q_approach_rad, plan.q_lift_rad))
     return float(lifted[2, 3] - grasp[2, 3])
 
@@ -85,8 +85,8 @@ def planned_rise_m(plan: MotionPlan, robot: Robot) -> float:
 def pressing_target_m(fingers_m: F64, grip_force_n: float) -> float:
     """Target of both fingers that presses with the grip's force, evenly about the object's middle.
 
-    As in a hand whose fingers are coupled: a push along the closing axis moves one finger back and the
-    other after it. `fingers_m` (2,) is where they are.
+    As in a hand whose fingers are coupled, a push along the closing axis moves one finger back and the
+    other after it. `fingers_m` (2,) are their positions.
     """
     return float(np.mean(fingers_m)) - grip_force_n / FINGER_STIFFNESS
 

@@ -26,23 +26,23 @@ from datagen.workers.trials.trial_scene import (
     still_parts_near,
 )
 
-# At the end of reach and approach no joint may be farther off than this, nor the TCP.
+# Largest errors of a joint and of the TCP at the end of reach and approach.
 _JOINT_OFF_RAD, _TCP_OFF_M = 0.05, 0.015
 # Farther behind its path than this, the arm is pushing against something.
 _BLOCKED_RAD = 0.3
 _EMPTY_OPENING_M = 0.001
 LIFTED_SHARE = 0.8  # of the hand's planned rise, for success
-RISEN_SHARE = 0.5  # of it, to speak of dropping rather than slipping, and to be clear of what stands around
+RISEN_SHARE = 0.5  # of it, for a lost target to count as dropped, not slipped, and to clear its support
 # A finger holds where it pushes with at least this share of the grip's force along the closing axis.
 HOLDS_SHARE = 0.1
 _PLAYED_STEP_RAD = 0.04  # of the joint that moves farthest
-_LOOK_STEPS = 4  # contacts are checked after each of the last steps of a phase
+_LOOK_STEPS = 4  # last steps of a phase, after each of which contacts are checked
 # An object whose energy would carry it this much higher than the hand rises has been thrown by the solver.
 _THROWN_M = 0.15
 _SETTLE_S, _SETTLED_MPS = 0.4, 0.02
-# Held for good: the target moves in the hand by less in each of _STILL_PERIODS control periods of holding.
+# Held for good: the target moves less than this in the hand in each of _STILL_PERIODS control periods.
 _STILL_M, _STILL_RAD, _STILL_PERIODS = 0.0005, 0.01, 2
-_SPEED_WITHOUT_SENSE_MPS, _GONE_M = 20.0, 10.0
+_IMPLAUSIBLE_MPS, _GONE_M = 20.0, 10.0
 _LARGEST_M = 100.0
 
 
@@ -54,15 +54,15 @@ def run_trial(
     record: bool = False,
     whole: bool = False,
 ) -> TrialResult:
-    """Executes a plan in a fresh physics scene.
+    """Execute a plan in a fresh physics scene.
 
-    Free motion is not simulated as contacts are: the reach is played where the arm touches nothing on it, and
-    the solver takes fewer iterations until something is near the arm, and holding ends once the target rests
-    in the hand; `whole` simulates all alike and to its end.
+    Three shortcuts save time: a reach that touches nothing is played back and not simulated, the solver takes
+    fewer iterations until something is near the arm, and holding ends once the target rests in the hand.
+    `whole` simulates everything in full.
 
-    `T_world_base` (4, 4) is where the plan expects the mount; the disturbance says where things truly
-    are. Equal arguments give equal results, bit by bit, whatever ran before. Never raises for what
-    physics does: poses that are not finite end as `unstable`.
+    `T_world_base` (4, 4) is where the plan expects the mount; the disturbance has the true poses. Equal
+    arguments give equal results, bit by bit, whatever ran before. Never raises for the physics: poses that
+    are not finite end as `unstable`.
     """
     poses = (T_world_base, prepared.T_world_object, disturbance.T_target_moved, disturbance.T_base_moved)
     paths = (plan.q_reach_rad, plan.q_approach_rad, plan.q_lift_rad)
@@ -74,10 +74,10 @@ def run_trial(
 
 @dataclass(eq=False)
 class _Trial:
-    """A trial under way. What may end it returns the outcome, or None."""
+    """A running trial. Methods that may end it return the outcome, or None."""
 
     prepared: TrialScene
-    T_world_base: F64  # where the base truly is
+    T_world_base: F64  # true pose of the base
     plan: MotionPlan
     disturbance: Disturbance
     record: bool
@@ -88,8 +88,8 @@ class _Trial:
     start_m: F64 = field(default_factory=lambda: np.zeros((0, 3)))
     start_energy_m: F64 = field(default_factory=lambda: np.zeros(0))
     risen_m: float = 0.0  # highest rise so far of the target where it is grasped
-    gripped: bool = False  # when last looked
-    supported: bool = False  # when last looked: whether anything but the robot pushed the target
+    gripped: bool = False  # at the last check of contacts: whether both fingers hold
+    supported: bool = False  # at the last check of contacts: whether anything but the robot pushed the target
     T_tcp_target: F64 | None = None  # when the hand had closed
     grasped_z_m: float = 0.0  # height of the TCP then
     T_tcp_held: F64 | None = None  # at the end of lifting, then after each control period of holding
@@ -122,8 +122,8 @@ class _Trial:
         self.start_m, self.start_energy_m = self.world.positions_m(), self.world.energies_m()
 
     def run(self) -> str:
-        """All phases; the outcome."""
-        ask_at_end = {
+        """Run all phases and return the outcome."""
+        check_at_end = {
             "reach": self._arrived,
             "approach": self._arrived,
             "close": self._closed,
@@ -146,12 +146,12 @@ class _Trial:
                 return ended
             if tick.phase == "hold" and not self.whole and self._is_held_for_good():
                 return self._held(tick) or "success"
-            if tick.ends_phase and (ended := ask_at_end[tick.phase](tick)):
+            if tick.ends_phase and (ended := check_at_end[tick.phase](tick)):
                 return ended
         return "success"
 
     def _settle(self) -> str | None:
-        """Lets a target that was moved come to rest before the arm starts; the others sleep."""
+        """Let a target that was moved come to rest before the arm starts; the other objects sleep."""
         count = len(self.prepared.mass_kg)
         if np.array_equal(self.disturbance.T_target_moved, np.eye(4)):
             self.world.rest(range(count))
@@ -166,9 +166,9 @@ class _Trial:
         return None
 
     def _played(self, reach: list[ControlPeriod]) -> bool:
-        """Puts the arm along its reach to the end; False where it touches something on the way.
+        """Put the arm along its reach to the end; False where it touches something on the way.
 
-        The drives follow a path through free space without lag, and nothing else moves meanwhile.
+        In free space the drives follow a path without lag, and nothing else moves meanwhile.
         """
         world, opening_m = self.world, self.plan.opening_m
         self.is_free = True
@@ -186,7 +186,7 @@ class _Trial:
         self.commanded = np.concatenate([before, [opening_m / 2] * 2])
         return True
 
-    # -- a tick -------------------------------------------------------------------------------------
+    # -- a control period ---------------------------------------------------------------------------
 
     def _take(self, tick: ControlPeriod) -> str | None:
         finger_m, joints = tick.finger_m, self.world.joints
@@ -201,7 +201,7 @@ class _Trial:
         return "not_reached" if blocked and not grips else None
 
     def _step(self, phase: str, targets: F64, look: bool = False) -> str | None:
-        """One control period. Where `look`, `gripped` says afterwards whether both fingers hold."""
+        """Simulate one control period. With `look`, check contacts and set `gripped` and `supported`."""
         world, steps = self.world, self.steps
         seen = min(_LOOK_STEPS, steps) if look else 0
         taken = 0
@@ -226,7 +226,7 @@ class _Trial:
             return "unstable"
         thrown = (energies_m - self.start_energy_m).max() > self.rise_m + _THROWN_M
         gone = np.abs(positions_m - self.start_m).max() > _GONE_M
-        if thrown or gone or world.speeds_mps().max() > _SPEED_WITHOUT_SENSE_MPS:
+        if thrown or gone or world.speeds_mps().max() > _IMPLAUSIBLE_MPS:
             return "unstable"
         self.risen_m = max(self.risen_m, self._lift_m())
         self._note(phase)
@@ -269,12 +269,12 @@ class _Trial:
         return None if lifted and self._slip_m() <= self.prepared.params.max_slip_m else "slipped"
 
     def _is_held_for_good(self) -> bool:
-        """Whether the target no longer moves in the hand; asked after each control period of holding."""
+        """Whether the target no longer moves in the hand; called after each control period of holding."""
         now = inverse(self._T_world_tcp()) @ self.world.T_world_object[0]
         before, self.T_tcp_held = self.T_tcp_held, now
         assert before is not None  # since the end of lifting
         moved_m = np.linalg.norm(now[:3, 3] - before[:3, 3])
-        # Of a rotation by a small angle, the part off the identity has the norm sqrt(2) of it.
+        # For a rotation R by a small angle, the norm of R - I is sqrt(2) times the angle.
         turned_rad = np.linalg.norm(now[:3, :3] @ before[:3, :3].T - np.eye(3)) / np.sqrt(2)
         is_still = bool(moved_m < _STILL_M and turned_rad < _STILL_RAD)
         self.still_periods = self.still_periods + 1 if is_still else 0
@@ -287,7 +287,7 @@ class _Trial:
 
     @cached_property
     def rise_m(self) -> float:
-        """How far the plan lifts the hand."""
+        """Height in metres by which the plan lifts the hand."""
         return planned_rise_m(self.plan, self.prepared.robot)
 
     def _T_world_tcp(self) -> F64:
@@ -300,19 +300,19 @@ class _Trial:
         return T[:3, :3] @ inverse(self.T_tcp_target)[:3, 3] + T[:3, 3]
 
     def _lift_m(self) -> float:
-        """Rise of the target: of that point from when the hand had closed; before, of its frame."""
+        """Rise of the target, metres: of its grasped point since the hand closed; before, of its frame."""
         if self.T_tcp_target is None:
             return float(self.world.positions_m()[0, 2] - self.start_m[0, 2])
         return float(self._grasped_m()[2] - self.grasped_z_m)
 
     def _slip_m(self) -> float:
-        """How far that point has moved in the hand."""
+        """Distance in metres that the grasped point has moved in the hand."""
         if self.T_tcp_target is None:
             return 0.0
         return float(np.linalg.norm(self._grasped_m() - self._T_world_tcp()[:3, 3]))
 
     def _is_off_its_support(self) -> bool:
-        """Whether nothing but the robot carries the target, or all of it is well above where it was."""
+        """Whether only the robot carries the target, or its lowest point has risen by `RISEN_SHARE`."""
         if not self.supported:
             return True
         corners_m = np.concatenate(self.prepared.parts_m[0]).astype(np.float64)
@@ -326,7 +326,7 @@ class _Trial:
             self.moments.append((time_s, self.world.joints, self.world.T_world_object, phase))
 
     def result(self, outcome: str) -> TrialResult:
-        """The trial's numbers, finite and within what a record takes."""
+        """The trial's numbers, finite and within the ranges of a record."""
         moved_m = np.linalg.norm(self.world.positions_m()[1:] - self.start_m[1:], axis=1)
         lift_m, slip_m, disturbed_m = (
             float(np.clip(np.nan_to_num(value, nan=0.0), -_LARGEST_M, _LARGEST_M))

@@ -1,4 +1,4 @@
-"""A robot as an agent of ManiSkill, whose joints follow their targets as those of a trial do.
+"""A robot as an agent of ManiSkill, whose joints follow their targets as in a trial.
 
 Never imported by a worker: ManiSkill loads torch and every environment it has.
 """
@@ -24,7 +24,7 @@ from datagen.workers.trials.drive_targets import FINGER_DAMPING, FINGER_STIFFNES
 
 
 class _FromLastTarget(PDJointPosController):
-    """Targets go evenly from the last one to the next; ManiSkill's own start from where the joints are."""
+    """Interpolates from the last target to the next; ManiSkill's controller starts from the joints."""
 
     def set_action(self, action: Any) -> None:
         start = torch.as_tensor(self._target_qpos).clone()
@@ -49,9 +49,9 @@ class _FingersConfig(PDJointPosMimicControllerConfig):
 
 @lru_cache(maxsize=64)
 def agent_of(robot: Robot, grip_force_n: float) -> type[BaseAgent]:
-    """A registered ManiSkill agent for a robot, `pd_joint_pos` alone.
+    """A registered ManiSkill agent for a robot, with control mode `pd_joint_pos` alone.
 
-    Actions (A + 1,): targets of the arm's joints in radians and of both fingers in metres, as they are.
+    Actions (A + 1,): targets of the arm's joints in radians and of both fingers in metres, not normalised.
     """
     first, second = robot.finger_joint_names
 

@@ -54,13 +54,13 @@ from datagen.workers.trials.trial_scene import TrialScene, disturbed_things, ped
 
 ENV_ID = "DatagenGrasp-v1"
 _MAX_TICKS = 1000
-_RISING_M = 0.002  # a hand that holds the target has begun to lift it
+_RISING_M = 0.002  # from this rise on, a hand that holds the target lifts it
 _TOUCHES_N = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class GraspTask:
-    """What one environment holds: the arguments of `run_trial`."""
+    """The task of one environment: the arguments of `run_trial`."""
 
     prepared: TrialScene
     T_world_base: F64  # (4, 4), where the plan expects the mount
@@ -94,8 +94,8 @@ class DatagenGraspEnv(BaseEnv):
     """One grasp task in each of `len(tasks)` environments, all with the same robot and parameters.
 
     On `physx_cuda` all environments step together; on `physx_cpu` there is one. Every reset builds new
-    physics scenes, as a trial does; `reconfiguration_freq=0` reuses them, at the price that outcomes
-    then depend on what came before.
+    physics scenes, as a trial does; `reconfiguration_freq=0` reuses them, but outcomes then depend on
+    earlier episodes.
     """
 
     SUPPORTED_OBS_MODES = ("state", "state_dict", "none")
@@ -141,10 +141,10 @@ class DatagenGraspEnv(BaseEnv):
         return []
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
-        """None: nothing here is drawn."""
+        """No lights: nothing here is rendered."""
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        tree = read_urdf(self.robot.urdf)  # asked for first: the agent loads the same files
+        tree = read_urdf(self.robot.urdf)  # first: `urdf` writes the files that the agent loads
         super()._load_agent(options, self._root_poses(), build_separate=True)
         above = {joint.child: joint for joint in tree.joints.values()}
         shoulder, fingers = self.robot.joint_names[0], self.robot.finger_joint_names
@@ -231,7 +231,7 @@ class DatagenGraspEnv(BaseEnv):
         self.start_low_m = self._lowest_m()
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Success as `run_trial` has it: off its support, between both fingers, hardly moved in the hand.
+        """Success as in `run_trial`: the target is off its support, between both fingers, with little slip.
 
         Rise and slip are those of the point that was between the pads when the hand began to rise. After the
         last action of the plan it is the trial's outcome. Shapes (N,).
@@ -285,7 +285,7 @@ class DatagenGraspEnv(BaseEnv):
         return max(len(script) for script in self.scripts)
 
     def plan_action(self) -> torch.Tensor:
-        """The plans' actions (N, A + 1) of the coming step; the last one again where a plan is done."""
+        """The plans' actions (N, A + 1) of the next step; the last one again where a plan is done."""
         step = int(self._elapsed_steps.max())
         fingers_m = self.agent.robot.get_qpos()[:, self.finger_columns].cpu().numpy().astype(np.float64)
         rows: list[F64] = []
@@ -299,7 +299,7 @@ class DatagenGraspEnv(BaseEnv):
 
 
 def execute_plans(env: DatagenGraspEnv) -> torch.Tensor:
-    """Resets, takes every plan's actions to its end; whether each (N,) succeeded then."""
+    """Reset, execute every plan to its end, and return whether each (N,) succeeded then."""
     env.reset()
     success = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     ends = torch.tensor([len(script) for script in env.scripts], device=env.device)

@@ -28,24 +28,25 @@ with warnings.catch_warnings():
     import sapien
     from sapien import physx
 
-# Collision groups [kinds it is, kinds it meets, -, -]: two shapes meet where one meets what the other is.
-# Things meet all. The arm meets things and what stands still, never itself: the planner has seen to that.
-# What carries the arm meets things alone; the shoulder, which turns on the pedestal, not the pedestal.
+# Collision groups [own kinds, kinds to collide with, -, -]: shapes collide where one lists the other's kind.
+# Objects collide with everything. The arm collides with objects and static parts, never with itself: the
+# planner checks that. Links below the arm collide with objects alone. The shoulder turns on the pedestal and
+# does not collide with it.
 THING, STILL, PEDESTAL = [1, 1, 0, 0], [4, 1 | 2 | 16, 0, 0], [4, 1 | 2, 0, 0]
 ARM, SHOULDER, CARRIER = [2, 1, 0, 0], [16, 1, 0, 0], [8, 1, 0, 0]
 
 # With 15 and 1, the defaults of ManiSkill, more labels depend on the timestep.
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 40, 8
-# Of the arm while nothing is within `NEAR_M` of it: its drives alone need no more.
+# Iterations of the arm while nothing is within `NEAR_M` of it: its drives alone need no more.
 FREE_ITERATIONS, NEAR_M = (4, 1), 0.003
-# PhysX's own default is 1 cm. Contacts farther apart than this are not looked for.
+# Contacts are generated up to this distance. PhysX's default is 1 cm.
 CONTACT_OFFSET_M = 0.005
 SLEEP_THRESHOLD = 0.005  # PhysX's, joules a kilogram
 GRAVITY_MPS2 = 9.81  # PhysX's
 
 
 def still_body(parts_m: Sequence[F32], groups: list[int], friction: float) -> physx.PhysxRigidStaticComponent:
-    """What does not move, of convex parts (V, 3) each in the world frame."""
+    """A static body of convex parts (V, 3) each in the world frame."""
     body = static_body(parts_m, physx.PhysxMaterial(friction, friction, 0.0))
     for shape in body.get_collision_shapes():
         tune_shape(shape, groups)
@@ -62,16 +63,16 @@ def thing_body(parts_m: Sequence[F32], mass_kg: float, friction: float) -> physx
 
 
 def tune_shape(shape: physx.PhysxCollisionShape, groups: list[int]) -> None:
-    """What a shape meets, and from where on contacts are looked for."""
+    """Set the collision groups and contact offset of a shape."""
     shape.set_collision_groups(groups)
     shape.set_contact_offset(CONTACT_OFFSET_M)
     shape.set_rest_offset(0.0)
 
 
 def tune_pad(shape: physx.PhysxCollisionShape, friction: float, finger_friction: float, pad_m: float) -> None:
-    """Makes rubber of a finger's shape; the pad is `pad_m` across.
+    """Give a finger's shape the material of its pad, which is `pad_m` across.
 
-    A soft pad also resists turning about its normal, as points do not.
+    A soft pad, unlike points, also resists turning about its normal.
     """
     shape.set_physical_material(pad_material(friction, finger_friction))
     shape.set_patch_radius(pad_m / 2)
@@ -79,17 +80,17 @@ def tune_pad(shape: physx.PhysxCollisionShape, friction: float, finger_friction:
 
 
 def tune_body(body: physx.PhysxRigidDynamicComponent | physx.PhysxArticulation) -> None:
-    """Solver iterations and when it sleeps."""
+    """Set solver iterations and sleep threshold of a body."""
     body.set_solver_position_iterations(POSITION_ITERATIONS)
     body.set_solver_velocity_iterations(VELOCITY_ITERATIONS)
     body.set_sleep_threshold(SLEEP_THRESHOLD)
 
 
 class TrialWorld:
-    """Robot, things and what stands still, with the steps and looks that a trial takes.
+    """Robot, movable objects and static parts, with the steps and measurements that a trial needs.
 
-    Nothing is shared with any other world: a physics scene that is used again makes outcomes depend
-    on what happened in it before.
+    Worlds share nothing: in a physics scene that is used again, outcomes depend on what happened in it
+    before.
     """
 
     def __init__(
@@ -135,10 +136,10 @@ class TrialWorld:
             entity.set_pose(sapien_pose(T_world_body))
         self._scene.add_entity(entity)
 
-    # -- what moves ---------------------------------------------------------------------------------
+    # -- motion -------------------------------------------------------------------------------------
 
     def place_arm(self, q_rad: F64, opening_m: float) -> None:
-        """Puts the arm at joints (A,) at rest, and its drives' targets there."""
+        """Put the arm at joints (A,) at rest, and its drives' targets there."""
         q = np.concatenate([q_rad, [opening_m / 2] * 2])
         ordered = np.empty(len(q), np.float32)
         ordered[self._columns] = q
@@ -147,7 +148,7 @@ class TrialWorld:
         self._drive(q.tolist())
 
     def drive(self, steps: int, start: F64, end: F64, first: int = 0) -> None:
-        """Takes steps `first` to `steps` while the targets (A + 2,) go evenly from `start` to `end`."""
+        """Simulate steps `first` to `steps` while the targets (A + 2,) move evenly from `start` to `end`."""
         if np.array_equal(start, end):
             self._drive(end.tolist())
             for _ in range(first, steps):
@@ -159,7 +160,7 @@ class TrialWorld:
             self._system.step()
 
     def drive_free(self, steps: int, start: F64, end: F64) -> int:
-        """As `drive`, with fewer iterations and until something is near the arm: the steps taken."""
+        """As `drive`, but only until something is near the arm; returns the number of steps taken."""
         shares = (np.arange(1, steps + 1) / steps)[:, None]
         for k, targets in enumerate((start + (end - start) * shares).tolist(), start=1):
             self._drive(targets)
@@ -169,19 +170,19 @@ class TrialWorld:
         return steps
 
     def be_free(self, is_free: bool) -> None:
-        """Whether the arm moves with the few iterations of free motion."""
+        """Set whether the arm moves with the few iterations of free motion."""
         iterations = FREE_ITERATIONS if is_free else (POSITION_ITERATIONS, VELOCITY_ITERATIONS)
         self._arm.set_solver_position_iterations(iterations[0])
         self._arm.set_solver_velocity_iterations(iterations[1])
 
     def look_at(self, q_rad: F64, opening_m: float) -> float:
-        """`gap_m` with the arm put at joints (A,); what is asleep stays so unless the arm touches it."""
+        """`gap_m` with the arm put at joints (A,); only objects that the arm touches wake up."""
         self.place_arm(q_rad, opening_m)
         self._system.step()
         return self.gap_m()
 
     def rest(self, rows: Sequence[int]) -> None:
-        """Puts objects to sleep until something touches them."""
+        """Put objects to sleep until something touches them."""
         for k in rows:
             self._things[k].put_to_sleep()
 
@@ -189,29 +190,29 @@ class TrialWorld:
         for joint, target in zip(self._joints, targets, strict=True):
             joint.set_drive_target(target)
 
-    # -- what is seen -------------------------------------------------------------------------------
+    # -- measurements -------------------------------------------------------------------------------
 
     @property
     def joints(self) -> F64:
-        """(A + 2,): the arm's joints, then the two fingers' in metres."""
+        """Joints (A + 2,): the arm's, then the two fingers' in metres."""
         return np.asarray(self._arm.get_qpos(), np.float64)[self._columns]
 
     @property
     def T_world_object(self) -> F64:
-        """(K, 4, 4)."""
+        """Poses (K, 4, 4) of the objects."""
         return np.stack([pose_of(body) for body in self._things])
 
     def positions_m(self) -> F64:
-        """(K, 3) of the objects' frames."""
+        """Positions (K, 3) of the objects' frames."""
         return np.array([body.entity_pose.p for body in self._things], np.float64)
 
     def speeds_mps(self) -> F64:
-        """(K,) of the objects."""
+        """Speeds (K,) of the objects."""
         velocities = np.array([body.linear_velocity for body in self._things], np.float64)
         return np.linalg.norm(velocities, axis=1)
 
     def energies_m(self) -> F64:
-        """(K,) of the objects: potential and kinetic energy, as the height that its centre would reach."""
+        """Potential and kinetic energies (K,) of the objects, as the height that each centre would reach."""
         found: list[float] = []
         for body, centre in zip(self._things, self._centres, strict=True):
             velocity = body.linear_velocity
@@ -240,7 +241,7 @@ class TrialWorld:
         return False
 
     def finger_impulses(self) -> F64:
-        """(2, 3): what each finger gave the target in the last step, in newton seconds, world frame."""
+        """Impulses (2, 3) of the fingers on the target in the last step, newton seconds, world frame."""
         impulses = np.zeros((2, 3))
         target = self._things[0]
         for contact in self._system.get_contacts():
@@ -255,7 +256,7 @@ class TrialWorld:
 
 
 def _fresh_system() -> physx.PhysxCpuSystem:
-    """A system with settings of its own: SAPIEN keeps them for the process, where others may change them."""
+    """A system with default settings: SAPIEN keeps them per process, where other code may change them."""
     before = physx.get_scene_config()
     physx.set_scene_config(physx.PhysxSceneConfig())  # PhysX's: TGS, PCM, 9.81 m/s^2 down, one thread
     try:
@@ -281,7 +282,7 @@ def _robot_links(
         link.set_mass(body.mass_kg)
         link.set_cmass_local_pose(sapien_pose(body.T_body_principal))
         link.set_inertia(body.inertia_kgm2.tolist())
-        # As ManiSkill's agents: a real arm's controller carries its own weight.
+        # As in ManiSkill's agents: a real arm's controller compensates its weight.
         link.set_disable_gravity(True)
         joint = link.joint
         if body.parent < 0:

@@ -6,7 +6,7 @@ import numpy as np
 
 from datagen.workers.geometry.mesh import F64
 
-# From rest to that speed. A joint's speed may jump by what it gains in a control period.
+# Time from rest to full speed. A joint's speed may jump by its gain in a control period.
 SPEED_UP_S = 0.25
 _GRID_RAD = 0.02  # spacing of the points at which speeds are decided
 _SAME_RAD = 1e-9
@@ -71,7 +71,7 @@ def time_parameterized(path_rad: F64, speed_radps: F64, period_s: float, at_leas
 def lag_compensated(joints_rad: F64, period_s: float, lag_s: float) -> F64:
     """Targets (N, A) for spring-damper drives, which follow a moving target late by damping / stiffness.
 
-    Each target is ahead by as much, so that the joints are where `joints_rad` (N, A) wants them.
+    Each target is ahead by this lag, so that the joints follow `joints_rad` (N, A).
     """
     speed = np.zeros_like(joints_rad)
     speed[1:-1] = (joints_rad[2:] - joints_rad[:-2]) / (2 * period_s)

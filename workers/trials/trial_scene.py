@@ -15,11 +15,11 @@ from datagen.workers.scenes.scene import SettledScene
 from datagen.workers.trials.articulation import Articulation, articulation_of
 from datagen.workers.trials.trial import Disturbance
 
-# What stands still takes part where the arm, or a thing that it knocks over, can come: metres.
+# Static parts up to this far beyond the arm's reach take part: knocked over objects can hit them.
 _BEYOND_REACH_M = 0.4
 _PEDESTAL_SIDES = 16
 _PEDESTAL_GAP_M = 0.005  # below the mount, so that the arm's own foot does not touch it
-_MOVED_ABOVE_M = 0.0005  # a moved target starts so far above where it would stand
+_MOVED_ABOVE_M = 0.0005  # a moved target starts this far above its support
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def prepare_trials(
 
 
 def still_parts_near(prepared: TrialScene, T_world_base: F64) -> list[F32]:
-    """Parts of the surroundings beside, above and below where the arm can come; things fall on floors."""
+    """Static parts (V, 3) near the arm: at its sides, above it and below it, since objects fall on floors."""
     reach_m = prepared.robot.reach_m + _BEYOND_REACH_M
     x, y, z = T_world_base[:3, 3]
     apart = np.maximum(0.0, np.maximum(prepared.still_low_m - [x, y, z], [x, y, z] - prepared.still_high_m))
@@ -82,7 +82,7 @@ def still_parts_near(prepared: TrialScene, T_world_base: F64) -> list[F32]:
 
 
 def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
-    """Corners (V, 3) of the column below the mount; None for robots that bring their own base."""
+    """Corners (V, 3) of the pedestal below the mount; None for robots with their own base."""
     if prepared.robot.base_radius_m is not None:
         return None
     x, y, z = T_world_base[:3, 3]
@@ -95,7 +95,7 @@ def pedestal_below(prepared: TrialScene, T_world_base: F64) -> F32 | None:
 
 
 def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> MovableObjects:
-    """The objects as they truly are."""
+    """The movable objects with the disturbance applied."""
     mass_kg, T_world_object = prepared.mass_kg.copy(), prepared.T_world_object.copy()
     mass_kg[0] *= disturbance.mass_scale
     T_world_object[0] = _moved_target(prepared, disturbance.T_target_moved)
@@ -103,7 +103,7 @@ def disturbed_things(prepared: TrialScene, disturbance: Disturbance) -> MovableO
 
 
 def _moved_target(prepared: TrialScene, T_target_moved: F64) -> F64:
-    """The target's true pose (4, 4), raised where its lowest point would be below where it was."""
+    """The target's true pose (4, 4), raised where its lowest point would be below the planned one."""
     T_planned = prepared.T_world_object[0]
     T = T_planned @ T_target_moved
     if np.array_equal(T_target_moved, np.eye(4)):

@@ -48,7 +48,7 @@ def test_the_hand_is_taken_off_the_arm(robot: Robot) -> None:
     moving = moving_of(robot)
     parts = sum(len(p) for p in robot.link_parts_m)
     hand = len(robot.gripper.parts_at(robot.gripper.max_opening_m))
-    assert len(moving.standing) + len(moving.arm) + len(moving.hand.hulls) == parts
+    assert len(moving.fixed) + len(moving.arm) + len(moving.hand.hulls) == parts
     assert len(moving.hand.hulls) == hand
 
 
