@@ -1,4 +1,4 @@
-"""Arrival error: where a robot stands when it was sent to a base pose, and what that leaves of a score map.
+"""Arrival error: how far a robot stops from its goal base pose, and the success expected with it.
 
 Source of the preset `nav2`: SimpleGoalChecker of Nav2 ends a drive within xy_goal_tolerance 0.25 m and
 yaw_goal_tolerance 0.25 rad by default
@@ -24,7 +24,7 @@ from datagen.train.inputs import F64, Bools
 _RINGS, _ANGLES = 8, 16
 _LARGEST_M = 2.0
 _MOST_BYTES, _LEAST_ROWS, _MOST_ROWS = 10_000_000, 10, 100_000
-_USED_ROWS = 1000  # of a file of samples, evenly
+_USED_ROWS = 1000  # evenly spaced rows of a file of samples
 _FIX = (
     "Give normal:0.05 (m), normal:0.05,3deg, disc:0.25, nav2 or a CSV file with columns x_m, y_m[, yaw_rad]"
 )
@@ -37,7 +37,7 @@ class Arrival:
 
     text: str
     offsets: F64  # (K, 3)
-    is_round: bool  # alike in all directions, so that the goal's heading does not matter
+    is_round: bool  # the same in all directions, so the goal's heading does not matter
 
     @property
     def yaw_std_rad(self) -> float:
@@ -50,9 +50,9 @@ class Arrival:
         return float(np.sqrt(np.mean((self.offsets[:, :2] ** 2).sum(axis=1))))
 
     def drawn(self, n: int, rng: np.random.Generator) -> F64:
-        """`n` of the errors (n, 3), spread evenly over them from a random start: few are not all alike.
+        """`n` of the errors (n, 3), evenly spaced from a random start, so that a few still differ.
 
-        Generators of one state draw like directions from rings of any size.
+        Generators in the same state draw the same directions from rings of any size.
         """
         share = (rng.random() + np.arange(n)) / n % 1.0
         return self.offsets[np.floor(share * len(self.offsets)).astype(np.int64)]
@@ -114,10 +114,10 @@ def _read_samples(path: Path) -> Arrival:
         raise InputError("--arrival", str(path)[:60], "is neither a distribution nor a file", _FIX)
     text = read_regular(path, _MOST_BYTES, _FIX).decode("utf-8", errors="replace")
     lines = list(csv.reader(line for line in text.splitlines() if line.strip() and not line.startswith("#")))
-    heads = [head.strip() for head in lines[0]] if lines else []
+    names = [name.strip() for name in lines[0]] if lines else []
     fix = "Give a header x_m,y_m,yaw_rad and one arrival a line: ahead of and left of the goal, and its turn"
-    if heads not in (["x_m", "y_m"], ["x_m", "y_m", "yaw_rad"]):
-        raise InputError(path, "header", f"is {','.join(heads)[:60]!r}", fix)
+    if names not in (["x_m", "y_m"], ["x_m", "y_m", "yaw_rad"]):
+        raise InputError(path, "header", f"is {','.join(names)[:60]!r}", fix)
     if not _LEAST_ROWS <= len(lines) - 1 <= _MOST_ROWS:
         problem = f"are {len(lines) - 1}, not {_LEAST_ROWS} to {_MOST_ROWS:,}"
         raise InputError(path, "arrivals", problem, "Record more arrivals, or cut the file")
@@ -127,9 +127,9 @@ def _read_samples(path: Path) -> Arrival:
             row = [float(cell) for cell in line]
         except ValueError:
             row = []
-        sound = len(row) == len(heads) and all(math.isfinite(value) for value in row)
+        sound = len(row) == len(names) and all(math.isfinite(value) for value in row)
         if not sound or math.hypot(*row[:2]) > _LARGEST_M or abs(row[-1]) > math.pi:
-            problem = f"is not {len(heads)} numbers within {_LARGEST_M:g} m and half a turn"
+            problem = f"is not {len(names)} numbers within {_LARGEST_M:g} m and half a turn"
             raise InputError(path, f"row {k}", problem, fix)
         rows.append([*row, 0.0][:3])
     samples = np.array(rows)[np.linspace(0, len(rows) - 1, min(len(rows), _USED_ROWS)).astype(np.int64)]
@@ -141,7 +141,7 @@ def _shares() -> F64:
 
 
 def _yaw_shares() -> F64:
-    # In an order that has nothing to do with the directions.
+    # In an order that is independent of the directions.
     return (np.arange(_ANGLES) * 7 % _ANGLES + 0.5) / _ANGLES
 
 
@@ -154,10 +154,10 @@ def _round(rings_m: F64, yaws_rad: F64) -> F64:
 
 
 def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
-    """Mean of a map (Y, X) over where a robot arrives that is sent to each of its cells.
+    """Mean (Y, X) of a map (Y, X) over the arrivals of a robot that is sent to each of its cells.
 
-    Rows of the map go along y and columns along x, `step_m` apart, with the target in the middle, which the
-    goals face. Between cells the map is bilinear; beyond it nothing succeeds.
+    Rows go along y and columns along x, `step_m` apart. Goals face the target in the middle. Between cells
+    the map is bilinear, outside it 0.
     """
     dx, dy = arrival.offsets[:, 0] / step_m, arrival.offsets[:, 1] / step_m
     if arrival.is_round:
@@ -180,9 +180,9 @@ def expected_success(value: F64, step_m: float, arrival: Arrival) -> F64:
 
 
 def tolerance_m(value: F64, step_m: float, cell: tuple[int, int], least: float) -> float:
-    """How far a robot may miss a cell (row, column) in any direction with the map (Y, X) at `least` or above.
+    """Distance by which a robot may miss a cell (row, column) with the map (Y, X) at `least` or above.
 
-    Between cells the map is bilinear; in steps of 1 cm, at most 0.5 m.
+    In any direction, in steps of 1 cm, at most 0.5 m. Between cells the map is bilinear.
     """
     far_m = np.arange(0.0, _TOLERANCE_MOST_M + 1e-9, _TOLERANCE_STEP_M)
     angle = np.linspace(0, 2 * np.pi, 4 * _ANGLES, endpoint=False)
@@ -194,5 +194,5 @@ def tolerance_m(value: F64, step_m: float, cell: tuple[int, int], least: float) 
 
 
 def stands(value: F64, can_stand: Bools) -> F64:
-    """The map with 0 where the base does not or may not fit: an arrival there fails."""
+    """The map with 0 where the base cannot stand: an arrival there fails."""
     return np.where(can_stand, value, 0.0)

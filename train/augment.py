@@ -145,7 +145,7 @@ class Augmentation:
         return ("T_world_camera",) if self.noise or self.holes else ()
 
     def apply(self, view: View, seed: Sequence[int]) -> View:
-        """Return the view after all effects; the given one is unchanged. `seed`: of scene and epoch."""
+        """Return the view after all effects; the given one is unchanged. `seed` is of scene and epoch."""
         if not view.n_points:
             return view
         effects = (self.noise, self.holes, self.dropout, self.colour, self.rotation)

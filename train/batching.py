@@ -65,7 +65,7 @@ def stored_scenes(
     bounds: I64,
     rows: I64,
 ) -> list[StoredScene]:
-    """The wanted scenes of a shard. InputError where samples of one robot have different robot values."""
+    """The scenes of a shard at `rows`. InputError where samples of one robot have different robot values."""
     robots = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds)), columns["robot_index"]
     order = np.lexsort(robots[::-1])
     same = (np.diff(robots[0][order]) == 0) & (np.diff(robots[1][order]) == 0)
@@ -78,17 +78,17 @@ def stored_scenes(
         raise InputError(place, "n_points", problem, "Repair the run with `datagen repair`")
     scene_columns = {name: columns[name] for name, dim in dims.items() if dim == "scene"}
     sample_columns = {name: columns[name] for name, dim in dims.items() if dim == "sample"}
-    if 2 * len(rows) < len(bounds) - 1:  # few are wanted: copy them, to free the shard's arrays
+    if 2 * len(rows) < len(bounds) - 1:  # few are used: copy them, to free the shard's arrays
         scene_columns = {name: a[rows] for name, a in scene_columns.items()}
-        places = range(len(rows))
+        indices = range(len(rows))
     else:
-        places = rows.tolist()
+        indices = rows.tolist()
     return [
         StoredScene(
-            {name: a[place] for name, a in scene_columns.items()},
+            {name: a[index] for name, a in scene_columns.items()},
             {name: a[bounds[row] : bounds[row + 1]] for name, a in sample_columns.items()},
         )
-        for place, row in zip(places, rows.tolist(), strict=True)
+        for index, row in zip(indices, rows.tolist(), strict=True)
     ]
 
 

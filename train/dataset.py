@@ -64,16 +64,16 @@ def plan_epoch(
 ) -> EpochPlan:
     """The order of one rank's scenes, given each scene's shard (S,), ascending.
 
-    With `rng`, shards are permuted; each rank takes its equal stretch of them, so that it reads little
-    else (a shard on a border is read by two); scenes are shuffled within every `buffer_shards` shards of
-    the stretch. Without, scenes keep their stored order. Batches differ by one scene at most.
+    With `rng`, shards are permuted, and each rank gets an equal, contiguous part of the scenes (two ranks
+    read a shard on a border). Scenes are shuffled within every `buffer_shards` shards of the part. Without
+    `rng`, scenes keep their stored order. Batches differ by one scene at most.
     """
     n, batches = len(shard), batches_of(len(shard), scenes_per_batch, world)
     if rng is None:
         order, luck = np.arange(n), None
     else:
-        kept, place = np.unique(shard, return_inverse=True)
-        order = np.argsort(rng.permutation(len(kept))[place], kind="stable")
+        kept, index = np.unique(shard, return_inverse=True)
+        order = np.argsort(rng.permutation(len(kept))[index], kind="stable")
         luck = rng.random(n)
     first, past = rank * n // world, (rank + 1) * n // world
     order = order[first:past]
@@ -105,19 +105,19 @@ class SampleStream:
     """Epochs of batches from one or many runs, merged or not, sealed or not, local or on S3.
 
     A batch holds `scenes_per_batch` whole scenes (a few less where they do not divide evenly) with all
-    their robots and candidates, or with a random `candidates_per_robot` of each robot. `houses` says
-    which houses count, by house_id. `extra` names further columns of the store. Of `world` ranks each
-    gives batches of its own, equally many, that together are the epoch. With `shuffle`, scenes are
-    shuffled within `buffer_shards` shards; without, they keep their stored order. Two such buffers are
-    in memory at most. Runs that lack planned samples are read with `allow_incomplete` alone.
-    docs/guides/read-data.md says what stays the same when what changes.
+    their robots, and all candidates or `candidates_per_robot` random ones of each robot. `houses` selects
+    houses by house_id. `extra` names further columns of the store. Each of `world` ranks gives the same
+    number of batches; together they are the epoch. With `shuffle`, scenes are shuffled within
+    `buffer_shards` shards; without, they keep their stored order. At most two such buffers are in memory.
+    Runs that lack planned samples need `allow_incomplete`. docs/guides/read-data.md describes what the
+    order of scenes depends on.
 
-    InputError names what is missing, foreign or damaged, in the constructor or while reading.
+    InputError names the missing, foreign or damaged data, in the constructor or while reading.
     """
 
     def __init__(
         self,
-        places: Sequence[str | Path],
+        paths: Sequence[str | Path],
         *,
         scenes_per_batch: int = 16,
         candidates_per_robot: int | None = None,
@@ -144,7 +144,7 @@ class SampleStream:
 
         needs = augment.fields if augment else ()
         names = list(dict.fromkeys([*_CORE, *extra, *needs]))
-        parts = open_parts(places, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete)
+        parts = open_parts(paths, list(dict.fromkeys([*names, *TABLE_FIELDS])), allow_incomplete)
         self._extra = tuple(dict.fromkeys(extra))
         self._shards = [(s, {n: p.arrays[n] for n in names}) for p in parts for s in p.shards]
         self._dims = {name: parts[0].arrays[name].dims[0] for name in names}
@@ -212,11 +212,11 @@ class SampleStream:
         ]
 
     def epoch(self, k: int, skip_batches: int = 0, every: int = 1) -> Generator[Batch[Array]]:
-        """Batches of epoch k from batch `skip_batches` on, as they would have come without skipping.
+        """Batches of epoch k from batch `skip_batches` on, the same as without skipping.
 
-        Of these each `every`-th, for processes that share an epoch. The next shards are read in a thread
-        while a batch is used. Close the iterator, or use it up, to end the thread; what is skipped is not
-        read where whole shards are.
+        `every` selects each `every`-th of them, for processes that share an epoch. A thread reads the next
+        shards while a batch is used. Close or exhaust the iterator to end the thread. Shards that are
+        skipped as a whole are not read.
         """
         _refuse_below("epoch", k, 0)
         _refuse_below("skip_batches", skip_batches, 0)
@@ -243,7 +243,7 @@ class SampleStream:
                 loaded.close()
 
     def _reads(self, plan: EpochPlan, batches: range) -> list[tuple[int, I64]]:
-        """(shard, its scenes that are wanted) of these batches, buffer by buffer."""
+        """(shard, its scenes in these batches), buffer by buffer."""
         wanted = np.repeat(np.isin(np.arange(len(plan.cuts) - 1), batches), np.diff(plan.cuts))
         scenes, buffer = plan.order[wanted], plan.buffer[wanted]
         by_shard = np.lexsort([scenes, self._scenes.shard[scenes], buffer])

@@ -3,7 +3,7 @@
 With H = alpha vis(rho) + (1 - alpha) dist(d), a candidate is good where its distance is at most k(rho) sigmas
 from mu (`reach_in_sigmas`). Given mu, tau and alpha, a candidate nearer than mu thus depends on sigma_l alone
 and a farther one on sigma_r alone, and each sigma is the best cut of one sorted list: exact, and linear in
-the labels. What is left to search are mu and tau, and alpha where it is asked for.
+the labels. The search is over mu and tau, and over alpha if requested.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ DECIMALS = 4
 # The initial grid of the search, the number of best points to refine, and of rounds.
 _MUS = 49
 _ALPHAS = np.linspace(0.0, 0.9, 10)
-# k at rho = 1, in place of tau: from 0.1, where nothing less visible is good, to where dist hardly counts.
+# k at rho = 1, in place of tau: from 0.1, where no less visible target is good, to 3.5, where dist hardly
+# counts.
 _SIGMAS_IN_SIGHT = np.linspace(0.1, 3.5, 49)
 _BEAM, _ROUNDS = 16, 7
-# Below the first a sigma is a step at mu; beyond the second the specification ends.
+# Below the first a sigma is a step at mu; the second is the largest that the specification allows.
 _SIGMA_LOW, _SIGMA_HIGH = 0.01, 10.0
 
 
@@ -68,7 +69,7 @@ class Trials:
         cut = {f.name: getattr(self, f.name)[rows] for f in fields(self)[2:]}
         return Trials(scene, self.house[scenes], **cut)
 
-    def said(self, params: HeuristicParams) -> Bools:
+    def labels_by(self, params: HeuristicParams) -> Bools:
         """The rule's labels (N,), by the code of the label source."""
         inputs = (self.distance_m, self.mount_distance_m, self.arm_reach_m, self.visibility)
         return heuristic(*inputs, params)[1] == 1
@@ -95,19 +96,19 @@ def fit(
 ) -> HeuristicParams:
     """The parameters mu, sigma_l, sigma_r, tau (and alpha) that agree best with the labels; others stay.
 
-    The first of the forms wins where several agree as well. tau stays above alpha vis(1), so that a
+    The first of equally good forms wins. tau stays above alpha vis(1), so that a
     distance outside [d_min, d_max] is never good. Deterministic, and independent of the order of rows.
     """
     gains = _gains(trials.label, objective)
     found = [_fit_form(trials, gains, begin_from(before, form), fit_alpha) for form in forms]
-    return max(found, key=lambda params: int(gains[trials.said(params)].sum()))
+    return max(found, key=lambda params: int(gains[trials.labels_by(params)].sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
     """Labels (N,) by rules fitted on other houses, and the rule of each fold."""
 
-    said: Bools
+    labels: Bools
     params: tuple[HeuristicParams, ...]
 
 
@@ -122,7 +123,7 @@ def fit_leaving_houses_out(
     folds = min(FOLDS, len(houses))
     dealt = np.random.default_rng([seed, 0]).permutation(len(houses)) % folds
     fold = dealt[house][trials.scene]
-    said = np.zeros(len(trials), np.bool_)
+    labels = np.zeros(len(trials), np.bool_)
     params: list[HeuristicParams] = []
     for k in range(folds):
         inside = fold != k
@@ -130,9 +131,9 @@ def fit_leaving_houses_out(
             problem = f"those of label {int(not trials.label[inside].any())} are in too few houses"
             raise InputError("labels", "house_id", problem, "Name runs of more houses")
         params.append(refit(trials.at(inside)))
-        said[~inside] = trials.at(~inside).said(params[-1])
+        labels[~inside] = trials.at(~inside).labels_by(params[-1])
         step()
-    return LeftOut(said, tuple(params))
+    return LeftOut(labels, tuple(params))
 
 
 def refuse_too_little(trials: Trials, place: str) -> None:
@@ -160,14 +161,15 @@ class Agreement:
     balanced_accuracy: Estimate
 
 
-def agreements(trials: Trials, said: Sequence[Bools], resamples: int, seed: int) -> list[Agreement]:
-    """One for each rule's labels (N,), all over the same resampled scenes."""
+def agreements(trials: Trials, labels: Sequence[Bools], resamples: int, seed: int) -> list[Agreement]:
+    """Agreement of each rule's labels (N,) with the trials, all over the same resampled scenes."""
     weights = resample_weights(trials.n_scenes, resamples, np.random.default_rng([seed, 1]))
     found: list[Agreement] = []
-    for labels in said:
-        by_scene = confusion(labels.astype(np.float64), trials.label, trials.scene, trials.n_scenes)
+    for of_rule in labels:
+        by_scene = confusion(of_rule.astype(np.float64), trials.label, trials.scene, trials.n_scenes)
         counts, resampled = by_scene.sum(axis=0), summed(weights, by_scene)
-        estimates = (Estimate(float(of(counts)), of(resampled)) for of in (accuracy, balanced_accuracy))
+        metrics = (accuracy, balanced_accuracy)
+        estimates = (Estimate(float(metric(counts)), metric(resampled)) for metric in metrics)
         found.append(Agreement(counts, *estimates))
     return found
 
@@ -183,7 +185,7 @@ def reach_in_sigmas(visible: F64, params: HeuristicParams) -> F64:
 
 
 def _gains(label: Bools, objective: Objective) -> I64:
-    """What calling each candidate (N,) good adds to the objective, in whole units: any order, one sum."""
+    """Gains (N,) of the objective by label 1 for each candidate, in whole units, so that sums are exact."""
     positives = int(label.sum())
     for_good, for_bad = (len(label) - positives, -positives) if objective == "balanced" else (1, -1)
     return np.where(label, for_good, for_bad).astype(np.int64)
@@ -228,12 +230,12 @@ def _with_best_sigmas(
 
 
 def _best_cut(needed: F64, gains: I64, otherwise: float) -> tuple[int, float]:
-    """The best gain of positives that need at most sigma (M,), and sigma; `otherwise` for no rows."""
+    """The best gain with label 1 where `needed` (M,) is at most sigma, and sigma; `otherwise` for no rows."""
     if not len(needed):
         return 0, otherwise
     order = np.argsort(needed)
     needed, total = needed[order], np.cumsum(gains[order])
-    # A cut lies between the last that is called good and the next; the first cut calls none good.
+    # A cut lies between the last row with label 1 and the next; at the first cut no row has label 1.
     below, above = np.concatenate([[0.0], needed]), np.concatenate([needed, needed[-1:] * 1.05])
     total = np.concatenate([[0], total])
     cuts = np.flatnonzero((below < above) & (below < _SIGMA_HIGH) & (above > _SIGMA_LOW))

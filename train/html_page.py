@@ -44,7 +44,7 @@ code { font-size: 88%; overflow-wrap: anywhere; }
 def html_page(title: str, body: Iterable[str], style: str = "", script: str | None = None) -> str:
     """The whole page; `body` is HTML, `style` is added to the page's.
 
-    With a `script`, the browser is told to run nothing but it, and to fetch nothing.
+    With a `script`, a content security policy lets the browser run only it and fetch nothing.
     """
     policy, end = "", ""
     if script is not None:
@@ -64,13 +64,13 @@ def html_page(title: str, body: Iterable[str], style: str = "", script: str | No
 
 
 def escape(text: str) -> str:
-    """The text as HTML that shows it, with nothing in it that a browser acts on."""
+    """The text escaped for HTML, without markup or control characters."""
     return html_escape(printable(text))
 
 
-def html_table(heads: Sequence[str], lines: Iterable[Sequence[str]], kind: str = "") -> str:
+def html_table(headings: Sequence[str], lines: Iterable[Sequence[str]], kind: str = "") -> str:
     """A table in a box that scrolls; `kind` is "text" where columns are not numbers."""
-    head = "".join(f"<th>{escape(h)}</th>" for h in heads)
+    head = "".join(f"<th>{escape(h)}</th>" for h in headings)
     body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in line) + "</tr>\n" for line in lines)
     return f'<div class="scroll" tabindex="0"><table class="{kind}"><tr>{head}</tr>\n{body}</table></div>'
 
@@ -82,5 +82,5 @@ def html_figure(content: str, caption: str = "") -> str:
 
 
 def html_facts(facts: Iterable[tuple[str, str]]) -> str:
-    """Pairs of a head and a text."""
+    """A list of pairs of a heading and a text."""
     return "<dl>" + "".join(f"<dt>{escape(h)}</dt><dd>{escape(t)}</dd>" for h, t in facts) + "</dl>"

@@ -30,7 +30,7 @@ U8 = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Clouds(Generic[A]):
-    """S observed scenes of P points each, of which the first `n_points` count.
+    """S observed scenes of P points each, of which the first `n_points` are valid.
 
     The first 512 (`observation.n_farthest`) points of a stored cloud are in farthest-point order, so
     that any prefix of them is a farthest-point sample; the rest are in random order.
@@ -94,5 +94,5 @@ def column(batch: Batch[Array], name: str) -> Array:
 
 
 def is_clear(batch: Batch[Array]) -> npt.NDArray[np.bool_]:
-    """Where (N,) the base fits. InputError where the batch was read without it."""
+    """Mask (N,) of clear bases. InputError where the batch was read without `base_is_clear`."""
     return column(batch, "base_is_clear").astype(np.bool_)

@@ -1,4 +1,4 @@
-"""Versions of labels: what `label` means may change between them."""
+"""Versions of labels: the meaning of `label` may change between them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from datagen.schemas.specification import Specification
 
 
 def refuse_mixed_labels(parts: Sequence[tuple[str, Specification]]) -> None:
-    """Raise InputError where labels of one source, at these places, are of different versions."""
+    """Raise InputError where runs, (path, specification), have labels of one source in two versions."""
     seen: dict[str, tuple[str, str]] = {}
     for place, spec in parts:
         version = spec.engines.get("labels", "unknown")

@@ -2,7 +2,7 @@
 
 The window is that of the true rho (`workers/rendering/visibility.py`): it is centred on the target and
 touches its bounding sphere. Points are sparse (on a table about one every 3 cm), so each is a disc in the
-tangent plane of its neighbours, as large as they are far (surface splatting, Zwicker et al. 2001): a table
+tangent plane of its neighbours, sized by their distance (surface splatting, Zwicker et al. 2001): a table
 seen at a grazing angle stays thin and does not hide the objects on it.
 
 The target's unobserved back is a copy of its observed points, rotated by 180 degrees about the vertical axis
@@ -19,16 +19,16 @@ from scipy.spatial import KDTree
 
 from datagen.train.inputs import F32, F64, Array, Bools, CandidateInputs, Clouds, Ints, RobotInputs
 
-_CELLS = 16  # of a window, each way
-_TARGET_POINTS = 128  # of the target's observed side
+_CELLS = 16  # cells along each side of a window
+_TARGET_POINTS = 128  # points that stand for the target's observed side
 # A disc reaches about half as far as the eighth neighbour, so that discs just close a surface.
 _NEIGHBOURS = 8
 _DISC_SHARE = 0.55
 _LARGEST_DISC_M = 0.06
-_MARGIN_M = 0.02  # a disc hides what lies farther behind it than this
-_NEAREST_M = 0.02  # to an eye; nearer points are the robot's own
-_EYES_AT_ONCE = 48  # whose sector of points is tested together
-_AT_ONCE = 1 << 16  # pairs of eye and point: bounds memory, and stays in the cache
+_MARGIN_M = 0.02  # a disc hides points that are farther behind it than this
+_NEAREST_M = 0.02  # distance from an eye; nearer points are the robot's own
+_EYES_AT_ONCE = 48  # eyes tested together, on one sector of points
+_AT_ONCE = 1 << 16  # pairs of eye and point: bounds memory, and fits in the cache
 
 
 def observed_visibility(
@@ -91,10 +91,10 @@ def _hidden(views: Views, others_m: F32, front_m: F32) -> Bools:
     """Cells (N, cells, cells) in which something is clearly nearer to the eye than `front_m`."""
     hidden, limits = np.zeros(front_m.size, np.bool_), Limits.of(front_m)
     sectors = [views.before(others_m, rows, limits) for rows in views.sectors()]
-    asked = np.zeros(len(others_m), np.bool_)  # whose disc could be before a target
+    chosen = np.zeros(len(others_m), np.bool_)  # points whose disc may hide a target
     for pairs in sectors:
-        asked[pairs.point] = True
-    discs, disc_of = fit_discs(others_m, asked), np.cumsum(asked) - 1
+        chosen[pairs.point] = True
+    discs, disc_of = fit_discs(others_m, chosen), np.cumsum(chosen) - 1
     if len(discs):
         for pairs in sectors:
             disc = disc_of[pairs.point]
@@ -105,29 +105,29 @@ def _hidden(views: Views, others_m: F32, front_m: F32) -> Bools:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """How near something must be to each eye to hide a cell of its window."""
+    """How near to each eye a disc must be to hide a cell of its window."""
 
-    depth_m: F32  # (N * cells * cells,); inf where the target is not
+    depth_m: F32  # (N * cells * cells,); inf where no target is seen
     nearest_m: F32  # (N,), the least of them
-    farthest: F32  # (N,), in cells from the window's middle, of a corner of a cell with the target
-    rows: tuple[F32, F32]  # (N,), the first and the last with a cell of the target
+    farthest: F32  # (N,), in cells, from the window's middle to a corner of a cell with the target
+    rows: tuple[F32, F32]  # (N,) each, the first and the last with a cell of the target
     columns: tuple[F32, F32]
 
     @classmethod
     def of(cls, front_m: F32) -> Limits:
-        """Behind `front_m` (N, cells, cells), the target's depths, by the margin."""
-        there = front_m > -np.inf
-        depth_m = np.where(there, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
-        rows, columns = (_bounds(np.logical_or.reduce(there, axis)) for axis in (2, 1))
+        """Limits in front of the target's depths `front_m` (N, cells, cells), by the margin."""
+        on_target = front_m > -np.inf
+        depth_m = np.where(on_target, front_m, np.inf).astype(np.float32) + np.float32(_MARGIN_M)
+        rows, columns = (_bounds(np.logical_or.reduce(on_target, axis)) for axis in (2, 1))
         corner = np.abs(np.arange(_CELLS) + 0.5 - _CELLS / 2) + 0.5
-        farthest = (there * np.hypot(corner, corner[:, None])).max((1, 2)).astype(np.float32)
+        farthest = (on_target * np.hypot(corner, corner[:, None])).max((1, 2)).astype(np.float32)
         return cls(depth_m.reshape(-1), depth_m.min((1, 2)), farthest, rows, columns)
 
 
-def _bounds(there: Bools) -> tuple[F32, F32]:
-    """The first and the last true cell of each row (N, cells); the last is first where there is none."""
-    first = np.where(there.any(1), there.argmax(1), _CELLS).astype(np.float32)
-    last = np.where(there.any(1), _CELLS - 1 - there[:, ::-1].argmax(1), -1).astype(np.float32)
+def _bounds(cells: Bools) -> tuple[F32, F32]:
+    """The first and the last true cell of each row (N, cells); without one the last is before the first."""
+    first = np.where(cells.any(1), cells.argmax(1), _CELLS).astype(np.float32)
+    last = np.where(cells.any(1), _CELLS - 1 - cells[:, ::-1].argmax(1), -1).astype(np.float32)
     return first, last
 
 
@@ -143,11 +143,11 @@ class Discs:
         return len(self.radius_m)
 
 
-def fit_discs(points_m: F32, asked: Bools) -> Discs:
-    """A disc for each asked point (M,), in the plane of its neighbours and as large as they are far."""
-    if len(points_m) <= _NEIGHBOURS or not asked.any():  # too few for a surface
+def fit_discs(points_m: F32, chosen: Bools) -> Discs:
+    """A disc for each chosen point (M,), in the plane of its neighbours and sized by their distance."""
+    if len(points_m) <= _NEIGHBOURS or not chosen.any():  # too few for a surface
         return Discs(points_m[:0], points_m[:0], np.zeros(0, np.float32))
-    centre_m = points_m[asked]
+    centre_m = points_m[chosen]
     distance_m, row = KDTree(points_m).query(centre_m, _NEIGHBOURS + 1)
     around_m = points_m[row]
     around_m = around_m - around_m.mean(1, keepdims=True)
@@ -179,16 +179,16 @@ class Views:
         )
         self.up = np.cross(self.towards, self.right)
         sine = np.minimum(radius_m / self.distance_m, 0.99)
-        self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), of the window at the target's centre
-        self.per_depth = 2 / _CELLS * self.half_m / self.distance_m  # (N,), of a cell's width, by depth
+        self.half_m = radius_m / np.sqrt(1 - sine**2)  # (N,), half the window's side at the target's centre
+        self.per_depth = 2 / _CELLS * self.half_m / self.distance_m  # (N,), a cell's width per metre of depth
 
     def sectors(self) -> list[Ints]:
-        """Rows of eyes, cut by the direction in which they stand."""
+        """Rows of eyes, divided by their direction from the target."""
         turned = np.argsort(np.arctan2(self.towards[:, 1], self.towards[:, 0]), kind="stable")
         return np.array_split(turned, -(-len(turned) // _EYES_AT_ONCE))
 
     def before(self, points_m: F32, rows: Ints, limits: Limits) -> Pairs:
-        """Pairs of which the largest disc around the point may be nearer to the eye than the limits."""
+        """Pairs where the largest disc around the point may be nearer to the eye than the limits."""
         some = self._beside(points_m, rows, limits)
         points_m = points_m[some]
         along_m = self.towards[rows] @ points_m.T
@@ -200,17 +200,17 @@ class Views:
         return Pairs(rows[eye], some[point], along_m[eye, point], beside_m2[eye, point])
 
     def reach(self, pairs: Pairs, radius_m: F32, limits: Limits) -> Bools:
-        """Which of the pairs that `before` names stay with discs of these radii (K,)."""
+        """Mask (K,) of pairs from `before` that may hide a cell with discs of these radii (K,)."""
         eye = pairs.eye
         limit_m = self._slope(eye, limits) * (self.distance_m[eye] - pairs.along_m) + radius_m
         return (pairs.beside_m2 <= limit_m**2) & (pairs.along_m + radius_m > limits.nearest_m[eye])
 
     def _slope(self, rows: Ints, limits: Limits) -> F32:
-        """Radius by depth of the cone around the target's cells, and a hundredth of a cell for rounding."""
+        """Radius per depth of the cone around the target's cells, plus a hundredth of a cell for rounding."""
         return self.per_depth[rows] * (limits.farthest[rows] + np.float32(0.01))
 
     def _beside(self, points_m: F32, rows: Ints, limits: Limits) -> Ints:
-        """Rows of the points that, seen from above, may be before one of these eyes: a superset."""
+        """Rows of points that, seen from above, may hide the target from one of these eyes: a superset."""
         towards = self.towards[rows, :2]
         angle = np.arctan2(towards[:, 1], towards[:, 0])
         middle, half = (angle[-1] + angle[0]) / 2, (angle[-1] - angle[0]) / 2
@@ -278,12 +278,10 @@ class Views:
         hidden[cell[(at_m > limits.depth_m[cell]) & (cell != own[rows])]] = True
 
 
-def _within(middle: F32, half: F32, bounds: tuple[F32, F32], of: Ints) -> tuple[Ints, Ints]:
-    """First and last of the cells whose centres lie within `half` of `middle` (K,), in cells, and in the
-    bounds of the eyes `of` (K,).
-    """
-    low = np.clip(np.ceil(middle - half - np.float32(0.5)), bounds[0][of], np.float32(_CELLS))
-    high = np.clip(np.floor(middle + half - np.float32(0.5)), np.float32(-1), bounds[1][of])
+def _within(middle: F32, half: F32, bounds: tuple[F32, F32], eye: Ints) -> tuple[Ints, Ints]:
+    """First and last cell (K,) with its centre within `half` cells of `middle`, in the eyes' bounds."""
+    low = np.clip(np.ceil(middle - half - np.float32(0.5)), bounds[0][eye], np.float32(_CELLS))
+    high = np.clip(np.floor(middle + half - np.float32(0.5)), np.float32(-1), bounds[1][eye])
     return low.astype(np.int32), high.astype(np.int32)
 
 

@@ -16,7 +16,7 @@ RATE_FIELDS = ("trials", "successes")
 
 
 def rate_fields(parts: Sequence[RunPart]) -> tuple[str, ...]:
-    """`RATE_FIELDS` where labels of a run are disturbed and all runs hold them; else none: labels count."""
+    """`RATE_FIELDS` where a run's trials are disturbed and all runs hold them; else (), to use labels."""
     disturbed = any(spec.arm is not None and spec.arm.disturbance for part in parts for spec in part.specs)
     held = all(
         set(RATE_FIELDS)
@@ -31,7 +31,7 @@ def label_losses(logits: Tensor, batch: Batch[Tensor]) -> Tensor:
     """Losses (N,) of logits (N, 2): cross-entropy with the label, or with the share of successful trials.
 
     The latter is the negative log-likelihood of a binomial number of successes, without its constant, for
-    each trial. A candidate without a trial keeps its label.
+    each trial. A candidate without a trial uses its label.
     """
     from torch.nn import functional
 
@@ -43,7 +43,7 @@ def label_losses(logits: Tensor, batch: Batch[Tensor]) -> Tensor:
 
 
 def success_shares(batch: Batch[Tensor], kind: dtype) -> Tensor:
-    """Shares (N,) of successful trials; the label where there was none."""
+    """Shares (N,) of successful trials; the label of candidates without a trial."""
     import torch
 
     label = batch.label.to(kind)

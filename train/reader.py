@@ -30,7 +30,7 @@ SAMPLE_FIELDS = (
     "base_is_clear",
     "label",
 )
-# What joins the two tables; every reader needs it.
+# Fields that join the two tables; every reader needs them.
 JOIN_FIELDS = ("scene_index", "sample_scene_index")
 
 
@@ -42,13 +42,13 @@ class SampleReader:
 
     def __init__(
         self,
-        places: Sequence[Path | str],
+        paths: Sequence[Path | str],
         scene_fields: Sequence[str] = SCENE_FIELDS,
         sample_fields: Sequence[str] = SAMPLE_FIELDS,
         allow_incomplete: bool = False,
     ) -> None:
         names = list(dict.fromkeys([*scene_fields, *sample_fields, *JOIN_FIELDS]))
-        parts = open_parts(places, names, allow_incomplete)
+        parts = open_parts(paths, names, allow_incomplete)
         arrays = parts[0].arrays
         for dim, names in (("scene", scene_fields), ("sample", sample_fields)):
             for name in names:

@@ -39,16 +39,16 @@ class RunPart:
 
 
 def open_parts(
-    places: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
+    paths: Sequence[Path | str], names: Sequence[str], allow_incomplete: bool = False
 ) -> list[RunPart]:
-    """The runs of all places, in order, with the named arrays, whose types are equal in all of them.
+    """The runs at all paths, in order, with the named arrays, which have equal types in all of them.
 
-    InputError for a place without a run, an unknown schema, a missing field, or missing samples of the plan
+    InputError for a path without a run, an unknown schema, a missing field, or missing samples of the plan
     (unless `allow_incomplete`).
     """
-    if not places:
+    if not paths:
         raise InputError("training data", "", "no run is given", "Name at least one run folder")
-    parts = [part for place in places for part in _open(place, names, allow_incomplete)]
+    parts = [part for path in paths for part in _open(path, names, allow_incomplete)]
     for part in parts[1:]:
         for name, ours in part.arrays.items():
             first = parts[0].arrays[name]
@@ -59,7 +59,7 @@ def open_parts(
 
 
 def refuse_twins(parts: Sequence[RunPart]) -> None:
-    """InputError where two parts are of one specification: their samples would count twice."""
+    """Raise InputError where two parts have one specification: their samples would count twice."""
     seen: dict[str, str] = {}
     for part in parts:
         for spec_hash in part.spec_hashes:
@@ -73,11 +73,11 @@ def _words(array: StoredArray) -> str:
     return f"{array.dtype} {array.shape[1:]} a {array.dims[0]}"
 
 
-def _open(place: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[RunPart]:
-    """The run, each of the merged ones, or the sealed store."""
-    if is_sealed_store(place):
-        return [open_sealed(place, names)]
-    storage = open_storage(place, probe=False, create=False)
+def _open(path: Path | str, names: Sequence[str], allow_incomplete: bool) -> list[RunPart]:
+    """The parts of a run, of merged runs, or of a sealed store."""
+    if is_sealed_store(path):
+        return [open_sealed(path, names)]
+    storage = open_storage(path, probe=False, create=False)
     found = (_open_run(run, names, allow_incomplete) for run in open_runs(storage))
     opened = [part for part in found if part is not None]
     if not opened:
@@ -102,7 +102,7 @@ def _open_run(run: Run, names: Sequence[str], allow_incomplete: bool) -> RunPart
             stored = [e.path for e in commit.files if e.path.endswith("/zarr.json")]
             _refuse_unknown(url, names, [path.removesuffix("/zarr.json") for path in stored])
             first, arrays = metadata, place.metadata(names)
-        # Merged runs may come from programs that word an array's meaning otherwise.
+        # Merged runs may come from versions that describe an array in other words.
         elif metadata != first:
             _refuse_other_arrays(place, arrays)
         shards.append(place)
@@ -138,17 +138,17 @@ def _refuse_other_arrays(place: ShardPlace, arrays: Mapping[str, StoredArray]) -
             )
 
 
-def is_sealed_store(place: Path | str) -> bool:
-    """Whether the place is named like a sealed store (`....zarr`) and is not a run of such a name."""
-    if not str(place).rstrip("/").endswith(".zarr"):
+def is_sealed_store(path: Path | str) -> bool:
+    """Whether the path ends like that of a sealed store (`.zarr`) and holds no run."""
+    if not str(path).rstrip("/").endswith(".zarr"):
         return False
-    storage = open_storage(place, probe=False, create=False)
+    storage = open_storage(path, probe=False, create=False)
     return not storage.exists("manifest.json") and not storage.exists(MERGED)
 
 
-def open_sealed(place: Path | str, names: Sequence[str]) -> RunPart:
+def open_sealed(path: Path | str, names: Sequence[str]) -> RunPart:
     """A sealed store without its run, with the named arrays, described by its own attributes."""
-    storage = open_storage(place, probe=False, create=False)
+    storage = open_storage(path, probe=False, create=False)
     data = storage.get("zarr.json", 64 * MAX_META_BYTES)
     where = f"{storage.url}/zarr.json"
     if data is None:
@@ -160,9 +160,9 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> RunPart:
         per_scene = int(attributes["candidates_per_scene"])
         stored = list(meta["consolidated_metadata"]["metadata"])
         schema, version = str(attributes["schema"]), int(attributes["schema_version"])
-        told = attributes.get("parts", [attributes])
-        spec_hashes = tuple(str(part["spec_hash"]) for part in told)
-        specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in told)
+        runs = attributes.get("parts", [attributes])
+        spec_hashes = tuple(str(part["spec_hash"]) for part in runs)
+        specs = tuple(Specification.model_validate_json(json.dumps(part["specification"])) for part in runs)
     except (ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(where, "", f"is not the root of a sealed store ({e})", _SEALED_FIX) from e
     if schema not in SCHEMAS or not OLDEST_SCHEMA_VERSION <= version <= SCHEMAS[schema].version:
@@ -186,4 +186,4 @@ def open_sealed(place: Path | str, names: Sequence[str]) -> RunPart:
         (min(per_shard, n_scenes - i * per_shard), min(full, n_samples - i * full)) for i in range(shards)
     ]
     slices = [ShardPlace(storage, "", i, *count, per_shard, full) for i, count in enumerate(counts)]
-    return RunPart(str(place), spec_hashes, specs, schema, version, slices, arrays, None)
+    return RunPart(str(path), spec_hashes, specs, schema, version, slices, arrays, None)

@@ -29,7 +29,7 @@ TABLE_FIELDS = (
 
 @dataclass(frozen=True, eq=False)
 class PartSummary:
-    """What counts of one part. `samples_sha256` is over ids and labels of its samples, in stored order."""
+    """Counts of one part. `samples_sha256` is over ids and labels of its samples, in stored order."""
 
     part: RunPart
     scenes: int
@@ -40,11 +40,11 @@ class PartSummary:
 
 @dataclass(frozen=True, eq=False)
 class SceneTable:
-    """One row a selected scene that has samples, in stored order."""
+    """One row per selected scene that has samples, in stored order."""
 
     shard: I64  # (S,), ascending, among all shards of all parts
     row: I64  # (S,), in the shard
-    samples: I64  # (S,), of an epoch
+    samples: I64  # (S,), in an epoch
     house_of_digest: Mapping[str, str]  # house_digest -> house_id
     house_ids: frozenset[str]
     object_digests: frozenset[str]  # of targets and clutter
@@ -57,7 +57,7 @@ class SceneTable:
 def read_scene_table(
     parts: Sequence[RunPart], per_robot: int | None, houses: Callable[[str], bool] | None
 ) -> SceneTable:
-    """The scenes of the houses that count. InputError where there is none, or a run is named twice."""
+    """The scenes of the selected houses. InputError where there is none, or a run is named twice."""
     refuse_twins(parts)
     rows: list[tuple[int, int, int]] = []  # shard, row, samples
     house_of_digest: dict[str, str] = {}

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Scorer(Protocol):
-    """A method that can be evaluated: label 1 from `threshold` on; nan: for each robot's best alone."""
+    """A method to evaluate: label 1 from `threshold` on; with nan, label 1 for each robot's best alone."""
 
     @property
     def name(self) -> str: ...
@@ -39,9 +39,9 @@ class ModelScorer:
     only_clear: bool = False
 
     def score(self, batch: Batch[Array]) -> F64:
-        """Probabilities (N,); the model itself goes through its candidates in parts that memory allows.
+        """Probabilities (N,); the model divides the candidates to bound memory.
 
-        InputError where it has to know what is clear and the batch was read without `base_is_clear`.
+        InputError where `only_clear` is set and the batch was read without `base_is_clear`.
         """
         import torch
 
@@ -56,7 +56,7 @@ class ModelScorer:
                 chance = torch.softmax(logits, dim=1)[:, 1].cpu().numpy()
         finally:
             self.model.train(trained)
-        # A place that is not clear hides no score that is not a number.
+        # NaN remains, also where the base is not clear.
         return np.where(is_clear(batch) | np.isnan(chance), chance, 0.0) if self.only_clear else chance
 
 

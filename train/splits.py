@@ -11,8 +11,8 @@ from typing import Any
 from datagen.schemas.errors import InputError
 from datagen.train.dataset import SampleStream
 
-# Other salts than that of a run's own split (workers/houses/split.py): the tenth that is held out here
-# is a tenth of a run of that split's training houses too.
+# These salts differ from that of a run's own split (workers/houses/split.py): the tenth that is held out
+# here is also a tenth of that split's training houses.
 _SALT = b"held-out-houses-1:"
 _SHARE_SALT = b"share-of-houses-1:"
 
@@ -40,22 +40,23 @@ class HouseShare:
 
 
 def _number(salt: bytes, house_id: str) -> int:
-    """Evenly spread over 0 .. 2**64 - 1."""
+    """A number of the house, uniform over 0 .. 2**64 - 1."""
     return int.from_bytes(hashlib.sha256(salt + house_id.encode()).digest()[:8], "big")
 
 
 def split_by_house(
-    places: Sequence[str | Path], share: float = 1.0, **options: Any
+    paths: Sequence[str | Path], share: float = 1.0, **options: Any
 ) -> tuple[SampleStream, SampleStream]:
-    """One set of runs as (training, validation): nine tenths of the houses, and one tenth, held out.
+    """(training, validation) streams of runs: nine tenths of the houses, and the tenth that is held out.
 
-    Of the nine tenths `share` is trained on. `options` are those of SampleStream for training; validation
-    is neither shuffled nor augmented and has all its candidates. InputError where a side has no house.
+    `share` is the part of the nine tenths to train on. `options` are those of SampleStream for training;
+    validation is neither shuffled nor augmented and has all its candidates. InputError where a side has no
+    house.
     """
     plain: dict[str, Any] = {"shuffle": False, "augment": None, "candidates_per_robot": None}
     try:
-        validation = SampleStream(places, **(options | plain), houses=HouseSide(held_out=True))
-        train = SampleStream(places, **options, houses=HouseShare(share, HouseSide(held_out=False)))
+        validation = SampleStream(paths, **(options | plain), houses=HouseSide(held_out=True))
+        train = SampleStream(paths, **options, houses=HouseShare(share, HouseSide(held_out=False)))
     except InputError as error:
         if error.field != "house_id":
             raise

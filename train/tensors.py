@@ -31,6 +31,6 @@ def _moved(table: Any, device: torch.device | str) -> Any:
 
 
 def _tensor(values: Array, device: torch.device | str) -> torch.Tensor:
-    # torch knows unsigned integers beyond a byte in name only.
+    # torch has few operations on unsigned integers of more than a byte.
     wide = values.astype(np.int64) if values.dtype.kind == "u" and values.dtype.itemsize > 1 else values
     return torch.from_numpy(np.ascontiguousarray(wide)).to(device)

@@ -40,9 +40,9 @@ class TorchStream(SampleStream, IterableDataset[Batch[torch.Tensor]]):
     where in it to begin: a training that stopped after `skip_batches` batches continues with the next.
     """
 
-    def __init__(self, places: Sequence[str | Path], **options: Unpack[StreamOptions]) -> None:
-        super().__init__(places, **options)
-        # Shared, so that the processes of a loader with persistent workers see what `set_epoch` says.
+    def __init__(self, paths: Sequence[str | Path], **options: Unpack[StreamOptions]) -> None:
+        super().__init__(paths, **options)
+        # Shared, so that the processes of a loader with persistent workers see what `set_epoch` sets.
         self._begin = torch.zeros(2, dtype=torch.int64).share_memory_()
 
     def set_epoch(self, epoch: int, skip_batches: int = 0) -> None:
@@ -70,7 +70,7 @@ def stream(*paths: str | Path, **options: Unpack[StreamOptions]) -> TorchStream:
         paths: Folders or `s3://` addresses of runs, merged runs or sealed `data.zarr` stores.
         options: `scenes_per_batch` [16], `candidates_per_robot` [all], `seed` [0] of the order,
             `shuffle` [True], `buffer_shards` to shuffle in [8], `houses` (a function of house_id that
-            says which count), `augment`, `extra` columns, `rank` and `world` of distributed training, and
+            selects houses), `augment`, `extra` columns, `rank` and `world` of distributed training, and
             `allow_incomplete`.
 
     Raises:

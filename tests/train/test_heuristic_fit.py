@@ -45,7 +45,7 @@ def make_trials(seed: int, n: int = N, scenes: int = SCENES, houses: int = 12) -
 
 
 def labelled_by(trials: Trials, params: HeuristicParams) -> Trials:
-    return replace(trials, label=trials.said(params))
+    return replace(trials, label=trials.labels_by(params))
 
 
 def permuted(trials: Trials, order: np.ndarray[Any, Any]) -> Trials:
@@ -82,7 +82,7 @@ def test_labels_of_a_hidden_rule_are_found_again(hidden: HeuristicParams, seed: 
     if trials.label.sum() < 20:
         return  # nothing but luck says where so few come from
     found = fit(trials, BEFORE, [hidden.distance], objective)
-    assert share_equal(trials.said(found), trials.label) > 0.99
+    assert share_equal(trials.labels_by(found), trials.label) > 0.99
     assert (found.distance, found.alpha, found.a) == (hidden.distance, hidden.alpha, hidden.a)
     assert (found.d_min, found.d_max) == (hidden.d_min, hidden.d_max)
 
@@ -94,7 +94,7 @@ def test_a_hidden_rule_of_another_weight_and_form_is_found_too() -> None:
     trials = labelled_by(make_trials(3), hidden)
     found = fit(trials, BEFORE, ["planar", "mount-over-reach"], fit_alpha=True)
     assert found.distance == hidden.distance
-    assert share_equal(trials.said(found), trials.label) > 0.99
+    assert share_equal(trials.labels_by(found), trials.label) > 0.99
 
 
 @pytest.mark.parametrize("objective", ["balanced", "accuracy"])
@@ -117,8 +117,8 @@ def test_row_order_does_not_change_the_report(seed: int) -> None:
 
     ours, theirs = (fit_leaving_houses_out(t, refit, seed) for t in (trials, other))
     assert ours.params == theirs.params
-    np.testing.assert_array_equal(ours.said[order], theirs.said)
-    a, b = (agreements(t, [left.said], 50, seed)[0] for t, left in ((trials, ours), (other, theirs)))
+    np.testing.assert_array_equal(ours.labels[order], theirs.labels)
+    a, b = (agreements(t, [left.labels], 50, seed)[0] for t, left in ((trials, ours), (other, theirs)))
     np.testing.assert_array_equal(a.confusion, b.confusion)
     np.testing.assert_array_equal(a.balanced_accuracy.resamples, b.balanced_accuracy.resamples)
 
@@ -132,7 +132,7 @@ def test_no_random_rule_does_better_than_the_fitted_one(form: Any) -> None:
     trials = replace(trials, label=near)
 
     def balanced(params: HeuristicParams) -> float:
-        return agreements(trials, [trials.said(params)], 1, 0)[0].balanced_accuracy.value
+        return agreements(trials, [trials.labels_by(params)], 1, 0)[0].balanced_accuracy.value
 
     start = begin_from(BEFORE, form)
     guesses = (
@@ -170,7 +170,7 @@ def test_every_house_is_labelled_by_a_rule_fitted_on_other_houses() -> None:
     for k, (houses, params) in enumerate(zip(seen, left_out.params, strict=True)):
         unseen = np.array([trials.house[s] not in houses for s in trials.scene])
         assert unseen.any(), k
-        np.testing.assert_array_equal(left_out.said[unseen], trials.said(params)[unseen])
+        np.testing.assert_array_equal(left_out.labels[unseen], trials.labels_by(params)[unseen])
     assert sorted(h for houses in seen for h in set(trials.house) - houses) == sorted(set(trials.house))
 
 
@@ -180,8 +180,8 @@ def test_overfitting_to_noise_shows_only_on_the_fitted_houses() -> None:
     def refit(some: Trials) -> HeuristicParams:
         return fit(some, BEFORE, ["planar"])
 
-    left_out = fit_leaving_houses_out(trials, refit, 0).said
-    fitted, unseen = agreements(trials, [trials.said(refit(trials)), left_out], 200, 0)
+    left_out = fit_leaving_houses_out(trials, refit, 0).labels
+    fitted, unseen = agreements(trials, [trials.labels_by(refit(trials)), left_out], 200, 0)
     assert fitted.balanced_accuracy.interval()[0] > 0.5
     low, high = unseen.balanced_accuracy.interval()
     assert low < 0.5 < high
@@ -201,7 +201,7 @@ def test_other_seeds_give_other_folds() -> None:
 
 def test_a_correct_rule_keeps_its_agreement() -> None:
     trials = labelled_by(make_trials(2), BEFORE)
-    right, wrong = agreements(trials, [trials.said(BEFORE), ~trials.label], 20, 0)
+    right, wrong = agreements(trials, [trials.labels_by(BEFORE), ~trials.label], 20, 0)
     assert right.accuracy.value == right.balanced_accuracy.value == 1
     assert right.accuracy.interval() == (1, 1) and wrong.accuracy.interval() == (0, 0)
     assert right.confusion.tolist() == [trials.label.sum(), 0, 0, (~trials.label).sum()]

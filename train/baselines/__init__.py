@@ -1,4 +1,4 @@
-"""Plain methods that a model has to beat: docs/explanation/baselines.md says what each is."""
+"""Plain methods to compare models with; docs/explanation/baselines.md describes each."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def make_baselines(
 ) -> list[Baseline]:
     """Return unfitted baselines. InputError for other names.
 
-    `detector` is a folder, `seed` is for `scalars`, and `robots` names those that `reachability` has to know.
+    `detector` is a folder, `seed` is for `scalars`, and `robots` names those that `reachability` supports.
     """
     for name in names:
         if name not in BASELINES:
@@ -59,7 +59,7 @@ def make_baselines(
 
 
 def fit_baselines(baselines: Sequence[Baseline], batches: Iterable[Batch[Array]]) -> list[Baseline]:
-    """Fit all of them on the same batches, read with `FIELDS`; kept in memory, 15 MB for 100 scenes."""
+    """Fit all baselines on the same batches, read with `FIELDS`; kept in memory, 15 MB for 100 scenes."""
     held = list(batches)
     return [baseline.fit(held) for baseline in baselines]
 

@@ -80,12 +80,12 @@ def observed_rho(batch: Batch[Array]) -> F64:
     return _KNOWN_RHO[batch]
 
 
-def labels(batches: Sequence[Batch[Array]], of: str) -> Bools:
+def labels(batches: Sequence[Batch[Array]], name: str) -> Bools:
     """All labels (N,). InputError where they are all equal, so that nothing can be fitted."""
     found = np.concatenate([np.zeros(0, np.int64), *(b.label for b in batches)]) == 1
     if found.all() or not found.any():
         problem = f"all {len(found):,} labels are equal, so nothing can be fitted"
-        raise InputError(f"baseline {of}", "label", problem, "Fit on runs with labels of both kinds")
+        raise InputError(f"baseline {name}", "label", problem, "Fit on runs with labels of both kinds")
     return found
 
 

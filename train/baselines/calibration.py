@@ -1,4 +1,4 @@
-"""Chances of success from scores of any scale, by isotonic regression on labels."""
+"""Probabilities of success from scores of any scale, by isotonic regression on labels."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from datagen.train.scorers import scored
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A chance that never falls with the score: linear between knots, constant beyond them."""
+    """A probability that never falls with the score: linear between knots, constant beyond them."""
 
     score: F64  # (K,), rising
     chance: F64  # (K,), in [0, 1]
 
     def __call__(self, score: F64) -> F64:
-        """Chances of scores, in their shape."""
+        """Probabilities of scores, in their shape."""
         return np.interp(score, self.score, self.chance)
 
 
 def calibrate(baseline: Baseline, batches: Sequence[Batch[Array]]) -> Calibration:
-    """Chances of a fitted baseline on clear candidates; equal scores have their mean label.
+    """Calibration of a fitted baseline on clear candidates; equal scores get their mean label.
 
     InputError where all labels are equal.
     """

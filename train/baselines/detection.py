@@ -1,7 +1,7 @@
 """Baseline: among feasible candidates, the best detection of the target (the paper's third baseline).
 
-Runs hold one frame a scene, and no picture from a candidate: its view is the stored coloured cloud as seen
-from its camera.
+Runs hold one frame per scene and no picture from a candidate. A candidate's view is the stored coloured
+cloud as seen from its camera.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _BACKGROUND = 127
 
 @dataclass(frozen=True, eq=False)
 class ThresholdDetector:
-    """Score: the confidence in the target where the base fits and the target is within reach, else -1.
+    """Score: the confidence in the target where the base is clear and the target within reach, else -1.
 
     Without a detector the estimated rho takes the confidence's place. Positive from `threshold` on, which
     `fit` sets for the best balanced accuracy of feasible candidates.
@@ -52,7 +52,7 @@ class ThresholdDetector:
         return np.where(feasible, seen, -1.0)
 
     def fit(self, batches: Sequence[Batch[Array]]) -> ThresholdDetector:
-        """With the best cut; unchanged where all feasible candidates have the same label."""
+        """A copy with the best cut; unchanged where all feasible candidates have the same label."""
         label = labels(batches, self.name)
         score = np.concatenate([scored(self, b) for b in batches])
         feasible = score >= 0
@@ -64,16 +64,16 @@ class ThresholdDetector:
         return {"threshold": self.threshold}
 
 
-def _confidence(detector: ZeroShotDetector, batch: Batch[Array], asked: Bools) -> F64:
-    """Scores (N,) of the best boxes around the middle of the asked candidates' views; 0 for others."""
+def _confidence(detector: ZeroShotDetector, batch: Batch[Array], chosen: Bools) -> F64:
+    """Scores (N,) of the best boxes around the middle of the chosen candidates' views; 0 for others."""
     found = np.zeros(len(batch))
     eyes_m = eyes(batch.clouds, batch.robots, batch.candidates)
     cloud_row = batch.robots.cloud_row[batch.candidates.robot_row]
     names = column(batch, "object_name")[:, 0]
-    for row in np.unique(cloud_row[asked]):
+    for row in np.unique(cloud_row[chosen]):
         n = int(batch.clouds.n_points[row])
         points_m, rgb = batch.clouds.points_m[row, :n], batch.clouds.rgb[row, :n]
-        rows = np.flatnonzero(asked & (cloud_row == row))
+        rows = np.flatnonzero(chosen & (cloud_row == row))
         for start in range(0, len(rows), _VIEWS_AT_ONCE):
             some = rows[start : start + _VIEWS_AT_ONCE]
             frames = render_views(points_m, rgb, eyes_m[some])
@@ -104,7 +104,7 @@ def _view(points_m: Array, rgb: U8, eye_m: Array, size_px: int) -> U8:
     length = float(np.linalg.norm(right))
     right = right / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
     local = (points_m - eye_m) @ np.stack([right, np.cross(forward, right), forward]).T  # right, down, ahead
-    ahead = local[:, 2] > _NEAREST_M  # also leaves out what is not finite
+    ahead = local[:, 2] > _NEAREST_M  # also drops points that are not finite
     order = np.flatnonzero(ahead)[np.argsort(-local[ahead, 2], kind="stable")]
     x, y, depth_m = local[order].T
     focal_px = size_px / 2 / np.tan(_HALF_ANGLE_RAD)

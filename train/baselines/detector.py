@@ -52,10 +52,10 @@ class ZeroShotDetector:
         self._device = device
 
     def detect(self, frames: U8, label: str) -> list[Detections]:
-        """Boxes of each frame (B, H, W, 3), all of them, whatever their score."""
+        """All boxes of each frame (B, H, W, 3), whatever their score."""
         import torch
 
-        # Lower case and a full stop is what Grounding DINO was trained with; OWL-ViT does not mind.
+        # Grounding DINO was trained with lower case and a full stop; OWL-ViT accepts both forms.
         words = [[f"a photo of a {label.lower()}."]] * len(frames)
         with torch.inference_mode():
             inputs = self._processor(images=list(frames), text=words, return_tensors="pt", padding=True)
@@ -72,7 +72,7 @@ class ZeroShotDetector:
 
 
 def _needs_ids(processor: Any) -> bool:
-    """Grounding DINO reads from the tokens which words a box is for."""
+    """Whether the processor needs the tokens: Grounding DINO's finds the words of a box in them."""
     from inspect import signature
 
     return "input_ids" in signature(processor.post_process_grounded_object_detection).parameters

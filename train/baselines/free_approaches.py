@@ -1,4 +1,4 @@
-"""Directions from which an open hand gets to the target's centre without touching an observed point."""
+"""Directions from which an open hand reaches the target's centre without touching an observed point."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from datagen.train.baselines.reachability_map import PREGRASP_M
 from datagen.train.inputs import F32, F64, Bools
 from datagen.workers.robots.gripper import Gripper
 
-_ROLLS = 4  # of half a turn about the approach: the hand is alike both ways
-# Stored clouds have a point every 2 to 3 cm: between them a finger would slip through.
+_ROLLS = 4  # in half a turn about the approach: the hand is the same after half a turn
+# Stored clouds have a point every 2 to 3 cm: without a margin a finger fits between them.
 _ROOM_M = 0.01
 
 
 def free_approaches(others_m: F32, directions: F64, gripper: Gripper) -> Bools:
-    """Mask (...,) of approach directions (..., 3) that some roll of the hand leaves free.
+    """Mask (...,) of approach directions (..., 3) that are free at some roll of the hand.
 
-    Points (P, 3) of all but the target are in the target's frame; the hand's middle goes to its origin. Palm
-    and fingers are boxes with margin, drawn out backwards over the last way. What was not observed hinders
-    nothing.
+    `others_m` (P, 3) are all points but the target's, in the target's frame. The hand's middle goes to its
+    origin. Palm and fingers are boxes with a margin, extended backwards over the last way. Unobserved space
+    is free.
     """
     boxes = _boxes(gripper)
     far_m = float(np.linalg.norm(np.abs(boxes).max((0, 1))))
-    near = others_m[np.linalg.norm(others_m, axis=1) <= far_m]  # also drops what is not finite
+    near = others_m[np.linalg.norm(others_m, axis=1) <= far_m]  # also drops points that are not finite
     axes = _rolled(directions.reshape(-1, 3)).astype(np.float32)  # (A, _ROLLS, 3, 3)
     x, y, z = np.moveaxis(near @ axes, -1, 0)  # (A, _ROLLS, P) each
     free: Bools = np.ones(axes.shape[:2], np.bool_)

@@ -1,4 +1,4 @@
-"""Several small networks fitted at once, each with a part of the data held out that says when to stop."""
+"""Several small networks fitted at once, each with held-out data for early stopping."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from datagen.train.inputs import F64, Bools, Ints
 
 MEMBERS = 5
 _WIDTH, _BATCH, _RATE, _DECAY = 32, 256, 3e-3, 1e-4
-_MEAN = 0.995  # of the weights over steps: what is used, and what is judged
-_EVERY = 50  # steps between looks at the held-out loss
-_PATIENCE = 1000  # steps without a lower one until it ends
+_MEAN = 0.995  # decay of the mean of weights over steps, which is validated and used
+_EVERY = 50  # steps between validations on held-out rows
+_PATIENCE = 1000  # steps without a lower held-out loss before the fit stops
 
 Layer = tuple[F64, F64]  # weights (MEMBERS, in, out), bias (MEMBERS, 1, out)
 

@@ -1,4 +1,4 @@
-"""Room around a base as the observed cloud shows it, in place of the true map, which no robot has."""
+"""Clearance of a base in the observed cloud, in place of the true map, which no robot has."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from scipy.spatial import KDTree
 from datagen.schemas.specification import CandidateParams
 from datagen.train.inputs import F64, Array, Batch
 
-# Lower points are floor, as far as a depth camera can say.
+# Lower points are floor, within the error of a depth camera.
 _FLOOR_M = 0.05
 # Clearances are capped here: the cloud ends a metre around the target.
 FAR_M = 1.0
-_BASES = CandidateParams(scaled_base=True)  # as `datagen predict` has them
+_BASES = CandidateParams(scaled_base=True)  # as in `datagen predict`
 
 
 def observed_clearance_m(batch: Batch[Array]) -> F64:
     """Horizontal distance (N,) from each base to the nearest observed obstacle (m), at most `FAR_M`.
 
     Negative where a point lies inside the base. Obstacles are points above the floor and below the arm's
-    mount; what no point shows is free.
+    mount. Unobserved space is free.
     """
     clouds, robots = batch.clouds, batch.robots
     clearance = np.full(len(batch), FAR_M)
@@ -29,7 +29,7 @@ def observed_clearance_m(batch: Batch[Array]) -> F64:
         rows, cloud = order[ends[robot] : ends[robot + 1]], int(robots.cloud_row[robot])
         points_m = clouds.points_m[cloud, : int(clouds.n_points[cloud])].astype(np.float64)
         height_m = points_m[:, 2] + clouds.target_height_m[cloud]
-        # What is not finite fails the comparisons.
+        # Points that are not finite fail the comparisons.
         low = (height_m > _FLOOR_M) & (height_m < robots.base_height_m[robot])
         if not low.any():
             continue

@@ -35,8 +35,8 @@ class Reachability:
     """Score: the share of the free directions of approach from which the arm reaches the target's centre.
 
     It is -1 where the base is not clear, and 0 where no direction is free. Positive from `threshold` on,
-    which `fit` sets for the best balanced accuracy of clear candidates. An arm is that of `robots` that has
-    its reach, with one of a fixed size before those that are scaled.
+    which `fit` sets for the best balanced accuracy of clear candidates. An arm is found among `robots` by its
+    reach, first among arms of fixed size, then among scaled ones.
     """
 
     robots: tuple[str, ...] = tuple(ROBOTS)
@@ -69,7 +69,7 @@ class Reachability:
         return share
 
     def fit(self, batches: Sequence[Batch[Array]]) -> Reachability:
-        """With the best cut; unchanged where all clear candidates have the same label."""
+        """A copy with the best cut; unchanged where all clear candidates have the same label."""
         label = labels(batches, self.name)
         score = np.concatenate([scored(self, b) for b in batches])
         clear = score >= 0

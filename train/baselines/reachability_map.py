@@ -1,4 +1,4 @@
-"""Reachability map of an arm: from which directions its hand gets to a point at some distance and height.
+"""Reachability map of an arm: directions from which its hand reaches a point at a distance and height.
 
 Zacharias et al. 2007, "Capturing robot workspace structure: representing robot capabilities" (IROS), divide
 an arm's workspace into cells, and directions of approach into parts of a sphere. Here cells are rings around
@@ -19,7 +19,7 @@ from datagen.workers.motion.forward_kinematics import forward_kinematics
 from datagen.workers.robots import open_robot, robot_limits
 from datagen.workers.robots.gripper import Gripper
 
-# Over which the hand comes in a straight line, as `motion.pregrasp_m` has it by default.
+# Length of the hand's last way, a straight line; the default of `motion.pregrasp_m`.
 PREGRASP_M = 0.08
 # Parts of the sphere of approach directions, all of one area: by their z, and by their azimuth.
 LEVELS, AZIMUTHS = 8, 16
@@ -32,7 +32,7 @@ _STEP_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ReachabilityMap:
-    """Whether the hand gets to a position from a pregrasp, by ring of positions and part of directions.
+    """Whether the hand reaches a position from a pregrasp, by ring of positions and part of directions.
 
     Distances from the vertical through the mount begin at 0, heights at `lowest` below it; both are in cells
     of 1 / `_CELLS_PER_REACH` of the reach. A direction's azimuth is 0 where it points away from the robot.
@@ -55,7 +55,7 @@ class ReachabilityMap:
             for j in (np.floor(column), np.floor(column) + 1):
                 weight = np.maximum(1 - np.abs(row - i), 0) * np.maximum(1 - np.abs(column - j), 0)
                 inside = (i < rings) & (j >= 0) & (j < heights)
-                # Nearer than half a cell to the vertical there is nothing but the first ring.
+                # Nearer than half a cell to the vertical, the first ring counts alone.
                 cells = self.reachable[np.clip(i[inside], 0, None).astype(int), j[inside].astype(int)]
                 found[inside] += weight[inside, None, None].astype(np.float32) * cells
         return found
@@ -98,7 +98,7 @@ def _backed(poses: ReachabilityMap, back: float) -> F32:
     height = np.tile((np.arange(heights) + 0.5) / _CELLS_PER_REACH + poses.lowest, rings)
     found = np.empty((rings * heights, LEVELS, AZIMUTHS), np.float32)
     for (level, azimuth), (x, y, z) in _by_part(part_directions()):
-        # The hand comes along a line: behind it the direction is the same, the azimuth from the mount is not.
+        # The hand moves along a line: behind, its direction is the same, its azimuth from the mount is not.
         behind = np.hypot(distance - back * x, back * y)
         turn = np.arctan2(-back * y, distance - back * x) / (2 * np.pi) * AZIMUTHS
         seen = (azimuth - np.round(turn).astype(int)) % AZIMUTHS

@@ -22,7 +22,7 @@ from datagen.workers.labels.distance_visibility_score import heuristic
 
 
 class Proximity(Unfitted):
-    """Without threshold: the nearest clear one of a robot's candidates is positive, the others negative."""
+    """Without threshold: a robot's nearest clear candidate is positive, its others are negative."""
 
     name = "proximity"
     threshold = float("nan")

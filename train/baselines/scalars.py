@@ -24,8 +24,8 @@ FEATURES = (
 class Scalars:
     """Probability of a positive label, the mean of five networks; 0 where the base is not clear.
 
-    Each network has drawn weights of its own and leaves out a fifth of the houses. All stop at the step with
-    the lowest loss on what they left out. All numbers are known to a robot before it moves.
+    Each network has its own random initial weights and leaves out a fifth of the houses. All stop at the step
+    with the lowest loss on the houses left out. A robot knows all features before it moves.
     """
 
     seed: int = 0
@@ -83,7 +83,7 @@ def features(batch: Batch[Array]) -> F64:
 
 
 def _parts(batches: Sequence[Batch[Array]], kept: Bools, rng: np.random.Generator) -> Ints:
-    """Which network leaves out each kept candidate: whole houses, or scenes where houses are too few."""
+    """Number of the network that leaves out each kept candidate, by house, or by scene with few houses."""
     scenes: list[Ints] = []
     houses: list[Array] = []
     seen = 0

@@ -1,1 +1,1 @@
-"""Training from tokens that are made once a run: many trainings of small models in minutes."""
+"""Training from tokens that are made once per run: many trainings of small models in minutes."""

@@ -10,7 +10,7 @@ import numpy as np
 from datagen.train.encoded.runs import EncodedRuns
 from datagen.train.inputs import I64, Array, Batch, Bools
 
-# One house of this number is held out where a training has no validation runs.
+# One in this number of houses is held out where a training has no validation runs.
 _HELD_OUT = 10
 
 
@@ -60,7 +60,7 @@ def subset_of_houses(encoded: EncodedRuns, share: float, seed: int) -> I64:
 
 
 def hold_out(encoded: EncodedRuns, scenes: I64, seed: int) -> tuple[I64, I64]:
-    """(training, validation) scenes: every tenth house in `house_order` is held out, or the last of fewer."""
+    """(training, validation) scenes: every tenth house in `house_order` is held out, with fewer the last."""
     present = set(np.unique(encoded.houses[scenes]).tolist())
     order = [name for name in house_order(encoded.houses, seed) if name in present]
     held = order[_HELD_OUT - 1 :: _HELD_OUT] or order[-1:]

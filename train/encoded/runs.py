@@ -1,9 +1,8 @@
 """Tokens of all robots of runs in one memory-mapped file, with the columns that training needs.
 
-A folder `<key>` holds `tokens.f16` (R, J, F) and `columns.npz`. The key is the digest of what decides its
-content: ids and labels of the samples, and the sizes of the tokens. Tokens have no parameters and clouds are
-not augmented, as in `datagen train` without --augment, so a training from them has the same inputs up to
-half precision.
+A folder `<key>` holds `tokens.f16` (R, J, F) and `columns.npz`. The key is the digest of its origin: ids and
+labels of the samples, and the sizes of the tokens. Tokens have no parameters and clouds are not augmented, as
+in `datagen train` without --augment, so a training from them has the same inputs up to half precision.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _TOKENS, _COLUMNS = "tokens.f16", "columns.npz"
 
 @dataclass(frozen=True, eq=False)
 class EncodedRuns:
-    """S scenes, R robots and N candidates; robots lie by scene, candidates by robot."""
+    """S scenes, R robots and N candidates; robots are sorted by scene, candidates by robot."""
 
     key: str
     tokens: Array  # (R, J, F) float16, in a file
@@ -74,7 +73,7 @@ class EncodedRuns:
 
     @property
     def in_range(self) -> Bools:
-        """Where (N,) the base is clear and the target within reach."""
+        """Mask (N,) of candidates with a clear base and the target within reach."""
         return self.columns["in_range"]
 
     def batch(self, scenes: I64) -> Batch[Array]:
@@ -104,7 +103,7 @@ class EncodedRuns:
 
 
 def _ranges(bounds: I64, rows: I64) -> tuple[I64, I64]:
-    """All of bounds[r] .. bounds[r + 1] for each of the rows, and the row's number in `rows` of each."""
+    """Numbers bounds[r] .. bounds[r + 1] of all rows r, and for each number its row's index in `rows`."""
     counts = bounds[rows + 1] - bounds[rows]
     owner = np.repeat(np.arange(len(rows)), counts)
     within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -196,8 +195,8 @@ def _columns(batch: Batch[Array], scenes: int, robots: int) -> dict[str, Array]:
     }
 
 
-def encoded_stream(places: Sequence[str], allow_incomplete: bool) -> SampleStream:
+def encoded_stream(paths: Sequence[str], allow_incomplete: bool) -> SampleStream:
     """The stream of these runs that `encode_runs` reads."""
     return SampleStream(
-        places, scenes_per_batch=16, shuffle=False, extra=EXTRA, allow_incomplete=allow_incomplete
+        paths, scenes_per_batch=16, shuffle=False, extra=EXTRA, allow_incomplete=allow_incomplete
     )

@@ -26,7 +26,7 @@ _SCENES_PER_BATCH = 32
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A model with its best weights, and how it was reached."""
+    """A model with its best weights, and the history and cost of its training."""
 
     model: Model
     best_epoch: int  # counted from 1
@@ -41,7 +41,7 @@ def train_encoded(
     init: Mapping[str, Tensor] | None,
     stopping: Callable[[], bool],
 ) -> Trained | None:
-    """Train as `datagen train` does, on the CPU; None where it was stopped. `init`: weights to begin from."""
+    """Train as `datagen train` does, on the CPU; None if it was stopped. `init` are the first weights."""
     torch.manual_seed(options.seed)
     model = build_model(options.model, options.model_config)
     if init is not None:
@@ -57,7 +57,7 @@ def train_encoded(
         position,
         Ranks(),
     )
-    # A training takes a minute, so one that is stopped begins again.
+    # A training takes a minute, so a stopped one is not saved.
     if not run_training(training, lambda: None, stopping=stopping):
         return None
     assert position.best_epoch is not None
@@ -66,7 +66,7 @@ def train_encoded(
 
 
 def _class_weights(train: EncodedBatches, weighted: bool) -> Tensor:
-    """(2,): both classes weigh alike; ones where unweighted, or where a class is missing."""
+    """Weights (2,) that balance the classes; ones where unweighted, or where a class is missing."""
     counts = np.array(train.class_counts(), np.float64)
     weights = counts.sum() / (2 * counts) if weighted and counts.all() else np.ones(2)
     return torch.from_numpy(weights.astype(np.float32))

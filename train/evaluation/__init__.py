@@ -1,1 +1,1 @@
-"""How good methods are: numbers with intervals by scene, over sets of candidates and whole grids."""
+"""Metrics of methods, with intervals by scene, over sets of candidates and whole grids."""

@@ -1,6 +1,6 @@
-"""Success of each method's pick where the robot arrives off it, on whole grids of labels.
+"""Success of each method's pick where the robot arrives with an error, on whole grids of labels.
 
-Truth between cells is bilinear in the labels of the four around; off the grid nothing succeeds.
+Truth between cells is bilinear in the four labels around; it is 0 off the grid.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from datagen.train.arrivals import Arrival, expected_success, ring_arrival, stan
 from datagen.train.evaluation import metrics
 from datagen.train.evaluation.bootstrap import Estimate, Weights, summed
 from datagen.train.evaluation.columns import Columns
-from datagen.train.evaluation.comparisons import said_of
+from datagen.train.evaluation.comparisons import estimate_values
 from datagen.train.evaluation.evaluation import Method
 from datagen.train.inputs import F64, Bools, Ints
 
-# How far robots park off the goal, in any direction.
+# Distances at which robots stop from the goal, in any direction.
 DISTANCES_M = (0.0, 0.03, 0.05, 0.10, 0.15, 0.25)
 PICKS = ("nominal", "smoothed")
 
@@ -53,13 +53,12 @@ def grid_maps(columns: Columns) -> GridMaps | None:
 def arrival_table(
     columns: Columns, methods: Sequence[Method], weights: Weights, given: Arrival | None = None
 ) -> list[dict[str, Any]]:
-    """For each arrival error, `DISTANCES_M` and the `given` one, the success of every method's picks.
+    """Success of every method's picks for each arrival error: `DISTANCES_M` and the `given` one.
 
-    Over grids with a good clear cell. A nominal pick is the cell with the best score; a smoothed one that
-    with the best mean chance over this error, cells that are not clear counting as failures. Chances are
-    the scores, where these are probabilities; else what a calibration makes of them, or without one their
-    rank among a scene's clear cells. `best` is the highest success
-    that any clear cell has, `any` the mean over them. Empty without such grids.
+    Only grids with a good clear cell are used; empty without any. A nominal pick is the cell with the best
+    score, a smoothed pick that with the best mean probability over the error, where cells that are not clear
+    are failures. Scores that are no probabilities are calibrated, or without a calibration replaced by their
+    rank among a scene's clear cells. `best` is the highest success of a clear cell, `any` the mean over all.
     """
     maps = grid_maps(columns)
     if maps is None:
@@ -86,7 +85,9 @@ def arrival_table(
                 "best": float(np.nanmax(offered[some], axis=(1, 2)).mean()),
                 "any": float(np.nanmean(offered[some], axis=(1, 2)).mean()),
                 "methods": {
-                    name: {pick: said_of(_mean(value, some, weights)) for pick, value in picks.items()}
+                    name: {
+                        pick: estimate_values(_mean(value, some, weights)) for pick, value in picks.items()
+                    }
                     for name, picks in per_scene.items()
                 },
             }
@@ -96,7 +97,7 @@ def arrival_table(
 
 def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
     """Scores (S, Y, X) as chances in [0, 1], or ranks among the clear cells; 0 elsewhere."""
-    if method.says_probabilities:
+    if method.gives_probabilities:
         return stands(score, maps.is_clear)
     if method.chances is not None:
         return stands(method.chances(score), maps.is_clear)
@@ -108,12 +109,12 @@ def method_values(score: F64, maps: GridMaps, method: Method) -> F64:
 
 
 def smoothed(value: F64, step_m: float, arrival: Arrival) -> F64:
-    """Maps (S, Y, X) of the mean value over where a robot arrives that is sent to each cell."""
+    """Maps (S, Y, X) of the mean value over the arrivals of a robot that is sent to each cell."""
     return np.stack([expected_success(each, step_m, arrival) for each in value])
 
 
 def _picked(value: F64, truth: F64, is_clear: Bools) -> F64:
-    """Truth (S,) at each scene's best clear cell, the mean over those that are equally good."""
+    """Truth (S,) at each scene's best clear cell, the mean over equally good ones."""
     masked = np.where(is_clear, value, -np.inf)
     top = is_clear & (masked >= masked.max(axis=(1, 2), keepdims=True) - 1e-12)
     return (truth * top).sum(axis=(1, 2)) / np.maximum(top.sum(axis=(1, 2)), 1)

@@ -32,7 +32,7 @@ def summed(weights: Weights, per_scene: F64) -> F64:
 
 
 def resampled_area_under_roc(weights: Weights, true: Bools, score: F64, scene: Ints) -> F64:
-    """The area under the ROC curve (B,) of each resample, ties counting half; nan in those of one class."""
+    """The area under the ROC curve (B,) of each resample, ties counting half; nan with one class."""
     _, rank = np.unique(score, return_inverse=True)
     found = np.full(len(weights), np.nan)
     for k, of_scene in enumerate(weights.astype(np.float64)):
@@ -55,7 +55,7 @@ class Estimate:
     def interval(self) -> tuple[float, float]:
         """The percentile interval of `LEVEL`; nan without defined resamples.
 
-        Of a share that is 0 or 1 in every resample: the exact interval (Clopper and Pearson 1934).
+        A share of scenes that is 0 or 1 has the exact interval (Clopper and Pearson 1934).
         """
         defined = self.resamples[np.isfinite(self.resamples)]
         if not len(defined) or not np.isfinite(self.value):

@@ -1,6 +1,6 @@
 """Choices and success rates of a closed loop: which cells methods pick, and where robots arrive.
 
-What happens after an arrival is not decided here: `datagen.closed_loop` plans and executes it.
+`datagen.closed_loop` plans and executes the trials after an arrival.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from datagen.train.arrivals import Arrival
 from datagen.train.evaluation.arrival_success import PICKS, GridMaps, method_values, smoothed
 from datagen.train.evaluation.bootstrap import Estimate, Weights, summed
 from datagen.train.evaluation.columns import Columns
-from datagen.train.evaluation.comparisons import TrainedBy, comparisons, said_of
+from datagen.train.evaluation.comparisons import TrainedBy, comparisons, estimate_values
 from datagen.train.evaluation.evaluation import Method
 from datagen.train.inputs import F64, I64, Bools
 
-# Choices that no method makes: by the labels of the whole grid, and at random.
+# Picks without a method: by the labels of the whole grid, and at random.
 BY_LABELS, AT_RANDOM = "best by labels", "random in reach"
 
 Pick = tuple[str, str]  # a method, and one of PICKS
@@ -30,9 +30,9 @@ Names = npt.NDArray[np.object_]
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """E arrival errors in S scenes, D arrivals each: where robots are sent, and how far off they arrive."""
+    """E arrival errors in S scenes, D arrivals each: the picks, and the errors of the arrivals."""
 
-    cells: Mapping[Pick, I64]  # (E, S) each, of Y * X cells
+    cells: Mapping[Pick, I64]  # (E, S) each, index into Y * X cells
     offsets: F64  # (E, S, D, 3), in the frame of the goal: x ahead, y to the left (m), yaw (rad)
 
 
@@ -47,9 +47,9 @@ def plan_turns(
     """The picks of every method and `n` arrivals a scene.
 
     A nominal pick is the clear cell with the best score, a smoothed one that with the best mean of the score
-    over the error (as `arrival_table`). One of equally good cells is drawn, the same for all methods.
-    `generators(scene, purpose)` gives each scene's own; arrivals of all errors begin from one state, so that
-    they lie in like directions.
+    over the error (as `arrival_table`). Ties are broken at random, the same for all methods.
+    `generators(scene, purpose)` gives each scene's own; arrivals of all errors use the same state, so that
+    they have the same directions.
     """
     side = maps.truth.shape[1:]
     lucky = np.stack([generators(k, 0).random((2, *side)) for k in range(columns.n_scenes)])
@@ -70,20 +70,20 @@ def plan_turns(
     within = best(columns.is_reachable[maps.order].astype(np.float64), lucky[:, 1])
     cells[AT_RANDOM, "nominal"] = np.stack([within] * len(arrivals))
     offsets = [[arrival.drawn(n, generators(k, 1)) for k in range(columns.n_scenes)] for arrival in arrivals]
-    # Rounded, and without -0: an arrival is known by its numbers.
+    # Rounded, and without -0: its numbers identify an arrival.
     return Turns(cells, np.round(np.array(offsets), 6) + 0.0)
 
 
 def candidates_of(maps: GridMaps, cells: I64) -> I64:
-    """The index (E, S) in its scene of the candidate in each cell (E, S)."""
+    """Index (E, S), within its scene, of the candidate in each cell (E, S)."""
     rows = maps.order.reshape(len(maps.order), -1)
     return rows[np.arange(len(rows)), cells] - rows.min(axis=1)
 
 
 def label_success(columns: Columns, maps: GridMaps, cells: I64, offsets: F64) -> tuple[F64, F64]:
-    """What the labels around each arrival (E, S, D) say of it: that of the nearest cell, and bilinear.
+    """Success (E, S, D) of each arrival by the labels around it: of the nearest cell, and bilinear.
 
-    Off the grid nothing succeeds.
+    It is 0 off the grid.
     """
     scene = np.arange(len(maps.order))
     xy = columns.base_xy_m.astype(np.float64)[maps.order.reshape(len(scene), -1)]  # (S, Y * X, 2)
@@ -107,23 +107,23 @@ def loop_table(
     scenes: Bools,
     weights: Weights,
 ) -> list[dict[str, Any]]:
-    """For each arrival error the success of every pick over some of the S scenes, with intervals over scenes.
+    """Success of every pick for each arrival error over some of the S scenes, with intervals over scenes.
 
-    `outcomes` are keys of OUTCOMES, `by_labels` what the labels say (E, S, D); `weights` (B, S) resample the
+    `outcomes` are keys of OUTCOMES, `by_labels` success by labels (E, S, D); `weights` (B, S) resample the
     scenes. `gains` are paired differences of smoothed and nominal picks, `comparisons` those of methods'
     smoothed picks.
     """
     found: list[dict[str, Any]] = []
     for e, arrival in enumerate(arrivals):
         rates: dict[str, dict[str, Estimate]] = {}
-        told: dict[str, dict[str, Any]] = {}
+        results: dict[str, dict[str, Any]] = {}
         for (name, pick), of_pick in outcomes.items():
             ends = of_pick[e, scenes]
             rates.setdefault(name, {})[pick] = rate = _rate(of_pick[e] == "success", scenes, weights)
             causes, count = np.unique(ends[ends != "success"].astype(str), return_counts=True)
             shares = sorted(zip((count / ends.size).tolist(), causes.tolist(), strict=True), reverse=True)
-            told.setdefault(name, {})[pick] = {
-                **said_of(rate),
+            results.setdefault(name, {})[pick] = {
+                **estimate_values(rate),
                 "by_labels": float(by_labels[name, pick][e, scenes].mean()),
                 "failures": {cause: share for share, cause in shares},
             }
@@ -133,11 +133,11 @@ def loop_table(
                 "arrival": arrival.text,
                 "distance_m": arrival.distance_m,
                 "yaw_std_rad": arrival.yaw_std_rad,
-                "methods": told,
+                "methods": results,
                 "gains": {
-                    name: said_of(of["smoothed"].minus(of["nominal"]))
-                    for name, of in rates.items()
-                    if len(of) == len(PICKS)
+                    name: estimate_values(by_pick["smoothed"].minus(by_pick["nominal"]))
+                    for name, by_pick in rates.items()
+                    if len(by_pick) == len(PICKS)
                 },
                 "comparisons": comparisons(methods, origins, ("smoothed",)),
             }
@@ -149,5 +149,5 @@ def _rate(success: npt.NDArray[Any], scenes: Bools, weights: Weights) -> Estimat
     """The mean over scenes of each scene's share (S, D) of successes."""
     parts = np.column_stack([success.mean(axis=1), np.ones(len(success))]) * scenes[:, None]
     whole, drawn = parts.sum(axis=0), summed(weights, parts)
-    with np.errstate(invalid="ignore"):  # a resample may hold none of few scenes
+    with np.errstate(invalid="ignore"):  # a resample of few scenes may hold none of these
         return Estimate(float(whole[0] / whole[1]), drawn[:, 0] / drawn[:, 1], int(scenes.sum()))

@@ -40,8 +40,8 @@ class Columns:
     house: Array  # (S,) text
     target: Array  # (S,) text
     target_digest: Array  # (S,) text
-    run: I64  # (S,) which of the places
-    is_grid: Bools  # (S,) whether all cells of a grid are there, for one robot
+    run: I64  # (S,) index of the run
+    is_grid: Bools  # (S,) whether it has all cells of a grid, for one robot
 
     def __len__(self) -> int:
         return len(self.label)
@@ -90,7 +90,7 @@ class Example:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The columns of a run, scenes to show, and the seconds that each method took to score all of it."""
+    """The columns of runs, example scenes, and the seconds that each method took to score all runs."""
 
     columns: Columns
     examples: tuple[Example, ...]
@@ -98,24 +98,24 @@ class Gathered:
 
 
 def gather(
-    places: Sequence[tuple[int, Iterable[Batch[Array]]]],
+    runs: Sequence[tuple[int, Iterable[Batch[Array]]]],
     scorers: Mapping[str, Scorer],
     rng: np.random.Generator,
     n_examples: int = 0,
     seen: Callable[[int], None] = lambda scenes: None,
 ) -> Gathered:
-    """Score every candidate of every place by every scorer, a batch at a time.
+    """Score every candidate of every run by every scorer, a batch at a time.
 
-    Scorers are given by name. A place is (cells of its whole grids, or 0 where it has none; batches with
+    Scorers are given by name. A run is (cells of its whole grids, or 0 where it has none; batches with
     `EXTRA`). Examples are drawn uniformly from the scenes with whole grids and a positive. `seen` is called
     with the number of each batch's scenes. InputError where a score is not finite or a scene occurs twice.
     """
     parts: list[dict[str, Any]] = []
     seconds = dict.fromkeys(scorers, 0.0)
-    examples: list[tuple[float, Example]] = []  # with a random number: the first of that order are kept
+    examples: list[tuple[float, Example]] = []  # with a random number, by which the first are kept
     known: set[bytes] = set()
     n_scenes = n_robots = 0
-    for run, (cells, batches) in enumerate(places):
+    for run, (cells, batches) in enumerate(runs):
         for batch in batches:
             part = _rows(batch, n_scenes, n_robots)
             for name, scorer in scorers.items():

@@ -22,7 +22,7 @@ Estimates = Mapping[str, Mapping[str, Estimate]]
 
 @dataclass(frozen=True)
 class TrainedBy:
-    """What trained a method: regime and model, both "" of a baseline, and the share of the houses it had."""
+    """Training of a method: regime and model, both "" of a baseline, and the share of the houses used."""
 
     regime: str = ""
     model: str = ""
@@ -33,7 +33,7 @@ NO_TRAINING = TrainedBy()
 
 
 def differences(estimates: Estimates, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Every two methods by each metric: the difference, what can be said of it, and of the two intervals."""
+    """Difference of every two methods by each metric, its verdict, and whether intervals are disjoint."""
     return [
         _difference(estimates, metric, first, second)
         for metric in names
@@ -65,14 +65,14 @@ def _difference(estimates: Estimates, metric: str, first: str, second: str) -> d
         "metric": metric,
         "first": first,
         "second": second,
-        **said_of(difference := a.minus(b)),
+        **estimate_values(difference := a.minus(b)),
         "verdict": verdict(difference),
         "disjoint": are_disjoint(a, b),
     }
 
 
 def _consecutive(origins: Mapping[str, TrainedBy]) -> Iterator[tuple[str, str]]:
-    """(later, earlier) of the regimes that are there of each model and share, the last first."""
+    """(later, earlier) names of methods in consecutive regimes of a model and share, the last first."""
     for like in dict.fromkeys(replace(o, regime="") for o in origins.values() if o.regime):
         alike = {r: [n for n, o in origins.items() if o == replace(like, regime=r)] for r in REGIMES}
         present = [names for names in alike.values() if names]
@@ -81,15 +81,15 @@ def _consecutive(origins: Mapping[str, TrainedBy]) -> Iterator[tuple[str, str]]:
 
 
 def _best(estimates: Estimates, origins: Mapping[str, TrainedBy], metric: str) -> Iterator[tuple[str, str]]:
-    """(best model, best baseline) where there are both; the first named of equals."""
+    """(best model, best baseline) where there are both; the first of equals."""
     known = {n: e[metric].value for n, e in estimates.items() if np.isfinite(e[metric].value)}
     models, baselines = ([n for n in known if bool(origins[n].regime) is side] for side in (True, False))
     if models and baselines:
         yield max(models, key=known.__getitem__), max(baselines, key=known.__getitem__)
 
 
-def said_of(estimate: Estimate) -> dict[str, float | None]:
-    """Value and interval as JSON has them."""
+def estimate_values(estimate: Estimate) -> dict[str, float | None]:
+    """Value and interval as JSON values."""
     low, high = estimate.interval()
     return {"value": finite(estimate.value), "low": finite(low), "high": finite(high)}
 

@@ -27,8 +27,8 @@ from datagen.train.evaluation.comparisons import (
     TrainedBy,
     comparisons,
     differences,
+    estimate_values,
     finite,
-    said_of,
 )
 from datagen.train.evaluation.grids import picks, select
 from datagen.train.inputs import F64, Bools
@@ -46,21 +46,21 @@ _RATIO_EDGES: Edges = (0.0, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, None)
 class Method:
     """A method: its name among the scores, its threshold and its training.
 
-    `chances` makes probabilities of scores that are none.
+    `chances` calibrates scores that are no probabilities.
     """
 
     name: str
     threshold: float
     origin: TrainedBy = NO_TRAINING
-    says_probabilities: bool = False
+    gives_probabilities: bool = False
     chances: Callable[[F64], F64] | None = None
 
     @property
     def only_picks(self) -> bool:
-        """Whether it has no threshold, so that its choice among a robot's candidates is its decision."""
+        """Whether it has no threshold: only its choice among a robot's candidates is positive."""
         return bool(np.isnan(self.threshold))
 
-    def says(self, score: F64, columns: Columns) -> F64:
+    def decisions(self, score: F64, columns: Columns) -> F64:
         """Its decisions (N,) in [0, 1], among exactly these candidates."""
         if self.only_picks:
             return picks(score, columns.robot, columns.is_clear)
@@ -83,8 +83,8 @@ def evaluate_set(
     if positives in (0, n):
         problem = f"all {n:,} candidates have the label {int(positives > 0)}"
         raise InputError("--candidates", candidates, problem, "Evaluate a run with labels of both kinds")
-    said = {m.name: m.says(columns.scores[m.name], columns) for m in methods}
-    estimates = {m.name: _estimates(columns, m, said[m.name], weights) for m in methods}
+    decisions = {m.name: m.decisions(columns.scores[m.name], columns) for m in methods}
+    estimates = {m.name: _estimates(columns, m, decisions[m.name], weights) for m in methods}
     return {
         "candidates": candidates,
         "count": n,
@@ -94,7 +94,7 @@ def evaluate_set(
         "out_of_reach": _class_counts(columns, ~columns.is_reachable),
         "methods": {
             m.name: {
-                **{name: said_of(e) for name, e in estimates[m.name].items()},
+                **{name: estimate_values(e) for name, e in estimates[m.name].items()},
                 **_calibration(columns, m),
             }
             for m in methods
@@ -108,7 +108,7 @@ def evaluate_set(
                 "group": name,
                 "count": int(rows.sum()),
                 "positives": int(columns.label[rows].sum()),
-                "methods": {name: _accuracies(said[name][rows], columns.label[rows]) for name in said},
+                "methods": {name: _accuracies(d[rows], columns.label[rows]) for name, d in decisions.items()},
             }
             for heading, members in groups_of(columns, trained_objects).items()
             for name, rows in members
@@ -116,11 +116,11 @@ def evaluate_set(
     }
 
 
-def _estimates(columns: Columns, method: Method, said: F64, weights: Weights) -> dict[str, Estimate]:
+def _estimates(columns: Columns, method: Method, decisions: F64, weights: Weights) -> dict[str, Estimate]:
     score, true = columns.scores[method.name], columns.label
 
     def estimate(metric: Callable[[F64], F64], rows: Bools) -> Estimate:
-        per_scene = metrics.confusion(said[rows], true[rows], columns.scene[rows], columns.n_scenes)
+        per_scene = metrics.confusion(decisions[rows], true[rows], columns.scene[rows], columns.n_scenes)
         return Estimate(float(metric(per_scene.sum(axis=0))), metric(summed(weights, per_scene)))
 
     everywhere, in_reach = np.ones(len(columns), np.bool_), columns.is_reachable
@@ -149,7 +149,9 @@ def evaluate_grids(columns: Columns, methods: Sequence[Method], weights: Weights
         "clear_per_scene": float(offered.mean()) if columns.n_scenes else None,
         "positives_per_scene": float(positives[some].mean()) if some.any() else None,
         "any_clear": float((positives[some] / offered[some]).mean()) if some.any() else None,
-        "methods": {name: {k: said_of(e) for k, e in found.items()} for name, found in estimates.items()},
+        "methods": {
+            name: {k: estimate_values(e) for k, e in found.items()} for name, found in estimates.items()
+        },
         "differences": differences(estimates, GRID_METRICS),
         "comparisons": comparisons(estimates, {m.name: m.origin for m in methods}, GRID_METRICS),
     }
@@ -185,10 +187,10 @@ def weights_for(columns: Columns, n_resamples: int, seed: int) -> Weights:
 
 def _calibration(columns: Columns, method: Method) -> dict[str, Any]:
     score, true = columns.scores[method.name], columns.label
-    if not method.says_probabilities:
+    if not method.gives_probabilities:
         return {"brier": None, "expected_calibration_error": None, "reliability": None}
     bins = metrics.reliability(true, score)
-    rows = zip(bins.count.tolist(), bins.said.tolist(), bins.true.tolist(), strict=True)
+    rows = zip(bins.count.tolist(), bins.predicted.tolist(), bins.true.tolist(), strict=True)
     return {
         "brier": metrics.brier(true, score),
         "expected_calibration_error": bins.expected_error,
@@ -209,8 +211,8 @@ def _class_counts(columns: Columns, rows: Bools) -> dict[str, int]:
     return {"count": int(rows.sum()), "positives": int(columns.label[rows].sum())}
 
 
-def _accuracies(said: F64, true: Bools) -> dict[str, float | None]:
-    counts = metrics.confusion(said, true, np.zeros(len(true), np.int64), 1)[0]
+def _accuracies(decisions: F64, true: Bools) -> dict[str, float | None]:
+    counts = metrics.confusion(decisions, true, np.zeros(len(true), np.int64), 1)[0]
     return {name: finite(float(metric(counts))) for name, metric in _OF_CONFUSIONS.items()}
 
 

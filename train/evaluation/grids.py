@@ -1,4 +1,4 @@
-"""Grids, and the best-scored candidate of each robot: its label, its distance to a positive, the order."""
+"""Grids, and the best-scored candidate of each robot: its label, its distance to a positive, the ranking."""
 
 from __future__ import annotations
 

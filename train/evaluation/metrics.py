@@ -14,9 +14,9 @@ from datagen.train.inputs import F64, I64, Bools, Ints
 N_BINS = 10
 
 
-def confusion(said: F64, true: Bools, group: Ints, n_groups: int) -> F64:
+def confusion(decisions: F64, true: Bools, group: Ints, n_groups: int) -> F64:
     """True and false positives, false and true negatives (n_groups, 4) of decisions in [0, 1], by group."""
-    parts = (said * true, said * ~true, (1 - said) * true, (1 - said) * ~true)
+    parts = (decisions * true, decisions * ~true, (1 - decisions) * true, (1 - decisions) * ~true)
     return np.stack([np.bincount(group, part, n_groups) for part in parts], axis=1).astype(np.float64)
 
 
@@ -39,7 +39,7 @@ def ratio(part: F64, whole: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Points (K,) of a curve in order; equal scores give one point, since no threshold parts them."""
+    """Points (K,) of a curve in order; equal scores give one point, since no threshold separates them."""
 
     x: F64
     y: F64
@@ -55,7 +55,7 @@ class Curve:
 
 
 def _steps(true: Bools, score: F64) -> tuple[F64, F64]:
-    """True and false positives (K,) when all from the k-th highest distinct score on are called good."""
+    """True and false positives (K,) at thresholds of all distinct scores, the highest first."""
     order = np.argsort(-score, kind="stable")
     ordered = score[order]  # compared and not subtracted: scores may be infinite
     last_of_ties = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
@@ -98,13 +98,13 @@ class Reliability:
     """Bins (K,) of predictions: count, mean prediction, observed rate."""
 
     count: I64
-    said: F64
+    predicted: F64
     true: F64
 
     @property
     def expected_error(self) -> float:
         """Expected calibration error: count-weighted distance of mean prediction and observed rate."""
-        return float(np.average(np.abs(self.said - self.true), weights=self.count))
+        return float(np.average(np.abs(self.predicted - self.true), weights=self.count))
 
 
 def reliability(true: Bools, probability: F64) -> Reliability:
@@ -112,8 +112,8 @@ def reliability(true: Bools, probability: F64) -> Reliability:
     row = np.minimum((probability * N_BINS).astype(np.int64), N_BINS - 1)
     count = np.bincount(row, minlength=N_BINS)
     held = count > 0
-    said, positives = (np.bincount(row, values, N_BINS)[held] / count[held] for values in (probability, true))
-    return Reliability(count[held], said, positives)
+    predicted, rate = (np.bincount(row, values, N_BINS)[held] / count[held] for values in (probability, true))
+    return Reliability(count[held], predicted, rate)
 
 
 def brier(true: Bools, probability: F64) -> float:

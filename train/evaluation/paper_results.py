@@ -21,9 +21,9 @@ ACCURACY: Mapping[str, float] = {
 }
 # Accuracy of its two-stage model where the target is beyond the arm's reach.
 ACCURACY_OUT_OF_REACH = 0.9917
-# Over whole grids (Table III): how often its two-stage model's best candidate is a good one, and how far
-# from a good one it is where it is not.
+# Over whole grids (Table III): the share of good ones among the best candidates of its two-stage model, and
+# the mean distance of the others from a good one.
 GRID_SELECTION = 0.9466
 GRID_MISS_M = 0.24
-# Time for as many candidates on the laptop version of an RTX 4090.
+# Time for this number of candidates on the laptop version of an RTX 4090.
 TIMED_CANDIDATES, TIMED_S = 600, 0.3

@@ -31,8 +31,8 @@ class Crop:
 def crop_clouds(clouds: Clouds[Tensor], robots: RobotInputs[Tensor], n_points: int) -> Crop:
     """The first `n_points` stored points of each robot's cloud within `arm_reach_m` of the target, in 3D.
 
-    In stored order, whose first points are a farthest-point sample. Padding and points that are not finite
-    are left out.
+    They keep the stored order, in which the first are a farthest-point sample. Padding and points that are
+    not finite are left out.
     """
     device = clouds.points_m.device
     stored = clouds.points_m[robots.cloud_row]  # (R, P, 3)

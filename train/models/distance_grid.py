@@ -6,7 +6,7 @@ import numpy as np
 
 from datagen.train.inputs import F32, U8, Array, Bools, Ints
 
-# In cells. Squares of two of them fit in a byte.
+# In cells. The sum of two squares fits in a byte.
 FARTHEST = 11
 
 
@@ -14,7 +14,7 @@ class DistanceGrid:
     """Distances (m) from cells to the nearest cell with a point, at most `FARTHEST` cells."""
 
     def __init__(self, points_m: Array, low_m: Array, shape: tuple[int, int, int], cell_m: float) -> None:
-        """Of points (M, 3) in a box of `shape` cells whose corner is `low_m` (3,); others are left out."""
+        """Points (M, 3) outside the box of `shape` cells with its corner at `low_m` (3,) are left out."""
         self._low_m, self._shape, self._cell_m = low_m, shape, cell_m
         cell, inside = self._cells(points_m[np.isfinite(points_m).all(1)])
         square = np.full(shape, FARTHEST**2, np.uint8)

@@ -1,4 +1,4 @@
-"""Clouds and candidates whose inputs are already made, packed into arrays, so that they can be cached."""
+"""Clouds and candidates with the inputs of `shared` already computed, as arrays that can be cached."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Frames:
 def frames_of(
     base_xy_m: Tensor, target_rise_m: Tensor, camera_rise_m: Tensor, reach_m: Tensor, radius_m: Tensor
 ) -> Frames:
-    """Frames of candidates (N, 2) in the target frame; the rest (N,) are of their robots."""
+    """Frames of candidates (N, 2) in the target frame; other arguments (N,) are of their robots."""
     planar_m = torch.linalg.vector_norm(base_xy_m, dim=-1)
     forward = -base_xy_m / planar_m.clamp(min=_TINY_M)[..., None]
     return Frames(forward, planar_m, target_rise_m, camera_rise_m, reach_m, radius_m)

@@ -1,4 +1,4 @@
-"""What an arm at a candidate can do with the hand poses at the target: reach is learned, room is measured.
+"""Pooled hand poses at the target for an arm at a candidate: reach is learned, clearance is measured.
 
 Each pose of `hand_poses` is seen from the candidate's mount: where TCP and wrist are, in units of the arm's
 reach, at the grasp, before it and above it. Poses to the right of the line to the target are mirrored to its
@@ -15,7 +15,7 @@ from datagen.train.models.hand_poses import N_MEASURES
 from datagen.train.models.tokens import turned
 
 _WRIST_M, _WAY_M = 0.2, 0.1  # from the TCP back to the wrist; before the grasp, and up
-_NEAR = 0.05  # of the reach: nearer to the mount a direction is noise
+_NEAR = 0.05  # share of the reach; nearer to the mount a direction is noise
 N_SEEN_FROM_MOUNT = 26
 
 
@@ -55,12 +55,12 @@ def from_mount(axes: Tensor, frames: Frames) -> Tensor:
     level = turned(axes[..., :2], forward.expand(*axes.shape[:3], 2))
     left = level[..., 1]  # of TCP, approach and closing axis; a mirror changes the sign of each
     x, z = level[:, :, 2, 0], axes[:, :, 2, 2]
-    # By the approach; where the hand comes along the line, by its place or by how it is turned.
+    # By the approach; for an approach along the line, by the TCP, then by the closing axis.
     side = left[..., 1] + 0.1 * left[..., 0] + 0.01 * left[..., 2] * (x + z)
     level = torch.stack([level[..., 0], left * torch.where(side < 0, -1.0, 1.0)[..., None]], dim=-1)
     tcp, approach, closing = torch.cat([level, axes[..., 2:]], dim=-1).unbind(2)
     x, y, z = closing.unbind(-1)
-    closing = torch.stack([x * x, y * y, x * y, x * z, y * z], dim=-1)  # both fingers are alike
+    closing = torch.stack([x * x, y * y, x * y, x * z, y * z], dim=-1)  # the fingers are interchangeable
     reach = frames.arm_reach_m[:, None, None]
     away = torch.stack([frames.planar_m, torch.zeros_like(frames.planar_m), frames.target_rise_m], dim=-1)
     tip = (tcp + away[:, None]) / reach

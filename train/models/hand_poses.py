@@ -1,9 +1,9 @@
-"""Poses of a parallel hand at the target, and how much room the observed cloud leaves them.
+"""Poses of a parallel hand at the target, and their clearances in the observed cloud.
 
-A label is good where an arm reaches a grasp that is free in the scene. Which grasps are free can be seen
-without an arm: this module lays a grid of approach and closing directions over the target, moves the hand to
-where it would grip, and measures clearances there, on the way in and on the way up. Whether an arm reaches a
-pose from a base is left to the model (`hand_features.py`).
+A label is good where an arm reaches a grasp that is free in the scene. Free grasps can be found without an
+arm: this module lays a grid of approach and closing directions over the target, moves the hand to where it
+would grip, and measures clearances there, on the way in and on the way up. The model learns whether an arm
+reaches a pose from a base (`hand_pooling.py`).
 
 The target's unobserved back is a copy of its observed points, turned by half a turn about the vertical
 through its centre, as in `observed_visibility`. Directions begin at the side from which the target was seen,
@@ -22,14 +22,14 @@ from scipy.spatial import KDTree
 from datagen.train.inputs import F32, F64, Bools, Ints
 from datagen.train.models.distance_grid import DistanceGrid
 
-# The Franka Hand's collision shapes (robots' files in workers/robots): other parallel hands are alike.
+# The Franka Hand's collision shapes (robots' files in workers/robots): other parallel hands are similar.
 _STROKE_M = 0.08
 _PAD_M = 0.011  # half the width of a finger
 _TIP_M = 0.0095  # from the TCP to the fingertips, along the approach
 _FINGER_M = 0.015  # thickness of a finger, along the closing axis
 _PALM_M = (0.033, 0.105)  # half sizes of the palm across the approach
 _PALM_NEAR_M, _PALM_FAR_M = -0.0364, -0.13  # along the approach
-# Spheres that stand for the parts, along the approach and, of the palm, along the closing axis.
+# Centres of the parts' spheres along the approach, and for the palm along the closing axis too.
 _FINGER_Z_M = (-0.045, -0.03, -0.015, 0.0)
 _PALM_YZ_M = tuple((y, z) for z in (-0.066, -0.1) for y in (-0.08, -0.04, 0.0, 0.04, 0.08))
 _WRIST_Z_M = (-0.17, -0.22, -0.28)
@@ -38,14 +38,14 @@ _WAYS_M = (0.05, 0.1)  # back along the approach, and up
 
 # Tilts of the approach from straight down, azimuths, and turns of the hand about it.
 _DIRECTIONS = ((0, 1, 8), (20, 4, 4), (45, 8, 4), (70, 8, 4), (95, 8, 2))
-_GRIPS = 6  # places along the closing axis (middle, both walls) at two depths
+_GRIPS = 6  # positions along the closing axis (middle, both walls) at two depths
 _OPENS_M = 0.02  # how much wider than the target the hand opens
-_SUPPORT_GAP_M = 0.004  # what is kept from the plane that the target stands on
+_SUPPORT_GAP_M = 0.004  # distance kept from the plane that the target stands on
 _TARGET_POINTS, _SHAPE_POINTS = 128, 256
 _NEIGHBOURS = 9
 
 # Distances to the nearest observed point, on grids around the target.
-_AROUND_M, _CELL_M = 0.3, 0.01  # no arm is shorter: farther points are in no robot's crop
+_AROUND_M, _CELL_M = 0.3, 0.01  # no arm is shorter: these points are in every robot's crop
 _TARGET_AROUND_M, _TARGET_CELL_M = 0.12, 0.005
 _BEYOND_M = 0.1  # clearance outside of a grid
 
@@ -81,12 +81,12 @@ class _Hands:
         return self.tcp_m[:, None] + y * self.closing[:, None] + z * self.approach[:, None]
 
     def wrist(self) -> F64:
-        """Spheres (P, 3, 3) of what carries the hand."""
+        """Spheres (P, 3, 3) of the wrist, which carries the hand."""
         return self.tcp_m[:, None] + np.array(_WRIST_Z_M)[:, None] * self.approach[:, None]
 
 
 def poses_of_clouds(points_m: F32, target_mask: Bools, n_points: Ints, count: int) -> F32:
-    """`hand_poses` (S, count, HAND_WIDTH) of clouds (S, P, 3) of which the first `n_points` (S,) count."""
+    """`hand_poses` (S, count, HAND_WIDTH) of clouds (S, P, 3) with `n_points` (S,) valid first points."""
     found = np.zeros((len(n_points), count, HAND_WIDTH), np.float32)
     for row, n in enumerate(n_points):
         cloud_m, mask = points_m[row, :n], target_mask[row, :n]
@@ -111,7 +111,7 @@ def hand_poses(others_m: F32, target_m: F32, count: int) -> F32:
     seen_from = target[:_TARGET_POINTS, :2].mean(0)
     angle = float(np.arctan2(seen_from[1], seen_from[0])) if np.hypot(*seen_from) > 1e-4 else 0.0
     c, s = np.cos(angle), np.sin(angle)
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # from the frame that is seen from +x
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # from the frame in which the target is seen from +x
     measures, penalty, hands = _measured(others @ R, target @ R)
     best = np.argsort(penalty, kind="stable")[:count]
     axes = [v[best] @ R.T for v in (hands.tcp_m, hands.approach, hands.closing)]
@@ -189,12 +189,12 @@ def _frames() -> F64:
 def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
     """TCPs (D, 6, 3) in each direction's own axes, and the target's bounds (D, 3) there.
 
-    `local` (D, 3, N) are the target's points, `rise` (D, 3) is the height gained along each axis. At the
-    middle and at both walls, shallow and deep; where the hand would touch the support it is drawn back, or
-    moved up along the pads' width.
+    `local` (D, 3, N) are the target's points, `rise` (D, 3) is the height gained along each axis.
+    Grips are at the middle and at both walls, shallow and deep. A hand that would touch the support is moved
+    back, or up along the pads' width.
     """
     low, high = local.min(2), local.max(2)
-    places = np.stack([(low[:, 1] + high[:, 1]) / 2, low[:, 1] + 0.004, high[:, 1] - 0.004], axis=1)
+    positions = np.stack([(low[:, 1] + high[:, 1]) / 2, low[:, 1] + 0.004, high[:, 1] - 0.004], axis=1)
     across, up = rise[:, :1], rise[:, 2:]
     opening = np.minimum(high[:, 1:2] - low[:, 1:2] + _OPENS_M, _STROKE_M)
     deep = np.minimum(low[:, 2] + 0.032, (low[:, 2] + high[:, 2]) / 2 + 0.004)
@@ -204,7 +204,7 @@ def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
         x = np.repeat(np.median(local[:, 0], axis=1)[:, None], 3, axis=1)
 
         def missing(x: F64, z: F64) -> F64:
-            height = across * x + rise[:, 1:2] * places + up * z
+            height = across * x + rise[:, 1:2] * positions + up * z
             lowest = np.minimum(*_lowest(height, rise[:, None], opening))
             return np.maximum(_SUPPORT_GAP_M - (lowest - support_m), 0)
 
@@ -216,7 +216,7 @@ def _grips(local: F64, rise: F64, support_m: float) -> tuple[F64, F64, F64]:
             low[:, :1] + 0.004,
             np.maximum(high, low + 0.008)[:, :1] - 0.004,
         )
-        grips.append(np.stack([x, places, z], axis=2))
+        grips.append(np.stack([x, positions, z], axis=2))
     return np.concatenate(grips, axis=1), low, high
 
 
@@ -231,8 +231,10 @@ def _lowest(tcp_height_m: F64, rise: F64, opening_m: F64) -> tuple[F64, F64]:
 
 
 def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64], list[F64]]:
-    """Clearances (P,) from other objects: nearer finger, other finger, palm, wrist; fingers and palm on two
-    places of the way in; all on two of the way up. From the target: fingers, palm.
+    """Clearances (P,) each, from other objects and from the target.
+
+    From others: nearer finger, other finger, palm, wrist; fingers, and palm, at two positions on the way in;
+    all at two positions on the way up. From the target: fingers, palm.
     """
     fingers, palm, wrist = hands.fingers(), hands.palm(), hands.wrist()
     others = partial(_around(others_m, _AROUND_M, _CELL_M), outside_m=_BEYOND_M)
@@ -252,7 +254,7 @@ def _clearances(hands: _Hands, others_m: F64, target_m: F64) -> tuple[list[F64],
 
 
 def _around(points_m: F64, half_m: float, cell_m: float) -> DistanceGrid:
-    """Distances to points in a cube around the origin. Measures are cut off before its farthest."""
+    """Distances to points in a cube around the origin. Measures are clipped below its largest distance."""
     cells = round(2 * half_m / cell_m)
     return DistanceGrid(points_m, np.full(3, -half_m), (cells, cells, cells), cell_m)
 

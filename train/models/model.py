@@ -29,7 +29,7 @@ class Model(nn.Module, ABC):
     """
 
     name: ClassVar[str]
-    # Methods that take most of the time, of tensors alone: `fast` compiles them.
+    # Methods on tensors alone that take most of the time: `fast` compiles them.
     hot: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
@@ -46,7 +46,7 @@ class Model(nn.Module, ABC):
     def forward(
         self, clouds: Clouds[Tensor], candidates: CandidateInputs[Tensor], robots: RobotInputs[Tensor]
     ) -> Tensor:
-        """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) go through it."""
+        """As `score`; wrappers of modules (DistributedDataParallel, torch.compile) call it."""
 
     @property
     def logit_layer(self) -> nn.Module | None:
@@ -66,7 +66,7 @@ class Model(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
 

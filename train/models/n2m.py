@@ -1,4 +1,4 @@
-"""A mixture of Gaussians over base positions, predicted from the local cloud at once, in the manner of N2M.
+"""A mixture of Gaussians over base positions, predicted from the local cloud in one pass, as in N2M.
 
 N2M (Chai, Lee and Lim 2025, arXiv 2509.18671) encodes an egocentric cloud and decodes a Gaussian mixture over
 base poses, fitted by maximum likelihood to poses from which rollouts succeeded; poses are sampled from it
@@ -6,11 +6,10 @@ until one is free. Here the mixture is a rate: with
 
     rate(x) = sum_k w_k N(x; m_k, C_k),    P(label 1 at x) = 1 - exp(-rate(x)),
 
-labels are those of a Poisson process of good positions that is observed where candidates were proposed. Their
-likelihood, which the usual loss is, is that of the good positions, as in N2M, times that of their number. The
-rate is a density ratio: it counts in units of the density with which candidates were proposed, so no weights
-are needed. The score thus also says whether there is a good position at all, which a normalised density
-cannot.
+labels are those of a Poisson process of good positions that is observed where candidates were proposed. The
+usual loss is their likelihood: that of the good positions, as in N2M, times that of their number. The rate is
+a density ratio: it counts in units of the density with which candidates were proposed, so no weights are
+needed. The score thus also predicts whether any position is good, which a normalised density cannot.
 
 Further differences: a PointNet (Qi et al. 2017, arXiv 1612.00593) without pretraining in place of Point-BERT;
 the robot's heights and reach as inputs, since runs hold many robots; positions alone, since bases face the
@@ -59,7 +58,7 @@ class N2mModel(Model):
 
     The rate is the mean over the four frames along the principal axes, two of them mirrored, so that it is
     the same for every direction of the scene (frame averaging, Puny et al. 2022, arXiv 2110.03336). In
-    training each robot has one of them, drawn anew in each step.
+    training each robot has one of them, sampled in each step.
     """
 
     name = "n2m"
@@ -111,9 +110,9 @@ class N2mModel(Model):
         above_mount_m, on_target = crop.points_m[..., 2], crop.target_mask.to(height_m.dtype)
         alike = torch.cat([torch.stack([height_m, above_mount_m, on_target], dim=2), crop.rgb], dim=2)
         features = torch.cat([views, alike[:, None].expand(-1, views.shape[1], -1, -1)], dim=3)
-        there = crop.valid[:, None, :, None]
-        hidden = self.points(features) * there
-        mean = hidden.sum(2) / there.sum(2).clamp(min=1)
+        valid = crop.valid[:, None, :, None]
+        hidden = self.points(features) * valid
+        mean = hidden.sum(2) / valid.sum(2).clamp(min=1)
         rise, radius = crop.target_rise_m, _radius_m(crop)
         of_robot = torch.stack([reach_m, rise, rise / reach_m, 10 * radius], dim=1)
         of_robot = of_robot[:, None].expand(-1, views.shape[1], -1)

@@ -11,7 +11,7 @@ Our choices where the paper gives none:
 - Sizes and radii are those of PointNet++'s single-scale classifier, in metres.
 - Colours are between 0 and 1. Only colour and position distinguish the candidate from a black object.
 - The 50 points follow the cloud, so a ball query takes them after the surface's. Farthest-point sampling
-  begins with the candidate as one point and continues in the robot's cloud: one sample a robot.
+  begins with the candidate as one point and continues in the robot's cloud: one sample per robot.
 """
 
 from __future__ import annotations

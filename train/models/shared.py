@@ -9,9 +9,9 @@ product with (cos, sin, cos 2, sin 2) of the frame's angle:
     token_kj = relu(A f_j + turn_k(V f_j) + B g_kj + C s_k)
 
 then a small layer, and the maximum and the mean over each kind of token, joined with the candidate's
-scalars s_k and with what the arm can do with poses of a hand at the target (`hand_pooling.py`). The logits
-do not change when cloud and candidates rotate together about the vertical, nor, if `mirrored`, when the scene
-is mirrored at a candidate's line to the target: the mean over both sides is taken.
+scalars s_k and with pooled poses of a hand at the target (`hand_pooling.py`). The logits do not change when
+cloud and candidates rotate together about the vertical, nor, if `mirrored`, when the scene is mirrored at a
+candidate's line to the target: the mean over both sides is taken.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class SharedConfig(ModelConfig):
     dropout: float = Field(default=0.4, ge=0, lt=1)
     camera: Literal["given", "unknown"] = "given"
     observed_visibility: bool = True
-    hand_poses: int = Field(default=64, ge=0, le=104)  # at the target, that the cloud leaves room for
+    hand_poses: int = Field(default=64, ge=0, le=104)  # at the target; 0 for none
     mirrored: bool = True
 
 
@@ -164,7 +164,7 @@ class SharedModel(Model):
     def encode(self, clouds: Clouds[Tensor], robots: RobotInputs[Tensor]) -> Tokens:
         """The clouds' tokens, the same for all candidates; without parameters, so they can be cached.
 
-        Those that `EncodedClouds` bring are not made again.
+        Tokens of `EncodedClouds` are unpacked instead.
         """
         if isinstance(clouds, EncodedClouds):
             return unpack(clouds, token_sizes(len(self.sizes.scales_m)))
@@ -306,10 +306,10 @@ class SharedModel(Model):
         """Maximum and mean (r, c, F) over each kind of tokens (r, c, J, W)."""
         seen = self.seen(tokens) * valid[:, None, :, None]
         parts: list[Tensor] = []
-        for of_kind, there in zip(
+        for of_kind, mask in zip(
             seen.split(self.sizes.tokens, dim=2), valid.split(self.sizes.tokens, dim=1), strict=True
         ):
-            n = there.sum(1).clamp(min=1)[:, None, None]
+            n = mask.sum(1).clamp(min=1)[:, None, None]
             parts += [of_kind.amax(2), of_kind.sum(2) / n]
         return torch.cat(parts, dim=2)
 

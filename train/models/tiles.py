@@ -1,7 +1,7 @@
-"""How candidates are divided: into tiles for one product each, and into parts for threads.
+"""Division of candidates: into tiles for one product each, and into parts for threads.
 
-Torch divides each product among its threads. Numpy's share and everything between products is left to one of
-them. Parts of the candidates, each scored by a thread of its own, keep all cores busy.
+Torch divides each product among its threads; numpy and everything between products use one of them. Parts of
+the candidates, each scored by a thread of its own, keep all cores busy.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[
     """The results of `work`, in inference mode, in the order of the parts."""
 
     def inferring(part: Part) -> Result:
-        with torch.inference_mode():  # a thread's own
+        with torch.inference_mode():  # the mode is per thread
             return work(part)
 
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # for the threads that begin now
+    torch.set_num_threads(1)  # for the new threads
     try:
         with ThreadPoolExecutor(len(parts)) as pool:
             return list(pool.map(inferring, parts))

@@ -174,5 +174,5 @@ def _moment_sums(centres: Tensor, points: Tensor, lifted: Tensor, scales_m: Sequ
 def _moments(sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean position (..., 3), covariance (..., 6), mean of colour and mask (..., 4) from sums (..., 14)."""
     means = sums[..., 1:] / sums[..., :1].clamp(min=1e-6)
-    place, products, rest = means.split([3, 6, 4], dim=-1)
-    return place, products - place[..., _LEFT] * place[..., _RIGHT], rest
+    mean, products, rest = means.split([3, 6, 4], dim=-1)
+    return mean, products - mean[..., _LEFT] * mean[..., _RIGHT], rest

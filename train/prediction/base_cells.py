@@ -24,20 +24,20 @@ SEEN_SHARE = 0.8
 _LEAST_POINTS = 3
 _CELL_M = CELL_M
 _GAP_CELLS = 4  # gaps up to twice as wide are closed
-# Table tops and shelves reach down below the top that is seen of them, by about so much.
+# Boards of tables and shelves reach about this far below their visible top.
 _BOARD_M = 0.08
-_AROUND_M = 3.0  # farther from the grid's middle nothing matters
+_AROUND_M = 3.0  # from the grid's middle; farther points are ignored
 _THIN_M = 0.01  # points of obstacles are counted in cells of this side
 
 
 @dataclass(frozen=True)
 class RobotSize:
-    """The robot whose base is looked for; heights above the floor."""
+    """The robot to place; heights above the floor."""
 
     camera_height_m: float
     base_height_m: float
     arm_reach_m: float
-    footprint: Footprint | None = None  # None: the circle that the base of such an arm has in runs
+    footprint: Footprint | None = None  # None: the circular base of such an arm in runs
 
     @property
     def outline(self) -> Footprint:
@@ -49,7 +49,7 @@ class RobotSize:
 
 @dataclass(frozen=True, eq=False)
 class BaseCells:
-    """N base positions around the target, with what stands there."""
+    """N base positions around the target, with their states."""
 
     offset_m: F32  # (N, 2), from the target's centre, world axes
     state: I64  # (N,), index into STATES
@@ -68,10 +68,10 @@ def observe_cells(
 ) -> BaseCells:
     """The grid around the target, each cell blocked, unreachable, unseen or clear, in this order.
 
-    Blocked where observed points lie in the base's outline between the floor and a board's thickness above
-    the mount, or within the mast's radius from there to the camera; unreachable where no way leads there
-    (`floor_ways`); unseen where too little of the floor below it, or of the way, was seen. A polygon must
-    also fit where the base turns up to twice `yaw_error_rad` too far.
+    A cell is blocked where observed points lie in the base's outline between the floor and a board's
+    thickness above the mount, or within the mast's radius from there to the camera. It is unreachable where
+    no way leads there (`floor_ways`), and unseen where too little of the floor below it, or of the way, was
+    seen. A polygon must also fit where the base turns up to twice `yaw_error_rad` too far.
     """
     offsets, base = grid_offsets(params), robot.outline
     base_xy, yaw = center_m[:2] + offsets, yaws_to_target(offsets.astype(np.float32))
@@ -80,16 +80,16 @@ def observe_cells(
     is_floor = np.any([floor_points(seen.points_m, eye) for eye in seen.eyes_m], axis=0)
     above = (z > STEP_M + 2 * depth_error_m(gap_m)) & ~is_floor
     mount, top = robot.base_height_m, max(robot.camera_height_m, robot.base_height_m)
-    stands = seen.points_m[above & (z < mount + _BOARD_M)]
+    low_points = seen.points_m[above & (z < mount + _BOARD_M)]
     tops = seen.points_m[above & (z >= mount) & (z < top)]
     floor = seen.points_m[is_floor]
     high = _counts(tops, base_xy, yaw, Footprint(params.mast_radius_m))
     turns = (-2 * yaw_error_rad, 0.0, 2 * yaw_error_rad) if yaw_error_rad and base.corners_m else (0.0,)
-    low = np.max([_counts(stands, base_xy, yaw + turn, base) for turn in turns], axis=0)
+    low = np.max([_counts(low_points, base_xy, yaw + turn, base) for turn in turns], axis=0)
     blocked = (low >= _LEAST_POINTS) | (high >= _LEAST_POINTS) | _in_shadow(tops, base_xy)
     share = _floor_share(floor, base_xy, yaw, base)
     way = ways_to(
-        draw_map(base_xy, seen.eyes_m, stands, tops, floor),
+        draw_map(base_xy, seen.eyes_m, low_points, tops, floor),
         base_xy + _turned(np.broadcast_to(base.middle_m, (1, 2)), yaw)[:, 0],
         base.turning_radius_m - base.width_m,
         base.turning_radius_m,
@@ -113,7 +113,7 @@ def seen_share(cloud_m: F32, radius_m: float) -> float:
 
 
 def _counts(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> I64:
-    """Points (N, 3) in the outline of each base, seen from above."""
+    """Number of points (N, 3) in the outline of each base, seen from above."""
     near = np.abs(points_m[:, :2] - base_xy.mean(axis=0)).max(axis=1, initial=0) < _AROUND_M
     xy = points_m[near, :2].astype(np.float64)
     low = base_xy.mean(axis=0) - _AROUND_M
@@ -128,7 +128,7 @@ def _counts(points_m: F32, base_xy: F64, yaw: F64, base: Footprint) -> I64:
     point = np.concatenate([*found, np.empty(0)]).astype(np.int64)
     if base.corners_m:
         rel, c, s = thin[point] - base_xy[row], np.cos(yaw[row]), np.sin(yaw[row])
-        # Most points are in many outlines: all are looked at in one go.
+        # Most points are in many outlines: all pairs are tested at once.
         inside = base.holds(np.column_stack([c * rel[:, 0] + s * rel[:, 1], c * rel[:, 1] - s * rel[:, 0]]))
         row, point = row[inside], point[inside]
     return np.bincount(row, weight[point], len(base_xy)).astype(np.int64)
@@ -147,7 +147,7 @@ def _occupied(points_m: F32, low: F64, cell_m: float, size: tuple[int, int]) -> 
 
 
 def _in_shadow(tops_m: F32, base_xy: F64) -> Bools:
-    """Bases (N,) in a gap of a surface above the mount: the object that casts the gap is there."""
+    """Mask (N,) of bases in a gap of a surface above the mount: an object there hides the surface."""
     n = int(2 * _AROUND_M / _CELL_M)
     low = base_xy.mean(axis=0) - _AROUND_M
     closed = ndimage.binary_closing(_occupied(tops_m, low, _CELL_M, (n, n)), iterations=_GAP_CELLS)

@@ -1,4 +1,4 @@
-"""Choose a base pose: the best score, or the best expected success where the robot arrives off it."""
+"""Choose a base pose: the best score, or the best expected success with an arrival error."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Choice:
     """The chosen base pose, as a row of the cells; None where none may be chosen."""
 
     best: int | None
-    nominal: int | None  # that with the best score
+    nominal: int | None  # the row with the best score
     expected: F64 | None  # (N,) success expected with the arrival error; None without one
-    miss_m: float | None  # how far the robot may miss the best in any direction, scores staying good
+    miss_m: float | None  # distance by which the robot may miss the best while scores stay good
 
 
 def choose(
@@ -27,8 +27,8 @@ def choose(
 ) -> Choice:
     """The best of the cells in an `allowed` state; with an arrival error by the mean score on arrival.
 
-    A robot that arrives where a base is in another state fails. Scores stay good from `threshold` on; a
-    method that only picks has none (nan), and no `miss_m`.
+    A robot that arrives where a base is in another state fails. Scores from `threshold` on are good; without
+    a threshold (nan) there is no `miss_m`.
     """
     can_stand = np.isin(cells.state, [STATES.index(name) for name in allowed])
     rows = np.flatnonzero(can_stand)

@@ -1,4 +1,4 @@
-"""Refuse a click on a wall, a table or the floor: a plane far wider than anything that a gripper takes."""
+"""Refuse a click on a wall, a table or the floor: a plane far wider than a gripper can hold."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.ground import depth_error_m
 
 _NEAR_PX = 6  # around the click, for the plane through it
-_SECTORS = 8  # of directions in the plane, in which it is followed
-# A plane that goes as far in that many of them is a surface of the room; at the corner of a table, a quarter.
+_SECTORS = 8  # sectors of directions in which the plane is followed
+# A plane that extends this far in this number of sectors is a surface of the room; a corner fills a quarter.
 _FAR_SHARE, _LEAST_SECTORS = 0.8, 3
-_LEAST_FILLED = 0.5  # share of each such sector's ring in which it must be
-_LEVEL, _UPRIGHT = 0.9, 0.3  # of the normal's z
+_LEAST_FILLED = 0.5  # share of such a sector's ring that the plane fills
+_LEVEL, _UPRIGHT = 0.9, 0.3  # limits of the normal's z
 _ON_FLOOR_M = 0.04
 _FIX = "Click on the target itself, or give --mask"
 
@@ -25,13 +25,13 @@ def refuse_surface(
     depth_m: F32,
     joined: Bools,
     click: tuple[int, int],
-    asked: tuple[int, int],
+    pixel: tuple[int, int],
     within_m: float,
 ) -> None:
     """InputError where pixel (u, v) lies on a plane that extends at least about `within_m` around it.
 
     `grid` (H, W, 3) are the pixels' points and `facets` (H, W, 3) their areas times normals, world; `joined`
-    (H, W) says where depth does not jump. The error names the pixel `asked`.
+    (H, W) is false where depth jumps. The error names `pixel`, the pixel in the full image.
     """
     u, v = click
     patch = np.s_[max(v - _NEAR_PX, 0) : v + _NEAR_PX + 1, max(u - _NEAR_PX, 0) : u + _NEAR_PX + 1]
@@ -45,7 +45,7 @@ def refuse_surface(
     off_m = np.abs(rel @ normal)
     gap_m = np.linalg.norm(rel, axis=2)
     on = joined & (depth_m > 0) & (gap_m < within_m) & (off_m < 0.006 + 2 * depth_error_m(depth_m))
-    # A plane's pixels face as it does: the strip that it cuts from another surface does not count.
+    # A plane's pixels face the same way: a strip that it cuts from another surface does not count.
     along = np.einsum("ijk,k->ij", facets, normal)
     on &= along > 0.8 * np.linalg.norm(facets, axis=2)
     labels = np.zeros(on.shape, np.int64)
@@ -64,7 +64,7 @@ def refuse_surface(
         return
     long_m, short_m = np.sort(np.ptp(plane[on], axis=0))[::-1]
     raise InputError(
-        "--click", f"{asked[0]},{asked[1]}", f"lies on {_words(normal, grid[on], long_m, short_m)}", _FIX
+        "--click", f"{pixel[0]},{pixel[1]}", f"lies on {_words(normal, grid[on], long_m, short_m)}", _FIX
     )
 
 

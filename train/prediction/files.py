@@ -23,10 +23,10 @@ MAX_PIXELS = 4096 * 4096
 MAX_FILE_BYTES = 256 * 2**20
 FILE_FIX = "Name an existing, smaller file"
 _MAX_JSON_BYTES = 2**20
-# The largest entry of R R^T - I: poses travel as text of four or five digits.
+# The largest entry of R R^T - I: poses are often text of four or five digits.
 _POSE_ROUNDING = 1e-3
 _EXTENT_M = 1000.0
-# Farther than this no depth camera measures; it is what saturated values look like.
+# No depth camera measures farther; larger values are saturated.
 MAX_DEPTH_M = 20.0
 # The least and largest value of each.
 _INTRINSICS: dict[str, tuple[float, float]] = {
@@ -48,7 +48,7 @@ def read_rgb(path: Path) -> U8:
 
 
 def read_mask(path: Path) -> Bools:
-    """Where a PNG (H, W) is not black; of one with an alpha channel, the colours count alone."""
+    """Mask (H, W) of the pixels of a PNG that are not black; an alpha channel is ignored."""
     pixels = np.asarray(_opened(path, ("PNG",), "RGB"))
     return np.asarray(pixels.any(axis=2), np.bool_)
 
@@ -63,7 +63,7 @@ def read_depth(path: Path, depth_scale_m: float) -> F32:
 
 
 def valid_depth(depth_m: F32) -> F32:
-    """Depth (H, W) with 0 for what is not finite, not positive or beyond what a depth camera measures."""
+    """Depth (H, W) with 0 for values that are not finite, not positive or beyond `MAX_DEPTH_M`."""
     good = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= MAX_DEPTH_M)
     return np.where(good, depth_m, np.float32(0)).astype(np.float32)
 
@@ -93,7 +93,7 @@ def read_pose(path: Path) -> F64:
 
 
 def checked_pose(T: F64, place: str) -> F64:
-    """The pose with its rotation made exact. InputError for NaN and for what is no rotation."""
+    """The pose with its rotation made exact. InputError for NaN and for a part that is no rotation."""
     fix = "Give T_world_camera as 4x4: a rotation, a position in metres, and the row 0 0 0 1"
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(place, "T_world_camera", "is not 4x4 finite numbers", fix)
@@ -109,7 +109,7 @@ def checked_pose(T: F64, place: str) -> F64:
 
 
 def read_arrays(path: Path) -> dict[str, Array]:
-    """Those of `NAMES` that the archive holds. InputError for objects, bombs and what is no archive."""
+    """Those of `NAMES` that the archive holds. InputError for objects, zip bombs and other files."""
     data = read_regular(path, MAX_FILE_BYTES, FILE_FIX)
     found: dict[str, Array] = {}
     try:
@@ -132,7 +132,7 @@ def read_arrays(path: Path) -> dict[str, Array]:
 
 
 def _array(path: Path, name: str, data: bytes) -> Array:
-    """One array of numbers; its header is held against its bytes before anything of its size is made."""
+    """One array of numbers; its header is compared with its bytes before memory is allocated."""
     if len(data) > _MAX_ARRAY_BYTES:
         raise InputError(path, name, f"unpacks to more than {_MAX_ARRAY_BYTES:,} bytes", _NPZ_FIX)
     file = io.BytesIO(data)

@@ -15,29 +15,29 @@ from datagen.train.inputs import F32, F64, I64, Bools
 CELL_M = 0.04
 # How a base gets there: over floor that was seen, over floor of which some is out of sight, or not at all.
 WAYS = ("seen", "unseen", "none")
-_MARGIN_M = 2.5  # of the map around the base poses, for ways around obstacles
+_MARGIN_M = 2.5  # margin of the map around base poses, for ways around obstacles
 _EYE_M = 6.0  # a camera farther from the target than this is outside the map
-_BEARINGS = 360  # of the circle around a camera
-_SIGHT_POINTS = 60_000  # are enough for them
-# Of the points in one bearing, as many may be stray at either end.
+_BEARINGS = 360  # directions around a camera
+_SIGHT_POINTS = 60_000  # points used for all bearings
+# Number of points at either end of a bearing that may be stray.
 _STRAY = 3
-# What ends the sight along a bearing is a wall where it rises by this within the depth, or above the camera.
+# The end of sight along a bearing is a wall if it rises by this within the depth, or above the camera.
 _RISE_M, _DEPTH_M = 0.3, 0.15
-_SMOOTH = 9  # bearings of which most must end at a wall: a bottle in front of the image's edge is none
+_SMOOTH = 9  # bearings of which most must end at a wall, unlike at a bottle before the image's edge
 _BEHIND_M = 0.1
-_BLIND_M, _STEPS = 2.0, 2  # from a camera to the first floor that it sees; cells that are gone at once
-# Share of the floor below a base that must be known on the way: where an image ends, its middle still is.
+_BLIND_M, _STEPS = 2.0, 2  # from a camera to the first floor that it sees; cells per step
+# Share of the floor below a base that must be known on the way: half, as at the edge of an image.
 _LEAST_KNOWN = 0.5
 _LEAST_PATCH = 25  # cells of floor, 0.04 m2, from which ways may begin
 
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:
-    """What was observed, on a grid of X x Y cells whose corner is at `low_m`, world."""
+    """Observed obstacles and floor on a grid of X x Y cells with its corner at `low_m`, world."""
 
     low_m: F64  # (2,)
     low_obstacle: Bools  # (X, Y), in the way of the base
-    mast_obstacle: Bools  # (X, Y), in the way of what stands on it
+    mast_obstacle: Bools  # (X, Y), in the way of the mast
     floor: Bools  # (X, Y), floor was seen
 
     def rows(self, xy_m: F64) -> tuple[I64, I64]:
@@ -55,8 +55,9 @@ class FloorMap:
 
 
 def draw_map(base_xy_m: F64, eyes_m: F64, low_points_m: F32, mast_points_m: F32, floor_m: F32) -> FloorMap:
-    """The map around base positions (N, 2) and cameras (F, 3), of points (M, 3) that stand in a base's way
-    below the mount, above it, and of floor.
+    """The map around base positions (N, 2) and cameras (F, 3), world.
+
+    Points (M, 3) are those of obstacles below the mount, of obstacles above it, and of floor.
     """
     middle = base_xy_m.mean(axis=0)
     near = eyes_m[np.linalg.norm(eyes_m[:, :2] - middle, axis=1) < _EYE_M, :2]
@@ -82,10 +83,10 @@ def ways_to(
     points_m: F32,
     eyes_m: F64,
 ) -> I64:
-    """How a circular base of `radius_m` comes from the cameras to its middles (N, 2): index into `WAYS`.
+    """Index (N,) into `WAYS` for a circular base of `radius_m` from the cameras to each middle (N, 2).
 
-    `slack_m` is how far the last bit may be for a base that is narrower than its circle. `points_m` (M, 3)
-    are all that was observed. No way leads through what lies behind a wall as seen from all cameras (F, 3).
+    A base that is narrower than its circle may end up to `slack_m` off a way. `points_m` (M, 3) are all
+    observed points. No way leads through cells behind a wall as seen from all cameras (F, 3).
     """
     near, ends = _sights(points_m, eyes_m)
     hidden = _hidden(floor_map, ends, eyes_m)
@@ -103,7 +104,7 @@ def ways_to(
 
 
 def counted(points_m: F32 | F64, low: F64, cell_m: float, size: tuple[int, int]) -> I64:
-    """Points (N, 2 or more) in each cell (size) of a grid on the floor with its corner at `low` (2,)."""
+    """Number of points (N, 2 or more) in each cell (size) of a floor grid with its corner at `low` (2,)."""
     cells = np.floor((points_m[:, :2] - low) / cell_m).astype(np.int64)
     x, y = cells[((cells >= 0) & (cells < size)).all(axis=1)].T
     return np.bincount(x * size[1] + y, minlength=size[0] * size[1]).reshape(size)
@@ -145,14 +146,14 @@ def _share(known: Bools, radius_m: float) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Where sight ends along each bearing of one camera."""
+    """Ends of sight along each bearing of one camera."""
 
-    far_m: F64  # (_BEARINGS,) distance on the floor to the farthest thing; 0 where nothing was measured
+    far_m: F64  # (_BEARINGS,) distance on the floor to the farthest point; 0 without points
     is_wall: Bools  # (_BEARINGS,)
 
 
 def _sights(points_m: F32, eyes_m: F64) -> tuple[list[F64], list[_Ends]]:
-    """For each camera: floor distance to the nearest thing along each bearing (_BEARINGS,), and its ends."""
+    """For each camera: floor distance to the nearest point along each bearing (_BEARINGS,), and its ends."""
     nearest, ends = list[F64](), list[_Ends]()
     points_m = points_m[:: max(1, len(points_m) // _SIGHT_POINTS)]
     for eye in eyes_m:
@@ -182,7 +183,7 @@ def _bearing(rel_m: F32 | F64) -> I64:
 
 
 def _hidden(floor_map: FloorMap, ends: list[_Ends], eyes_m: F64) -> Bools:
-    """Cells (X, Y) behind a wall for a camera, that no other looks over and where no floor was seen."""
+    """Cells (X, Y) behind a wall for a camera, out of sight of the others, and without observed floor."""
     behind, beyond = np.zeros(floor_map.floor.shape, np.bool_), np.zeros(floor_map.floor.shape, np.bool_)
     for eye, end in zip(eyes_m, ends, strict=True):
         rel = floor_map.centres() - eye[:2]
@@ -194,9 +195,9 @@ def _hidden(floor_map: FloorMap, ends: list[_Ends], eyes_m: F64) -> Bools:
 
 
 def _blind(floor_map: FloorMap, near: list[F64], eyes_m: F64, radius_m: float) -> Bools:
-    """Cells (X, Y) below the image of a camera: around itself, and up to the nearest thing of each bearing.
+    """Cells (X, Y) below the image of a camera: around it, and up to the nearest point of each bearing.
 
-    They count as free on the way: the robot that took the frame stands there.
+    They count as free on the way: the robot that took the frame stood there.
     """
     blind = np.zeros(floor_map.floor.shape, np.bool_)
     for eye, near_m in zip(eyes_m, near, strict=True):
@@ -207,10 +208,10 @@ def _blind(floor_map: FloorMap, near: list[F64], eyes_m: F64, radius_m: float) -
 
 
 def _reached(fits: Bools, known: Bools, seen: Bools, starts: tuple[I64, I64]) -> tuple[Bools, Bools]:
-    """Cells that the starts are connected with over `fits`, and those over `known`, a part of them.
+    """Cells connected with the starts over `fits`, and cells connected over `known`, a part of `fits`.
 
-    A start that does not fit begins at the nearest cell that does. Known ways also begin at the `seen` floor
-    that is nearest to it on the way, within `_BLIND_M`: between the two no camera sees.
+    A start that does not fit moves to the nearest cell that does. Known ways also begin at the nearest `seen`
+    floor on the way, within `_BLIND_M`: no camera sees the floor before it.
     """
     begins = np.zeros_like(fits)
     if not fits.any():

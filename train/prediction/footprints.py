@@ -12,9 +12,9 @@ from datagen.train.inputs import F64, Bools
 from datagen.workers.geometry.planar import inside_polygon
 from datagen.workers.robots import ROBOTS, robot_limits
 
-_SMALLEST_M, _LARGEST_M = 0.02, 2.0  # of any base, from the mount's axis
+_SMALLEST_M, _LARGEST_M = 0.02, 2.0  # limits of a base, from the mount's axis
 _MOST_CORNERS = 256
-_SIDES = 48  # of a circle where it is drawn
+_SIDES = 48  # sides of a drawn circle
 _FIX = "Give a radius (0.28), corners in order (0.3,0.2;-0.3,0.2;-0.3,-0.2;0.3,-0.2) or a robot's name"
 
 
@@ -39,7 +39,7 @@ class Footprint:
 
     @property
     def middle_m(self) -> F64:
-        """Middle (2,) of the polygon's bounding box: a base turns about it, near enough."""
+        """Middle (2,) of the polygon's bounding box: a base turns approximately about it."""
         corners = self.polygon_m
         return (corners.min(axis=0) + corners.max(axis=0)) / 2
 
@@ -56,7 +56,7 @@ class Footprint:
         return self.radius_m if not self.corners_m else float(np.ptp(self.polygon_m, axis=0).min() / 2)
 
     def holds(self, points_m: F64) -> Bools:
-        """Which points (N, 2) in the base's frame lie in it."""
+        """Mask (N,) of points (N, 2), in the base's frame, that lie in it."""
         if not self.corners_m:
             return np.hypot(*points_m.T) <= self.radius_m
         return inside_polygon(points_m, self.polygon_m)
@@ -76,7 +76,7 @@ class Footprint:
 def read_footprint(given: str | float | Sequence[Sequence[float]] | Footprint) -> Footprint:
     """A footprint of a radius (m), of corners as "x,y;x,y;..." or rows, or of a robot by its name.
 
-    InputError for what is none of these, and for a robot that stands on a pedestal.
+    InputError for other values, and for a robot that stands on a pedestal.
     """
     if isinstance(given, Footprint):
         return given
@@ -96,7 +96,7 @@ def read_footprint(given: str | float | Sequence[Sequence[float]] | Footprint) -
 
 
 def circle_footprint(radius_m: float, place: str = "--footprint") -> Footprint:
-    """The circle of a radius. InputError where it is not one of a base."""
+    """The circle of a radius. InputError where the radius is out of range."""
     if not _SMALLEST_M <= radius_m <= _LARGEST_M:
         problem = f"has no radius from {_SMALLEST_M:g} to {_LARGEST_M:g} m"
         raise InputError(place, f"{radius_m:g}", problem, _FIX)
@@ -133,7 +133,7 @@ def _crosses_itself(corners: F64) -> bool:
     along = (ends - corners)[:, None]
 
     def side(points: F64) -> F64:
-        """On which side (K, K) of each side's line the points (K, 2) are: 1 left, -1 right, 0 on it."""
+        """Side (K, K) of each edge's line on which points (K, 2) are: 1 left, -1 right, 0 on it."""
         rel = points[None] - corners[:, None]
         return np.sign(along[..., 0] * rel[..., 1] - along[..., 1] * rel[..., 0])
 

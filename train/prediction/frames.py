@@ -25,7 +25,7 @@ from datagen.train.prediction.files import (
 from datagen.train.prediction.ply import read_ply
 
 DEPTH_SCALE_M = 0.001
-# Of a folder that holds one frame.
+# Files of a folder that holds one frame.
 RGB, DEPTH, INTRINSICS, MASK, POSE = "color.png", "depth.png", "intrinsics.json", "mask.png", "pose.json"
 
 
@@ -76,7 +76,7 @@ class RgbdImage:
         return facets * np.sign(towards)[..., None]
 
     def world_grid(self, T: F64, depth_m: F32 | None = None) -> F64:
-        """Points (H, W, 3) of all pixels in T's parent frame; those without depth lie in the camera."""
+        """Points (H, W, 3) of all pixels in T's parent frame; those without depth lie at the camera."""
         h, w = self.depth_m.shape
         return moved(self.points(np.arange(h * w), depth_m), T).reshape(h, w, 3)
 
@@ -94,7 +94,7 @@ class SensorFrame:
 
 
 def moved(points_m: F32 | F64, T: F64) -> F64:
-    """Points (N, 3) by a transform (4, 4).
+    """Points (N, 3) moved by a transform (4, 4).
 
     Written out: a product of a long and a 3x3 matrix costs BLAS ten times as much, most of it in threads.
     """
@@ -124,8 +124,9 @@ def read_frame(
 
 
 def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> SensorFrame:
-    """The frame of a folder (color.png, depth.png, intrinsics.json, and if there: mask.png, pose.json),
-    of an .npz archive or of a .ply cloud.
+    """The frame of a folder, of an .npz archive or of a .ply cloud.
+
+    A folder holds color.png, depth.png, intrinsics.json, and optionally mask.png and pose.json.
     """
     path = Path(place)
     match path.suffix.lower():
@@ -143,9 +144,9 @@ def read_place(place: str | Path, depth_scale_m: float = DEPTH_SCALE_M) -> Senso
             raise InputError(path, "--frame", "is not a frame", fix)
 
 
-def image_frame(image: RgbdImage, T_world_camera: F64 | None, places: dict[str, str]) -> SensorFrame:
-    """The frame of an image; `places` names the sources of rgb, depth and mask in errors."""
-    where = {name: places.get(name, name) for name in ("rgb", "depth", "mask")}
+def image_frame(image: RgbdImage, T_world_camera: F64 | None, sources: dict[str, str]) -> SensorFrame:
+    """The frame of an image; `sources` names the files of rgb, depth and mask in errors."""
+    where = {name: sources.get(name, name) for name in ("rgb", "depth", "mask")}
     for name, picture in (("rgb", image.rgb), ("mask", image.mask)):
         if picture is not None and picture.shape[:2] != image.depth_m.shape:
             problem = f"has {_size(picture)} pixels, but the depth image {_size(image.depth_m)}"

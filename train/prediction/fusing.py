@@ -14,14 +14,14 @@ from datagen.train.prediction.frames import SensorFrame, moved
 from datagen.workers.rendering.cloud import Cloud, stored_cloud
 
 VOXEL_M = 0.005
-# Points of a frame without a mask that are the target's: nearer than this to one that is known to be.
+# Points of a frame without a mask are the target's if nearer than this to a known target point.
 _JOINS_M = 0.008
 _ROUNDS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """All that the frames measured, world frame."""
+    """All points that the frames measured, world frame."""
 
     points_m: F32  # (N, 3)
     rgb: U8  # (N, 3)
@@ -30,10 +30,10 @@ class SeenPoints:
 
 
 def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
-    """Frames by their `T_world_camera` in one cloud.
+    """One cloud of all frames, by their poses `T_world_camera`.
 
-    Of several frames one point a voxel stays, a target's before another's, then the nearest to its
-    camera; a single frame keeps every point, so that it is sampled by pixels as in training.
+    Several frames keep one point per voxel: first a target's, then the nearest to its camera. A single frame
+    keeps every point, so that it is sampled by pixels as in training.
     """
     worlds = [moved(f.points_m, T).astype(np.float32) for f, T in zip(frames, poses, strict=True)]
     points = np.concatenate(worlds)
@@ -54,7 +54,7 @@ def fuse(frames: Sequence[SensorFrame], poses: Sequence[F64]) -> SeenPoints:
 
 
 def join_target(seen: SeenPoints, center_m: F64, radius_m: float, support_m: float) -> SeenPoints:
-    """The cloud with points above the support marked too that are connected to the target's."""
+    """The cloud with target marks extended to connected points above the support."""
     free = (np.linalg.norm(seen.points_m - center_m, axis=1) < 1.1 * radius_m) & ~seen.on_target
     free &= seen.points_m[:, 2] > support_m + 0.008
     rows, marked = np.flatnonzero(free), seen.on_target.copy()

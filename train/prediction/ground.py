@@ -12,22 +12,22 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, I64, Bools
 from datagen.train.prediction.frames import SensorFrame, moved
 
-_SAMPLE = 20_000  # points that are looked at
-_MODES, _VOTERS = 200, 2500  # normals that are tried as the way up, and those that vote
-# Points this steep or flatter (cosine; 15 degrees) lie level: stereo noise turns normals by as much.
+_SAMPLE = 20_000  # points used
+_MODES, _VOTERS = 200, 2500  # normals tried as the up direction, and normals that vote
+# Points on this slope or less (cosine; 15 degrees) are level: stereo noise turns normals by as much.
 _LIES_LEVEL = 0.966
 _REFITS = 5
-# Errors of neighbouring points are alike: more points than this make a surface no more certain.
+# Errors of neighbouring points are correlated: more points than this make a surface no more certain.
 _INDEPENDENT = 400
-_GIVEN_ERROR_M = 0.01  # of the camera's height as people measure it
+_GIVEN_ERROR_M = 0.01  # error of the camera's height as measured by hand
 # The floor's normal points up in the picture (cosine; 75 degrees), and cameras are hardly rolled (sine).
 _LEAST_UP, _MOST_ROLL = 0.26, 0.25
 _BIN_M, _MOST_LEVELS = 0.02, 6
-# Of all points, the share on a level surface that counts as one, and that may lie below a floor.
+# Least share of all points on a level surface, and largest share below a floor.
 _LEAST_SHARE, _MOST_BELOW = 0.008, 0.02
-_LEAST_POINTS = 300  # of all, for a residual
+_LEAST_POINTS = 300  # points needed for a residual
 _SURE_SHARE, _SURE_OFF_M = 0.03, 0.03
-_NEIGHBOURS, _TREE_POINTS = 20, 20_000  # of clouds without a picture, for normals
+_NEIGHBOURS, _TREE_POINTS = 20, 20_000  # for normals of clouds without a picture
 _FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-pose pose.json"
 
 
@@ -35,9 +35,9 @@ _FIX = "Give --gravity x,y,z (direction of gravity, camera frame) or --camera-po
 class Ground:
     """The camera over the floor.
 
-    `how` says in words where it comes from. `residual_m` is the standard deviation of the floor's
-    points about z = 0 (None where no floor was seen), `offset_m` their mean height. `doubt` says why
-    what was taken for the floor may be something else.
+    `how` describes where the pose comes from. `residual_m` is the standard deviation of the floor's
+    points about z = 0 (None where no floor was seen), `offset_m` their mean height. `doubt` is the
+    reason why the detected floor may be another surface.
     """
 
     T_world_camera: F64  # (4, 4)
@@ -53,7 +53,7 @@ class Ground:
 
 
 def depth_error_m(depth_m: F32 | F64) -> F64:
-    """What a stereo camera's depth may be off by, one standard deviation: it grows with its square."""
+    """Standard deviation (m) of a stereo camera's depth (m); it grows with the depth's square."""
     return 0.0015 + 0.0026 * np.square(depth_m, dtype=np.float64)
 
 
@@ -61,7 +61,7 @@ def find_ground(frame: SensorFrame, camera_height_m: float | None, gravity: F64 
     """The pose of a frame's camera: as given with the frame, else by gravity, else by the floor's plane.
 
     Without a pose, the world's origin is on the floor below the camera, x to the camera's right and y
-    ahead of it, both level. InputError where what is given does not suffice or does not agree.
+    ahead of it, both level. InputError where arguments are missing or contradict each other.
     """
     if frame.T_world_camera is not None:
         T = frame.T_world_camera
@@ -106,7 +106,7 @@ def distances_m(points_m: F32 | F64, eye_m: F64) -> F64:
 
 
 def floor_points(points_m: F32 | F64, eye_m: F64) -> Bools:
-    """Which of world points (N, 3) lie on z = 0 as far as a camera at `eye_m` (3,) can tell."""
+    """Mask (N,) of world points (N, 3) on z = 0, within the error of a camera at `eye_m` (3,)."""
     far_m = distances_m(points_m, eye_m)
     slope = np.abs(eye_m[2]) / np.maximum(far_m, 1e-6)
     return np.abs(points_m[:, 2]) < 0.015 + 3 * depth_error_m(far_m) * np.minimum(slope, 1.0)
@@ -125,8 +125,8 @@ def _with_residual(frame: SensorFrame, T: F64, how: str) -> Ground:
 def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float, str | None]:
     """(up (3,) in the camera's frame, height of the camera, doubt) of the floor seen in the frame.
 
-    Up is what the normals of level surfaces agree on. Floor is the level surface that lies as far below
-    the camera as it was said to be: neither a table's top nor the board of a low shelf.
+    Up is the common normal of level surfaces. The floor is the level surface nearest to the given height
+    below the camera: neither a table's top nor the board of a low shelf.
     """
     rng = np.random.default_rng([0, len(frame.points_m)])
     rows = rng.choice(len(frame.points_m), min(_SAMPLE, len(frame.points_m)), replace=False)
@@ -148,8 +148,8 @@ def _floor_plane(frame: SensorFrame, camera_height_m: float) -> tuple[F64, float
             f"{camera_height_m:.2f} m given"
         )
         x, y, z = np.round(-up, 3)
-        told = f"level surfaces suggest {x:g},{y:g},{z:g}"
-        fix = f"Correct --camera-height, or, if that surface is not the floor: {_FIX}; {told}"
+        hint = f"level surfaces suggest {x:g},{y:g},{z:g}"
+        fix = f"Correct --camera-height, or, if that surface is not the floor: {_FIX}; {hint}"
         raise InputError(frame.place, "floor", problem, fix)
     error_m = depth_error_m(points[levels[k], 2])
     # The points' height is a mean of many measurements, the given height is one more.
@@ -186,7 +186,7 @@ def _way_up(normals: F64, rng: np.random.Generator) -> F64 | None:
     if len(upward) < _LEAST_SHARE * len(normals):
         return None
     tried = upward[rng.choice(len(upward), min(_MODES, len(upward)), replace=False)]
-    # Walls stand upright on it: they count too, less, as noise turns many a normal.
+    # Normals of walls are perpendicular to it; they vote with less weight, since many are noisy.
     cosines = normals[:_VOTERS] @ tried.T  # rows are in random order
     votes = np.maximum(cosines - _LIES_LEVEL, 0).sum(axis=0) / (1 - _LIES_LEVEL)
     votes += 0.25 * (np.abs(cosines) < 0.05).sum(axis=0)
@@ -198,7 +198,7 @@ def _way_up(normals: F64, rng: np.random.Generator) -> F64 | None:
 
 
 def _levels(points: F64, normals: F64, up: F64) -> list[I64]:
-    """Rows of the points (N, 3) on each of the largest level surfaces: where level points gather."""
+    """Rows of the points (N, 3) on each of the largest level surfaces: where level points cluster."""
     level = np.flatnonzero(normals @ up > _LIES_LEVEL)
     z, error_m = points[level] @ up, depth_error_m(points[level, 2])
     found, free = list[I64](), np.ones(len(level), np.bool_)
@@ -237,5 +237,5 @@ def _common_up(points: F64, levels: Sequence[I64], up: F64) -> F64:
 
 
 def _tolerance_m(camera_height_m: float) -> float:
-    """By how much a measured height of the camera may differ from the one that was given."""
+    """Largest difference (m) between the measured and the given height of the camera."""
     return 0.03 + 0.02 * camera_height_m

@@ -1,4 +1,4 @@
-"""A prediction as one HTML page that turns in a browser; it needs no other file and no network."""
+"""A prediction as one HTML page with a view to rotate; it needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from datagen.train.inputs import I64
 from datagen.train.prediction.base_cells import STATES
 from datagen.train.prediction.pictures import robot_lines, shown_rows
 from datagen.train.prediction.predict import Prediction
-from datagen.train.prediction.prediction_report import told
+from datagen.train.prediction.prediction_report import report_rows
 
 _MOST_POINTS = 20_000
 _SYMBOLS = {"clear": "square", "blocked": "x", "unseen": "square-open", "unreachable": "diamond-open"}
@@ -43,7 +43,7 @@ def page_of(prediction: Prediction) -> str:
         },
         legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
     )
-    # Checked by plotly, twenty thousand colours would take seconds.
+    # Without validation: plotly would take seconds for twenty thousand colours.
     view = to_html(
         {"data": [{**trace, "type": "scatter3d"} for trace in traces], "layout": layout.to_plotly_json()},
         validate=False, include_plotlyjs=True,
@@ -52,12 +52,12 @@ def page_of(prediction: Prediction) -> str:
     )  # fmt: skip
     return html_page(
         f"Base poses scored by {prediction.scorer}",
-        [html_facts(told(prediction)), html_figure(view, _CAPTION)],
+        [html_facts(report_rows(prediction)), html_figure(view, _CAPTION)],
     )
 
 
 def _first_eye(prediction: Prediction) -> dict[str, float]:
-    """Where the view begins: on the side of the camera, which saw the target, and above it."""
+    """Initial eye of the view: above the target, on the side of the camera, which saw it."""
     x, y = prediction.seen.eyes_m[0, :2] - prediction.center_m[:2]
     azimuth = np.arctan2(y, x)
     return {"x": round(2.05 * np.cos(azimuth), 3), "y": round(2.05 * np.sin(azimuth), 3), "z": 1.15}

@@ -19,7 +19,7 @@ from datagen.schemas.styles import BEST, CAMERA, SCORE_COLOURS, TARGET
 from datagen.train.inputs import F64
 from datagen.train.prediction.base_cells import BLOCKED, CLEAR, STATES, UNREACHABLE, UNSEEN
 from datagen.train.prediction.predict import Prediction
-from datagen.train.prediction.prediction_report import told
+from datagen.train.prediction.prediction_report import report_rows
 from datagen.workers.rendering.figures import draw_frame, new_sheet, save_sheet, write_facts
 
 _EDGE = {CLEAR: "#222222", UNSEEN: "none", BLOCKED: "none", UNREACHABLE: "none"}
@@ -36,7 +36,7 @@ def draw_prediction(prediction: Prediction, out: IO[bytes]) -> None:
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1, 1.15))).tolist()
     frame, facts = left.subplots(2, 1, height_ratios=(1, 1.1))
     _draw_frame(frame, prediction)
-    write_facts(facts, told(prediction), head_characters=9)
+    write_facts(facts, report_rows(prediction), head_characters=9)
     upper, lower = np.asarray(right.subfigures(2, 1, height_ratios=(1.45, 1))).tolist()
     plan = upper.subplots()
     upper.colorbar(_draw_plan(plan, prediction), ax=plan, shrink=0.75, label="score (0 bad, 1 good)")
@@ -68,7 +68,7 @@ def _half_m(prediction: Prediction) -> float:
 
 def _draw_plan(axes: Axes, prediction: Prediction) -> ScalarMappable:
     rows = shown_rows(prediction, 2 * _MOST_POINTS, _half_m(prediction))
-    rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # what is higher hides what is lower
+    rows = rows[np.argsort(prediction.seen.points_m[rows, 2])]  # higher points hide lower ones
     points, colours = prediction.seen.points_m[rows], prediction.seen.rgb[rows] / 255
     axes.scatter(points[:, 0], points[:, 1], c=colours, s=2.5, lw=0, zorder=1)
     scale, side = ScalarMappable(Normalize(0, 1), SCORE_COLOURS), _side_m(prediction)

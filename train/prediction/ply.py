@@ -27,7 +27,7 @@ _FIX = "Save the cloud again as PLY, its vertices first, with x, y and z in metr
 
 @dataclass(frozen=True, eq=False)
 class PlyCloud:
-    """Points as they stand in the file; grey where it has no colours, and None where no targets."""
+    """Points in the order of the file; grey without colours, `on_target` None without targets."""
 
     points_m: F32  # (N, 3)
     rgb: U8  # (N, 3)
@@ -111,7 +111,7 @@ def _columns(
         return {name: vertices[name] for name, _ in properties}
     if count > _MAX_ASCII_POINTS:
         raise InputError(path, "format", f"has {count:,} vertices as text", "Save it as binary PLY")
-    # A number is a character and a space at least: nothing is allocated for vertices that cannot be there.
+    # A number is a character and a space at least: nothing is allocated for vertices that cannot exist.
     if len(body) < count * (2 * len(properties) - 1):
         raise _short(path, count, len(body) // (2 * len(properties)))
     lines = bytes(body).split(b"\n", count)[:count]
@@ -125,7 +125,7 @@ def _columns(
 
 
 def _as_declared(values: F64, kind: str) -> npt.NDArray[np.generic]:
-    """Bytes where the header says so: whether a colour of 1 is black or full depends on it."""
+    """Values as bytes where declared so, which decides whether a colour of 1 is black or full."""
     return np.clip(np.nan_to_num(values), 0, 255).astype(np.uint8) if kind == "u1" else values
 
 
@@ -134,7 +134,7 @@ def _short(path: Path, count: int, found: int) -> InputError:
 
 
 def _colour(values: npt.NDArray[np.generic]) -> U8:
-    """Bytes as they are; of fractions, as some programs write them, 1 is full."""
+    """Colours as bytes; values up to 1, which some programs write, are fractions of full colour."""
     if values.dtype == np.uint8:
         return values.astype(np.uint8)
     numbers = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)

@@ -59,7 +59,7 @@ class Prediction:
 
     @property
     def best(self) -> int | None:
-        """Row of the best of those that may be chosen; None where there is none."""
+        """Row of the best allowed base pose; None where there is none."""
         return self.choice.best
 
     @property
@@ -83,7 +83,7 @@ class Prediction:
         return yaw_pose(float(x), float(y), self.robot.base_height_m, float(self.yaw_rad[row]))
 
     def T_camera_base(self, row: int) -> F64:
-        """The same in the first frame's camera."""
+        """The same pose in the frame of the first camera."""
         return inverse(self.grounds[0].T_world_camera) @ self.T_world_base(row)
 
     def rows(self, state: str) -> I64:
@@ -93,7 +93,7 @@ class Prediction:
 
     @property
     def margin(self) -> float | None:
-        """Score of the best over that of the 10th of its kind; None where there are fewer."""
+        """Score of the best minus that of the 10th in its state; None where there are fewer."""
         if self.best is None:
             return None
         rows = self.rows(STATES[int(self.cells.state[self.best])])
@@ -196,9 +196,9 @@ def predict(
 
     Several frames need a pose each. `camera_height_m` is that of the camera that took the frame; with
     `gravity` (3,), in its frame, or the floor in sight it gives the pose of a frame that has none.
-    The target is told by masks, by one click into the first frame, or by a cloud's own marks;
+    The target is given by masks, by one click into the first frame, or by a cloud's own marks;
     `target_center_m` (3,), world, replaces the estimated centre. With an `arrival` error the best is the cell
-    with the highest expected success. InputError for what does not suffice.
+    with the highest expected success. InputError where arguments are missing or invalid.
     """
     grounds = _grounds(frames, camera_height_m, gravity)
     frames = _with_target(frames, grounds, click)
@@ -240,7 +240,7 @@ def _grounds(
 def _with_target(
     frames: Sequence[SensorFrame], grounds: Sequence[Ground], click: tuple[int, int] | None
 ) -> list[SensorFrame]:
-    """The frames, the first with the mask of what was clicked."""
+    """The frames, the first with the mask of the clicked object."""
     first, image = frames[0], frames[0].image
     if click is not None:
         if image is None:

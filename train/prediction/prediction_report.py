@@ -21,7 +21,7 @@ def _world_axes(prediction: Prediction) -> str:
     return _OWN_AXES if prediction.frames[0].T_world_camera is None else _GIVEN_AXES
 
 
-def told(prediction: Prediction) -> list[tuple[str, str]]:
+def report_rows(prediction: Prediction) -> list[tuple[str, str]]:
     """The answer as rows of a heading and a text."""
     p, robot = prediction, prediction.robot
     lines = [("best", "none"), ("sure", p.sure)]
@@ -58,7 +58,7 @@ def told(prediction: Prediction) -> list[tuple[str, str]]:
 
 
 def _arrival_lines(p: Prediction) -> list[tuple[str, str]]:
-    """How far the best may be missed, and what an arrival error changed."""
+    """Rows on the effect of an arrival error, and on the distance by which the best may be missed."""
     lines = list[tuple[str, str]]()
     expected, at = p.choice.expected, p.choice.nominal
     if expected is not None and p.arrival is not None and p.best is not None and at is not None:

@@ -12,11 +12,11 @@ from datagen.train.prediction.frames import RgbdImage
 from datagen.train.prediction.ground import depth_error_m, floor_points
 from datagen.train.prediction.target import from_nearest
 
-_GROWS_M = 0.24  # from the clicked point
-# Growth that comes so near to that distance has run out over a surface.
+_GROWS_M = 0.24  # largest distance from the clicked point
+# A region that grows beyond this share of that distance has spread over a surface.
 _RAN_OUT, _ROUNDS = 0.95, 4
-_FEW_FAR = 0.01  # share of the region's pixels that may be so far
-_SUPPORT_AREA_M2 = 0.004  # less of a level surface is no support
+_FEW_FAR = 0.01  # share of the region's pixels that may be that far
+_SUPPORT_AREA_M2 = 0.004  # a smaller level surface is no support
 _BIN_M = 0.004
 
 
@@ -36,7 +36,7 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
         near = (depth_m[max(v - 15, 0) : v + 16, max(u - 15, 0) : u + 16] > 0).any()
         fix = "Give another pixel of the target" if near else "Take the frame again, or give --mask"
         raise InputError("--click", f"{u},{v}", "has no depth", fix)
-    # Beyond, nothing can be nearer than that to the point.
+    # Pixels outside the window are farther than `_GROWS_M` from the point.
     around_px = max(image.pinhole.fx_px, image.pinhole.fy_px) * _GROWS_M / max(depth_m[v, u] - _GROWS_M, 0.1)
     n = int(around_px) + 16
     left, top = max(u - n, 0), max(v - n, 0)
@@ -46,8 +46,8 @@ def grow_mask(image: RgbdImage, click: tuple[int, int], T_world_camera: F64) -> 
     return mask
 
 
-def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked: tuple[int, int]) -> Bools:
-    """The mask of an image around pixel (u, v), which was `asked` in the whole one."""
+def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, pixel: tuple[int, int]) -> Bools:
+    """The mask of an image around pixel (u, v), which is `pixel` in the full image."""
     (h, w), (u, v), depth_m = image.depth_m.shape, click, image.depth_m
     facets, grid = image.facets(T_world_camera), image.world_grid(T_world_camera)
     seed = grid[v, u]
@@ -56,7 +56,7 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked:
     joined = ~_breaks(depth_m) | _disc((h, w), (u, v), 2)
     level = around & (grid[..., 2] < seed[2] - 0.003)
     allowed = grown = np.zeros((h, w), np.bool_)
-    # Off the floor, above its support, and ends before the distance that it may grow.
+    # Whether the object is off the floor and above its support, and ends within `_GROWS_M`.
     on_floor = bool(floor_points(seed[None], T_world_camera[:3, 3])[0])
     stands_out = not on_floor
     for k in range(_ROUNDS):
@@ -72,22 +72,22 @@ def _grown(image: RgbdImage, click: tuple[int, int], T_world_camera: F64, asked:
     else:
         stands_out = False
     if not stands_out:
-        refuse_surface(grid, facets, depth_m, joined, click, asked, _GROWS_M)
+        refuse_surface(grid, facets, depth_m, joined, click, pixel, _GROWS_M)
     if on_floor:
         fix = "Click higher on the target, or give --mask"
-        raise InputError("--click", f"{asked[0]},{asked[1]}", "lies on the floor", fix)
+        raise InputError("--click", f"{pixel[0]},{pixel[1]}", "lies on the floor", fix)
     grown[v, u] = True
-    # What breaks left out at the rim is the target's where it is as near as the target beside it.
+    # Rim pixels that `_breaks` left out are the target's where they are as near as the target next to them.
     rim = np.asarray(ndimage.binary_dilation(grown, iterations=2), np.bool_) & allowed
     step_m = np.abs(depth_m - from_nearest(depth_m, grown))
     filled = np.asarray(ndimage.binary_fill_holes(grown | (rim & (step_m < _step_m(depth_m)))), np.bool_)
     mask = filled & (depth_m > 0)
-    _refuse_spread(grid, mask, far_m, asked)
+    _refuse_spread(grid, mask, far_m, pixel)
     return mask
 
 
-def _refuse_spread(grid: F64, mask: Bools, far_m: F64, asked: tuple[int, int]) -> None:
-    """InputError where the region is wider than any target, or runs on as far as it may grow."""
+def _refuse_spread(grid: F64, mask: Bools, far_m: F64, pixel: tuple[int, int]) -> None:
+    """Raise InputError where the region grows up to its largest distance, into its surroundings."""
     points = grid[mask]
     x, y, z = np.ptp(points, axis=0)
     size = f"{max(x, y):.2f} x {min(x, y):.2f} m wide and {z:.2f} m high"
@@ -95,19 +95,19 @@ def _refuse_spread(grid: F64, mask: Bools, far_m: F64, asked: tuple[int, int]) -
     if far > _FEW_FAR * len(points):
         problem = f"grows into its surroundings: a region {size}, {points[:, 2].mean():.2f} m above the floor"
         raise InputError(
-            "--click", f"{asked[0]},{asked[1]}", problem, "Click on another pixel, or give --mask"
+            "--click", f"{pixel[0]},{pixel[1]}", problem, "Click on another pixel, or give --mask"
         )
 
 
 def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
-    """Height from which on points belong to what stands on the widest level surface `among` pixels (H, W)."""
+    """Height above which points belong to objects on the widest level surface `among` pixels (H, W)."""
     areas = np.linalg.norm(facets, axis=2)
     rows = among & (facets[..., 2] > 0.9 * areas) & (areas > 0)
     z = grid[rows][:, 2]
     if not len(z):
         return float(seed[2] - _GROWS_M)
     edges = np.arange(z.min() - _BIN_M, z.max() + 2 * _BIN_M, _BIN_M)
-    # Beside an edge smoothed depth runs from one thing to the other: no pixel counts for much.
+    # At an edge, smoothed depth runs from one object to the other: the weight of a pixel is bounded.
     counted, _ = np.histogram(z, edges, weights=np.minimum(areas[rows], 10 * np.median(areas[rows])))
     spread = np.convolve(counted, np.ones(3), mode="same")
     k = int(spread.argmax())
@@ -119,12 +119,12 @@ def _above_support(grid: F64, facets: F64, among: Bools, seed: F64) -> float:
 
 
 def _step_m(depth_m: F32) -> F64:
-    """Difference in depth of neighbouring pixels from which on they belong to different things."""
+    """Difference in depth of neighbouring pixels from which on they belong to different objects."""
     return 0.008 + 3 * depth_error_m(depth_m)
 
 
 def _breaks(depth_m: F32) -> Bools:
-    """Pixels (H, W) at a jump in depth that slope does not explain, or beside missing depth."""
+    """Pixels (H, W) at a jump in depth that slope does not explain, or next to missing depth."""
     smooth = ndimage.median_filter(depth_m, 3)
     breaks = np.zeros(depth_m.shape, np.bool_)
     for axis in (0, 1):
@@ -134,7 +134,7 @@ def _breaks(depth_m: F32) -> Bools:
         unlike = np.minimum(np.abs(step - padded[:-2]), np.abs(step - padded[2:]))
         jump = unlike > _step_m(np.minimum(a[:-1], a[1:]))
         nearer = a[:-1] < a[1:]
-        # Only what lies behind is left out: the rim of what stands before belongs to it.
+        # Only farther pixels are left out: the rim of the nearer object belongs to it.
         marks[:-1] |= jump & ~nearer
         marks[1:] |= jump & nearer
     return breaks

@@ -11,33 +11,33 @@ from datagen.schemas.errors import InputError
 from datagen.train.inputs import F32, F64, Bools
 from datagen.train.prediction.frames import SensorFrame
 
-# Nothing that a gripper takes is wider: points farther from the middle of a target belong to other things.
+# No object that a gripper can hold is wider: points farther from a target's middle are of other objects.
 _LARGEST_M = 0.30
-# Of a mask's pixels, those with depth that must be there to stand for the others.
+# Least share and number of a mask's pixels that must have depth.
 _LEAST_SHARE, _LEAST_POINTS = 0.25, 30
 _RIM_PERCENT = 1.0  # left out at either end: noise at the rims
 
 
 @dataclass(frozen=True)
 class TargetBox:
-    """Where the target is, world frame; `how` says in words how it was found."""
+    """Position and size of the target, world frame; `how` describes how it was found."""
 
     center_m: tuple[float, float, float]
-    radius_m: float  # of the sphere around the centre that holds it
-    support_height_m: float  # what it stands on
+    radius_m: float  # of the sphere around the centre that holds the target
+    support_height_m: float  # of the surface that it stands on
     how: str
 
 
 @dataclass(frozen=True)
 class Filled:
-    """What became of a mask's pixels without depth."""
+    """Numbers of a mask's pixels: all, and those without depth, which are filled."""
 
     mask_pixels: int
     missing_pixels: int
 
 
 def fill_target(frame: SensorFrame) -> tuple[SensorFrame, Filled]:
-    """The frame with the depth of the nearest pixel where the mask has none. InputError for few."""
+    """The frame with the nearest pixel's depth where the mask has none. InputError if too few have it."""
     image = frame.image
     assert image is not None and image.mask is not None and frame.on_target is not None
     mask, known = image.mask, image.mask & (image.depth_m > 0)
@@ -68,8 +68,8 @@ def from_nearest(values: F32, known: Bools) -> F32:
 def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     """The box of the target from its visible points (N, 3), the others (M, 3) and the camera (3,), world.
 
-    Across the sight line the middle of what is seen; along it as deep as seen, at least as the
-    smaller of width and height; in height from the support to the top. InputError for too few points.
+    Across the line of sight it spans the visible points; along it their depth, at least the smaller of
+    width and height; vertically from the support to the top. InputError for too few points.
     """
     middle = np.median(target_m, axis=0)
     kept = target_m[np.linalg.norm(target_m - middle, axis=1) < _LARGEST_M]
@@ -87,7 +87,7 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
     )
     width = left - right
     support = _support_under(others_m, kept[:, :2].mean(axis=0), width / 2 + 0.12, low)
-    # Tops show how deep boxes are; the backs of round things are hidden; what lies flat hides nothing.
+    # Tops show how deep boxes are; the backs of round objects are hidden; flat objects hide nothing.
     deep = max(back - front, min(width, top - support))
     centre_xy = (front + deep / 2) * ahead + (left + right) / 2 * across
     centre = np.array([*centre_xy, (top + support) / 2])
@@ -103,7 +103,7 @@ def locate(target_m: F64, others_m: F64, eye_m: F64) -> TargetBox:
 
 
 def _support_under(others_m: F64, middle_xy: F64, half_m: float, low_m: float) -> float:
-    """Height of what the target stands on: where most points around its foot lie, or its lowest point."""
+    """Height of the target's support: where most points around its foot lie, or its lowest point."""
     near = (np.abs(others_m[:, :2] - middle_xy) < half_m).all(axis=1)
     z = others_m[near & (others_m[:, 2] < low_m + 0.03) & (others_m[:, 2] > low_m - 0.1), 2]
     if len(z) < 50:

@@ -15,13 +15,13 @@ class TrainingStep:
     """One step of the optimiser, over all ranks."""
 
     step: int  # counted from 1
-    steps: int  # of the whole schedule
+    steps: int  # in the whole schedule
     epoch: int  # counted from 1
     loss: float
     lr: float
     samples: int
     wait_s: float  # for the batch
-    step_s: float  # all of it
+    step_s: float  # for the whole step
 
 
 class TrainingCallback(Protocol):
@@ -35,7 +35,7 @@ class TrainingCallback(Protocol):
 
 
 class TrainingProgress:
-    """Progress of the training to `place`: loss, speed, time left, the loader's share; a row an epoch."""
+    """Progress of the training to `place`: loss, speed, time left, the loader's share; a row per epoch."""
 
     def __init__(self, shown: Progress, place: str) -> None:
         self._shown, self._place = shown, place

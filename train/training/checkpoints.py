@@ -1,9 +1,9 @@
 """A checkpoint: one file with a model's weights, their origin, and the state to resume training.
 
 On disk it is a safetensors file: tensors under `weights/` (the best epoch's) and `resume/` (the last step's
-model and optimiser), and in the header's metadata one JSON text, `head`. Numbers that are no tensors lie in
-the JSON, which holds a float to its last bit, as does the file's own checksum. Files of format 1, which
-`torch.save` wrote, are read by `pickled_checkpoints`.
+model and optimiser), and in the header's metadata one JSON text, `head`. Other numbers and the file's
+checksum are in the JSON, which keeps every bit of a float. `pickled_checkpoints` reads files of format 1,
+which `torch.save` wrote.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ MAX_BYTES = 2 << 30
 _MAX_HEADER_BYTES = 32 << 20
 _MAX_TENSORS, _MAX_AXES = 100_000, 64
 _DTYPES = {"F32", "I64", "U8", "BOOL"}
-_UNSIGNED = b"0" * 64  # in place of the checksum where the checksum is taken
+_UNSIGNED = b"0" * 64  # stands for the checksum while it is computed
 _NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 _MAX_TEXT = 4096
 _FIX = "Name a checkpoint of `datagen train`, or train it again"
-# Fields that a model's configuration did not have at first, with what models without them are.
+# Fields that were added to a model's configuration later, with their values for older models.
 _OLDER_CONFIGS: dict[str, dict[str, Any]] = {"shared": {"hand_poses": 0}}
 
 
@@ -67,15 +67,15 @@ class CheckpointHead:
     options: dict[str, Any]  # of training, resolved
     data: tuple[DataOrigin, ...]
     val_data: tuple[DataOrigin, ...]
-    house_ids: tuple[str, ...]  # trained on, by the checkpoint that this one began from too
+    house_ids: tuple[str, ...]  # trained on, also by the checkpoint that this one began from
     object_digests: tuple[str, ...]  # the same of objects
-    val_house_ids: tuple[str, ...]  # decided which epoch is the best, also of the one that it began from
-    cost: dict[str, float]  # label_cpu_s, train_cpu_s, train_wall_s; what it began from is not in it
+    val_house_ids: tuple[str, ...]  # chose the best epoch, also of the checkpoint that this one began from
+    cost: dict[str, float]  # label_cpu_s, train_cpu_s, train_wall_s; without those of `init`
     versions: dict[str, str]
     history: tuple[EpochRecord, ...]
-    step: int = 0  # optimiser's steps behind the last weights
-    epoch: int = 0  # whole epochs behind them
-    best_epoch: int | None = None  # whose weights `load_model` gives, counted from 1; None before the first
+    step: int = 0  # optimiser's steps up to the last weights
+    epoch: int = 0  # whole epochs up to them
+    best_epoch: int | None = None  # `load_model` gives its weights; counted from 1, None before the first
     finished: bool = False
     init: dict[str, Any] | None = None  # digest, stage and cost of the checkpoint that it began from
     digest: str = field(default="", compare=False)  # sha256 of the file; set by reading
@@ -98,7 +98,7 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> tuple[Mo
     """Load the model of a checkpoint with its best weights, in evaluation mode, and its metadata."""
     checkpoint = read_checkpoint(path)
     head = checkpoint.head
-    with torch.random.fork_rng(devices=[]):  # fresh parameters are drawn only to be replaced
+    with torch.random.fork_rng(devices=[]):  # the initial random parameters are replaced
         model = build_model(head.model, head.model_config)
     put_weights(model, checkpoint.weights, str(path))
     return model.to(device).eval(), head
@@ -144,7 +144,7 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Replace the file atomically. InputError, and the file stays, where a tensor is not finite."""
     path = Path(path)
     document = {
-        "sha256": _UNSIGNED.decode(),  # before any other text that could hold as many zeros
+        "sha256": _UNSIGNED.decode(),  # before any other text that could contain these zeros
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "head": {k: v for k, v in asdict(checkpoint.head).items() if k != "digest"},
@@ -162,7 +162,7 @@ def write_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
 
 @contextmanager
 def only_writer(path: str | Path) -> Generator[None]:
-    """Lock the checkpoint for this process. InputError while another one on this machine holds it."""
+    """Lock the checkpoint for this process. InputError while another process on this machine holds it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name}.lock")
@@ -201,8 +201,8 @@ def _read(data: bytes) -> tuple[dict[str, Tensor], str]:
     text: str = header.pop("__metadata__")["head"]
     if len(header) > _MAX_TENSORS:
         raise ValueError("too many tensors")
-    for name, told in header.items():
-        if told["dtype"] not in _DTYPES or len(told["shape"]) > _MAX_AXES:
+    for name, entry in header.items():
+        if entry["dtype"] not in _DTYPES or len(entry["shape"]) > _MAX_AXES:
             raise ValueError(f"tensor {name!r:.80} has a type or shape that no checkpoint has")
     stated: str = json.loads(text)["sha256"]
     unsigned = data[:end].replace(stated.encode(), _UNSIGNED, 1)
@@ -234,7 +234,7 @@ def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _refuse_odd_values(place: str, document: dict[str, Any]) -> None:
-    """InputError at a number that is not finite or beyond 64 bits, and at text that no terminal may print."""
+    """InputError for a number that is not finite or beyond 64 bits, and for text unfit for a terminal."""
     left: list[tuple[str, Any]] = [("", document)]
     while left:
         where, value = left.pop()

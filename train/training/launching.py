@@ -34,7 +34,7 @@ class Ranks:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes and shows."""
+        """Whether this process writes files and shows progress."""
         return self.rank == 0
 
     def total(self, values: Tensor) -> Tensor:
@@ -69,10 +69,10 @@ ProcessWork = Callable[[Any, Ranks, Stopping], bool]
 _PREFIX = "datagen-ranks-"
 
 
-def choose_device(asked: str, processes: int | None) -> tuple[str, int]:
+def choose_device(device: str, processes: int | None) -> tuple[str, int]:
     """`cpu` or `cuda`, and the number of processes: as given, else one per GPU, or one."""
-    gpus = torch.cuda.device_count() if asked != "cpu" and torch.cuda.is_available() else 0
-    if asked == "cuda" and not gpus:
+    gpus = torch.cuda.device_count() if device != "cpu" and torch.cuda.is_available() else 0
+    if device == "cuda" and not gpus:
         raise InputError("datagen train", "--device", "torch finds no GPU", "Give --device cpu")
     if gpus and processes is not None and processes > gpus:
         problem = f"{processes} is more than {gpus} GPUs"
@@ -82,7 +82,7 @@ def choose_device(asked: str, processes: int | None) -> tuple[str, int]:
 
 @contextmanager
 def interruptible() -> Generator[Stopping]:
-    """Give a function that returns whether Ctrl-C (or SIGTERM) came. A second one ends the block at once."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM came. A second Ctrl-C ends the block."""
     came = False
 
     def note(_number: int, _frame: FrameType | None) -> None:
@@ -121,7 +121,7 @@ def train_in_processes(work: ProcessWork, job: Any, processes: int, device: str,
 
 
 def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: Stopping) -> bool:
-    """Wait for all; an error of one of them is raised."""
+    """Wait for all processes; whether they finished. Raises their InputError."""
     waiting = {here: child for child, here in children}
     finished = True
     while waiting:
@@ -132,7 +132,7 @@ def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: St
         for here in ready:
             with suppress(EOFError):  # without an answer
                 answers[here] = here.recv()  # type: ignore[union-attr]
-        # A process that lost another one ends without an answer; the error of the other one explains it.
+        # A process whose peer failed ends without an answer; the peer's error explains it.
         for answer in answers.values():
             if isinstance(answer, InputError):
                 raise answer
@@ -148,14 +148,14 @@ def _ends(children: Sequence[tuple[Any, Connection]], folder: Path, stopping: St
 
 
 def _child(work: ProcessWork, job: Any, ranks: Ranks, device: str, folder: str, there: Connection) -> None:
-    # Ctrl-C reaches the whole group of processes; only the first of them decides what it means.
+    # Ctrl-C reaches the whole group of processes; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     parent, stop = multiprocessing.parent_process(), Path(folder, "stop")
     if device == "cuda":
         torch.cuda.set_device(ranks.rank)
     else:
-        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # this machine's name may mean nothing to it
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # the host name may not resolve
     backend = "nccl" if device == "cuda" else "gloo"
     dist.init_process_group(
         backend, init_method=f"file://{folder}/rendezvous", rank=ranks.rank, world_size=ranks.world

@@ -1,7 +1,7 @@
 """The training loop: batches, steps, validation, early stopping, and a position to resume from.
 
-Nothing random has a state that would have to be kept: batches follow from seed and epoch, and what a
-step draws (dropout) from seed, epoch, batch and rank.
+No random state is saved: batches follow from seed and epoch, and the random numbers of a step (dropout)
+from seed, epoch, batch and rank.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from datagen.train.training.optimiser import rate_at, set_rate
 from datagen.train.training.options import Options
 from datagen.train.training.validation import validate
 
-_STEP_STREAM = 0x57E9  # keeps the draws of steps apart from those of batches
+_STEP_STREAM = 0x57E9  # separates the random numbers of steps from those of batches
 _IDS_NAMED = 4
 
 
 class Batches(Protocol):
-    """What the loop needs of a `SampleStream`."""
+    """The part of a `SampleStream` that the loop uses."""
 
     @property
     def batches_per_epoch(self) -> int: ...
@@ -43,10 +43,10 @@ class Batches(Protocol):
 
 @dataclass
 class Position:
-    """How far a training is, and what it found."""
+    """Status of a training, and its results so far."""
 
-    epoch: int = 0  # whole ones
-    batch: int = 0  # done of the epoch under way
+    epoch: int = 0  # completed
+    batch: int = 0  # completed in the current epoch
     step: int = 0
     sums: list[float] = field(default_factory=lambda: [0.0] * 4)  # the epoch's weight, loss, hits, samples
     history: list[EpochRecord] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Position:
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """All that a training works with; `position`, the model and the optimiser change."""
+    """The parts of a training; `position`, the model and the optimiser change."""
 
     options: Options
     model: Model
@@ -77,7 +77,7 @@ def run_training(
     stopping: Callable[[], bool] = lambda: False,
     save_every_s: float = 300.0,
 ) -> bool:
-    """Train from the position on; whether it finished, else it was stopped and saved.
+    """Train from the position on; True if it finished, False if it was stopped and saved.
 
     `save` is called after each epoch, every `save_every_s` and on a stop. InputError at a loss or gradient
     that is not finite, before it reaches the weights.
@@ -109,7 +109,7 @@ def run_training(
 def _step(
     training: Training, logits_of: Callable[..., Tensor], batch: Batch[Array], clock: _Clock, stopping: bool
 ) -> tuple[TrainingStep, bool]:
-    """A step on the batches of all ranks as if they were one; what it was, and whether any rank stops."""
+    """Take a step on the batches of all ranks as one batch; the step, and whether any rank stops."""
     options, at, ranks, device = training.options, training.position, training.ranks, training.model.device
     torch.manual_seed(_seed(options.seed, at.epoch, at.batch, ranks.rank))
     given = to_torch(batch, device)
@@ -137,14 +137,14 @@ def _step(
     training.optimiser.zero_grad(set_to_none=True)
     at.batch, at.step = at.batch + 1, at.step + 1
     at.sums = [a + b for a, b in zip(at.sums, sums, strict=True)]
-    _pay(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
+    _add_cost(at, wall_s / ranks.world, cpu_s, wait_s / ranks.world)
     loss_now = sums[1] / sums[0]
     times = (wait_s / ranks.world, wall_s / ranks.world)
     return TrainingStep(at.step, steps, at.epoch + 1, loss_now, rate, round(sums[3]), *times), stop > 0
 
 
 def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
-    """Validate, keep the best weights, and decide whether to continue; the row for callbacks."""
+    """Validate, keep the best weights, and decide whether to continue. Returns the row for callbacks."""
     at, options = training.position, training.options
     measured = validate(training.model, training.val.epoch(0), training.class_weights, training.ranks)
     weight, loss, hits, samples = at.sums
@@ -166,19 +166,19 @@ def _end_epoch(training: Training, clock: _Clock) -> dict[str, Any]:
     wall_s, cpu_s, _ = clock.lap()
     spent = torch.tensor([wall_s, cpu_s], dtype=torch.float64, device=training.model.device)
     wall_s, cpu_s = training.ranks.total(spent).tolist()
-    _pay(at, wall_s / training.ranks.world, cpu_s, 0.0)
+    _add_cost(at, wall_s / training.ranks.world, cpu_s, 0.0)
     return {**record, "best": best}
 
 
-def _refuse(what: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:
-    """Name the samples; every rank comes here with its own, and all say the same."""
+def _refuse(quantity: str, training: Training, batch: Batch[Array], bad: Tensor) -> NoReturn:
+    """Raise InputError that names the samples of all ranks, the same on each rank."""
     rows = bad.cpu().numpy()
     ids = [bytes(i).hex() for part in training.ranks.gather(batch.sample_id[rows]) for i in part]
     at = training.position
     named = ", ".join(ids[:_IDS_NAMED]) + (", ..." if len(ids) > _IDS_NAMED else "")
     raise InputError(
         f"training, epoch {at.epoch + 1}, batch {at.batch + 1}",
-        what,
+        quantity,
         f"is not finite for {len(ids)} samples: {named}",
         "Nothing was overwritten. Check one with `datagen replay`, or give a smaller --lr and a new --out",
     )
@@ -188,7 +188,7 @@ def _seed(*numbers: int) -> int:
     return int(np.random.SeedSequence([_STEP_STREAM, *numbers]).generate_state(1, np.uint64)[0])
 
 
-def _pay(at: Position, wall_s: float, cpu_s: float, wait_s: float) -> None:
+def _add_cost(at: Position, wall_s: float, cpu_s: float, wait_s: float) -> None:
     for name, value in (("train_wall_s", wall_s), ("train_cpu_s", cpu_s), ("data_wait_s", wait_s)):
         at.cost[name] = at.cost.get(name, 0.0) + value
 
@@ -203,7 +203,7 @@ class _Clock:
         self._wait_s += time.perf_counter() - began_s
 
     def lap(self) -> tuple[float, float, float]:
-        """Wall, CPU and waiting seconds; all begin again."""
+        """Wall, CPU and waiting seconds since the last lap."""
         wall_s, cpu_s, wait_s = self._wall_s, self._cpu_s, self._wait_s
         self._wall_s, self._cpu_s, self._wait_s = time.perf_counter(), time.process_time(), 0.0
         return self._wall_s - wall_s, self._cpu_s - cpu_s, wait_s

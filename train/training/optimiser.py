@@ -13,7 +13,7 @@ from datagen.train.models import Model
 
 
 def make_optimiser(model: Model, lr: float, weight_decay: float) -> torch.optim.AdamW:
-    """AdamW; decay acts on matrices alone, since biases and norms are no directions to keep small."""
+    """AdamW; weight decay acts on matrices alone, not on biases and norms."""
     matrices = [p for p in model.parameters() if p.ndim > 1]
     others = [p for p in model.parameters() if p.ndim <= 1]
     groups = [{"params": matrices, "weight_decay": weight_decay}, {"params": others, "weight_decay": 0.0}]
@@ -21,7 +21,7 @@ def make_optimiser(model: Model, lr: float, weight_decay: float) -> torch.optim.
 
 
 def set_rate(optimiser: torch.optim.Optimizer, lr: float) -> None:
-    """Let the next step have this rate."""
+    """Set the learning rate of the next step."""
     for group in optimiser.param_groups:
         group["lr"] = lr
 
@@ -44,7 +44,7 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 def put_optimiser_tensors(
     optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], place: str
 ) -> None:
-    """Put back what `optimiser_tensors` gave. InputError where it does not fit the parameters."""
+    """Restore tensors of `optimiser_tensors`. InputError where they do not fit the parameters."""
     document = optimiser.state_dict()
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}

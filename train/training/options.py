@@ -32,14 +32,14 @@ STAGES: dict[str, TrainingStage] = {
 
 @dataclass(frozen=True)
 class Options:
-    """All that decides the weights, besides the data and the checkpoint to begin from."""
+    """All options that affect the weights, besides the data and the checkpoint to begin from."""
 
     stage: str
     model: str
     model_config: Mapping[str, Any]
     epochs: int
     batch_scenes: int = 16
-    house_share: float = 1.0  # of the houses that could be trained on; a larger share has those of a smaller
+    house_share: float = 1.0  # of the houses that could be trained on; a larger share includes a smaller
     candidates_per_robot: int | None = None  # sampled per robot per epoch; None for all
     lr: float = 2e-3  # the highest of the schedule
     weight_decay: float = 0.0  # on matrices alone: not on biases and norms
@@ -50,7 +50,7 @@ class Options:
     augment: Mapping[str, Any] = field(default_factory=dict)  # fields of Augmentation
 
     def refuse_bad(self) -> None:
-        """InputError for values out of range, by the option's name."""
+        """Raise InputError for values out of range, by the option's name."""
         least = "Give {} or more"
         rules = {
             "epochs": (self.epochs, self.epochs >= 1, least.format(1)),
@@ -71,5 +71,5 @@ class Options:
                 raise InputError("datagen train", f"--{name}", f"{value}", fix)
 
     def document(self) -> dict[str, Any]:
-        """As plain data, without the model, which a checkpoint states by itself."""
+        """The options as plain data, without the model, which a checkpoint stores separately."""
         return {k: v for k, v in asdict(self).items() if k not in ("stage", "model", "model_config")}

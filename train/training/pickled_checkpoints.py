@@ -1,4 +1,4 @@
-"""Checkpoints of format 1: files of `torch.save`, read as plain data: nothing is called.
+"""Checkpoints of format 1: files of `torch.save`, read as plain data without calling code.
 
 `torch.load(weights_only=True)` calls no foreign code, yet it allocates what a pickle asks for, and not every
 release compares the size that a pickle states with that of the record. Here a file is a zip of stored records
@@ -27,14 +27,14 @@ _DTYPES = {
     "FloatStorage": torch.float32, "LongStorage": torch.int64,
     "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
 }  # fmt: skip
-# What reading a file that is none, or a damaged one, raises.
+# Errors from reading a file of another kind, or a damaged one.
 NOT_PICKLED = (ArithmeticError, EOFError, LookupError, RuntimeError, TypeError, ValueError)
 # Marks, dictionaries, tuples, texts, whole numbers, False, globals, the memo, storages, calls; and the end.
 _OPCODES = b"\x80(})t\x85\x86\x87XJKM\x8a\x89cqrhjQR."
 
 
 # The unpickler of the standard library that is written in Python: it can be given fewer opcodes, and its memo
-# is a dictionary, where the one written in C makes room for any number that a file names.
+# is a dictionary, while the one written in C allocates memory for any index in a file.
 class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage]
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]
@@ -52,7 +52,7 @@ class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage]
 
     def _set(self, items: list[Any]) -> None:
         table = self.stack[-1]
-        # Texts alone are keys: the hash of tuples within tuples may take for ever.
+        # Only texts are keys: the hash of nested tuples may take forever.
         if not isinstance(table, dict) or not all(isinstance(key, str) for key in items[::2]):
             raise ValueError("a dictionary with keys that are no text")
         table.update(zip(items[::2], items[1::2], strict=True))
@@ -91,7 +91,7 @@ def _tensor(storage: Any, offset: Any, shape: Any, stride: Any, grad: Any, hooks
     if any(type(n) is not int or n < 0 for n in (*shape, *stride)):
         raise ValueError("a tensor of no shape")
     dense = tuple(math.prod(shape[k + 1 :]) for k in range(len(shape)))
-    # The stride of an axis with one entry, or of no entries at all, says nothing.
+    # The stride of an axis with one entry, or of an empty tensor, has no meaning.
     strided = len(storage) and any(a != b for n, a, b in zip(shape, stride, dense, strict=True) if n != 1)
     if offset != 0 or math.prod(shape) != len(storage) or strided or grad or hooks:
         raise ValueError("a tensor that is not dense")

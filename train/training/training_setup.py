@@ -1,4 +1,4 @@
-"""Sets up the training of a stage: streams, checks, model, and the position from which it resumes."""
+"""Set up the training of a stage: streams, checks, model, and the position from which it resumes."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ _POSITION = ("step", "epoch", "best_epoch", "finished")  # fields of both Positi
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """A training as it is asked for. Only `options`, the runs' rows and `init` decide its weights."""
+    """A requested training. Only `options`, the runs' rows and `init` decide its weights."""
 
     options: Options
     runs: tuple[str, ...]
-    val_runs: tuple[str, ...]  # none: a share of the runs' houses is held out
+    val_runs: tuple[str, ...]  # empty: a share of the runs' houses is held out
     out: str
     augment: Augmentation | None = None
     init: str | None = None
@@ -57,10 +57,10 @@ class TrainingJob:
     threads: int = 1
     save_every_s: float = 300.0
     tensorboard: str | None = None
-    json_lines: bool = False  # as progress
+    json_lines: bool = False  # for progress
     allow_incomplete: bool = False  # runs that lack samples of their plan
     allow_mixed_labels: bool = False  # labels of one source in different versions
-    encoded: str | None = None  # folder of `encode_runs`: clouds are encoded once, into it
+    encoded: str | None = None  # folder of `encode_runs`, which encodes clouds once
 
 
 def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> bool:
@@ -86,7 +86,7 @@ def train_job(job: TrainingJob, ranks: Ranks, stopping: Callable[[], bool]) -> b
 def prepare_training(
     job: TrainingJob, ranks: Ranks, seen: Seen | None = None
 ) -> tuple[Training, CheckpointHead]:
-    """The training at the position of `job.out`, or at its beginning, and what its checkpoint will say.
+    """The training at the position of `job.out`, or at its beginning, and the head of its checkpoint.
 
     `seen(done, of)` is called while scenes are encoded.
     """
@@ -103,9 +103,9 @@ def prepare_training(
     head = _head(job, model, train, val, began.head if began else None)
     position = Position()
     if Path(job.out).exists():
-        there = read_checkpoint(job.out)
-        refuse_other_training(job.out, there.head, head)
-        position = _resume_position(job.out, there, model, optimiser)
+        stored = read_checkpoint(job.out)
+        refuse_other_training(job.out, stored.head, head)
+        position = _resume_position(job.out, stored, model, optimiser)
     weights = class_weights.to(model.device)
     return Training(options, model, optimiser, *batches, weights, position, ranks), head
 
@@ -123,30 +123,30 @@ def save_checkpoint(path: str, training: Training, head: CheckpointHead) -> None
         history=tuple(at.history),
         **{name: getattr(at, name) for name in _POSITION},
     )
-    # Before the first epoch has ended nothing is better than the last weights.
+    # Before the first epoch ends, the last weights are the best.
     weights = at.best_weights or last
     write_checkpoint(path, Checkpoint(head, weights, resume, {"batch": at.batch, "sums": at.sums}))
 
 
 def _resume_position(
-    place: str, there: Checkpoint, model: Model, optimiser: torch.optim.Optimizer
+    place: str, stored: Checkpoint, model: Model, optimiser: torch.optim.Optimizer
 ) -> Position:
-    resume = there.resume
+    resume = stored.resume
     put_weights(model, below("model.", resume), place)
     put_optimiser_tensors(optimiser, below("optimiser.", resume), place)
-    batch, sums = there.loop.get("batch"), there.loop.get("sums")
-    best = there.head.best_epoch
+    batch, sums = stored.loop.get("batch"), stored.loop.get("sums")
+    best = stored.head.best_epoch
     if type(batch) is not int or batch < 0 or not isinstance(sums, list) or len(sums) != 4:
         raise InputError(place, "loop", "has no position to resume from", "Train it again to another file")
-    if best is not None and not 1 <= best <= len(there.head.history):
+    if best is not None and not 1 <= best <= len(stored.head.history):
         raise InputError(place, "best_epoch", "is beyond the history", "Train it again to another file")
     return Position(
-        **{name: getattr(there.head, name) for name in _POSITION},
+        **{name: getattr(stored.head, name) for name in _POSITION},
         batch=batch,
         sums=[float(value) for value in sums],
-        history=list(there.head.history),
-        best_weights={k: v.to(model.device) for k, v in there.weights.items()} if best else {},
-        cost={k: v for k, v in there.head.cost.items() if k != "label_cpu_s"},
+        history=list(stored.head.history),
+        best_weights={k: v.to(model.device) for k, v in stored.weights.items()} if best else {},
+        cost={k: v for k, v in stored.head.cost.items() if k != "label_cpu_s"},
     )
 
 
@@ -172,7 +172,7 @@ def _streams(job: TrainingJob, ranks: Ranks) -> tuple[SampleStream, SampleStream
         refuse_mixed_labels([(part.place, spec) for part in parts for spec in part.specs])
     refuse_shared_houses(train, val)
     train.use_rank(ranks.rank, ranks.world)
-    # Of fewer scenes than processes each process judges all; `validate` counts a sample once.
+    # With fewer scenes than processes, each process scores all; `validate` counts a sample once.
     if val.n_scenes >= ranks.world:
         val.use_rank(ranks.rank, ranks.world)
     return train, val
@@ -185,7 +185,7 @@ def _encoded(
     streams: tuple[SampleStream, SampleStream],
     seen: Seen | None,
 ) -> tuple[EncodedBatches, EncodedBatches]:
-    """Batches of the streams' scenes from clouds that are encoded once. InputError where that cannot be."""
+    """Batches of the streams' scenes from clouds that are encoded once. InputError if options exclude it."""
     options, folder = job.options, Path(job.encoded or "")
     if not isinstance(model, SharedModel):
         problem = f"does not go with --model {model.name}: only clouds of `shared` are encoded apart from it"
@@ -232,14 +232,14 @@ def _refuse_known_houses(job: TrainingJob, began: CheckpointHead, val: SampleStr
 
 
 def _class_weights(train: SampleStream, weighted: bool) -> Tensor:
-    """(2,) float32: so that both classes weigh alike and a sample 1 in the mean; or ones."""
+    """Weights (2,) float32 that balance the classes, with 1 as the mean over samples; or ones."""
     counts = np.array(train.class_counts(), np.float64)
     weights = counts.sum() / (2 * counts) if weighted else np.ones(2)
     return torch.from_numpy(weights.astype(np.float32))
 
 
 def _model(job: TrainingJob, began: Checkpoint | None) -> Model:
-    """With the parameters of the checkpoint to begin from, or drawn from the seed."""
+    """The model with parameters of the checkpoint to begin from, or with random ones from the seed."""
     options = job.options
     torch.manual_seed(options.seed)
     model = build_model(options.model, options.model_config)
@@ -256,7 +256,7 @@ def _head(
     job: TrainingJob, model: Model, train: SampleStream, val: SampleStream, began: CheckpointHead | None
 ) -> CheckpointHead:
     data = tuple(train.origin())
-    # With those of --init, also the houses by which it was chosen: its weights depend on them too.
+    # These include the houses of --init, and those that chose its best epoch: the weights depend on both.
     house_ids = train.house_ids().union(began.house_ids if began else ())
     object_digests = train.object_digests().union(began.object_digests if began else ())
     val_house_ids = val.house_ids().union(began.val_house_ids if began else ()) - house_ids
@@ -277,9 +277,9 @@ def _head(
     )
 
 
-def refuse_other_training(place: str, there: CheckpointHead, here: CheckpointHead) -> None:
+def refuse_other_training(place: str, stored: CheckpointHead, requested: CheckpointHead) -> None:
     """Raise InputError with the fields in which a checkpoint differs from these options."""
-    theirs, ours = _decisive(there), _decisive(here)
+    theirs, ours = _decisive(stored), _decisive(requested)
     names = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
     if names:
         shown = [f"{name} ({theirs.get(name)}, now {ours.get(name)})" for name in names[:4]]

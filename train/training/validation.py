@@ -18,12 +18,12 @@ from datagen.train.rates import label_losses, success_shares
 from datagen.train.tensors import to_torch
 from datagen.train.training.launching import Ranks
 
-# Of which the best is found; 1 is among them.
+# Candidates for the best temperature; 1 is among them.
 _TEMPERATURES = 1.02 ** np.arange(-35, 71)
 
 
 class ValidationMetrics(TypedDict):
-    """What a model came to on samples; what is not defined with one class alone is None."""
+    """Metrics of a model on samples; None where a metric is undefined with one class alone."""
 
     val_loss: float
     val_accuracy: float
@@ -55,10 +55,10 @@ def validate(
             ids.append(batch.sample_id)
             columns.append(rows.cpu().numpy())
     model.train()
-    everyone = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
-    # Several ranks may have judged the same sample.
-    _, first = np.unique(np.concatenate([i for i, _ in everyone]), axis=0, return_index=True)
-    label, p, loss, share, log_odds = np.concatenate([c for _, c in everyone])[np.sort(first)].T
+    gathered = ranks.gather((np.concatenate(ids), np.concatenate(columns)))
+    # Several ranks may have scored the same sample.
+    _, first = np.unique(np.concatenate([i for i, _ in gathered]), axis=0, return_index=True)
+    label, p, loss, share, log_odds = np.concatenate([c for _, c in gathered])[np.sort(first)].T
     weight = class_weights.cpu().double().numpy()[label.astype(np.int64)]
     mean_loss = float(np.average(loss, weights=weight))
     if not np.isfinite(mean_loss):
@@ -76,7 +76,7 @@ def validate(
 
 
 def _best_temperature(log_odds: F64, share: F64, weight: F64) -> float:
-    """The one with the least mean loss over samples with log-odds and shares of successes, (N,) each."""
+    """The temperature with the least mean loss; log-odds and shares of successes are (N,) each."""
     cooled = log_odds / _TEMPERATURES[:, None]
     losses = np.logaddexp(0, cooled) - share * cooled
     return float(_TEMPERATURES[np.average(losses, axis=1, weights=weight).argmin()])

@@ -40,7 +40,7 @@ def test_a_lonely_good_cell_fails_where_a_wide_region_does_not() -> None:
     score[2, 2] = 0.9
     columns = grids(label, score)
     found = arrival_table(
-        columns, [Method("model", 0.5, says_probabilities=True)], weights_for(columns, 20, 0)
+        columns, [Method("model", 0.5, gives_probabilities=True)], weights_for(columns, 20, 0)
     )
     at = {row["arrival"]: row["methods"]["model"] for row in found}
     assert at["0 m off"]["nominal"]["value"] == at["0 m off"]["smoothed"]["value"] == 1

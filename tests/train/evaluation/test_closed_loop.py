@@ -67,7 +67,7 @@ def lonely_and_wide() -> tuple[F64, F64]:
 
 def test_a_smoothed_pick_is_inside_what_is_good_and_a_nominal_one_is_the_best_score() -> None:
     columns = grids(*lonely_and_wide())
-    maps, methods = maps_of(columns), [Method("model", 0.5, says_probabilities=True)]
+    maps, methods = maps_of(columns), [Method("model", 0.5, gives_probabilities=True)]
     turns = plan_turns(columns, maps, methods, ARRIVALS, 3, generators)
     lonely, middle = 2 * SIDE + 2, 9 * SIDE + 9
     assert (turns.cells["model", "nominal"] == lonely).all()

@@ -18,7 +18,7 @@ from tests.train.evaluation.made_columns import make_columns
 METHODS = [
     Method("truth", 0.5),
     Method("constant", 0.5),
-    Method("noisy", 0.5, TrainedBy("stage1", "paper"), says_probabilities=True),
+    Method("noisy", 0.5, TrainedBy("stage1", "paper"), gives_probabilities=True),
     Method("nearest", float("nan")),
 ]
 

@@ -82,7 +82,7 @@ def test_calibration_measures_overconfidence() -> None:
     true = rng.random(len(p)) < p
     honest = metrics.reliability(true, p)
     assert len(honest.count) == metrics.N_BINS and honest.count.sum() == len(p)
-    np.testing.assert_allclose(honest.said, honest.true, atol=0.015)
+    np.testing.assert_allclose(honest.predicted, honest.true, atol=0.015)
     assert honest.expected_error < 0.01
     # The mean of p(1 - p) over p uniform in [0, 1].
     assert metrics.brier(true, p) == pytest.approx(1 / 6, abs=0.003)
