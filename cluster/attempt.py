@@ -87,10 +87,10 @@ def ends_job(every_input_error: bool = False) -> Generator[None]:
 
 
 @lru_cache(maxsize=1)  # a worker serves one run at a time, and a world is large
-def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
-    run = Run.open(place)
+def _open(path: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, World]:
+    run = Run.open(path)
     if run.manifest.spec_hash != spec_hash:
-        raise InputError(place, "spec_hash", "the run now has another specification", "Submit to a new --out")
+        raise InputError(path, "spec_hash", "the run now has another specification", "Submit to a new --out")
     arm = run.manifest.spec.arm
     if arm is not None:
         gripper_of(arm.robot)  # broken robot files concern every shard
@@ -98,9 +98,9 @@ def _open(place: str, spec_hash: str, houses: str, objects: str) -> tuple[Run, W
 
 
 @lru_cache(maxsize=1)
-def _open_scenes_run(place: str, scenes_hash: str) -> Run:
-    scenes_run = Run.open(place)
+def _open_scenes_run(path: str, scenes_hash: str) -> Run:
+    scenes_run = Run.open(path)
     if scenes_run.manifest.spec.scenes_hash != scenes_hash:
         fix = "Give --scenes-from with the run that this one was started with"
-        raise InputError(place, "spec_hash", "the run now has other scenes", fix)
+        raise InputError(path, "spec_hash", "the run now has other scenes", fix)
     return scenes_run

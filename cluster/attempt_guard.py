@@ -1,7 +1,7 @@
 """Runs an attempt in its worker: deadline with stack, note of the process, cost.
 
-A worker that is killed cannot report. So it first writes a note of its process and points `faulthandler`
-at a file next to it, from which `post_mortem` reports whatever ends the process.
+A killed worker cannot report. Therefore it first writes a note of its process and points `faulthandler` at a
+file next to it. `post_mortem` makes a failure report from both.
 """
 
 from __future__ import annotations

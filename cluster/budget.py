@@ -1,6 +1,6 @@
 """The budget of a job: whether one more shard may begin.
 
-The answer depends on the clock, on what was spent and on the costs seen alone. A shard begins only where it
+The answer depends only on the clock, the spending and the costs seen so far. A shard begins only where it
 is likely (90 %) to end within the budget, together with those in flight. No shard is ended for a budget.
 """
 
@@ -49,7 +49,7 @@ def ends_in_time(
 
 @dataclass
 class BudgetGuard:
-    """Says before each attempt whether it fits the budget of the job, which may be one over several runs."""
+    """Decides before each attempt whether it fits the budget of the job, which may span several runs."""
 
     budget: Budget
     began_s: float  # when the command began, by the driver's clock
@@ -58,7 +58,7 @@ class BudgetGuard:
     _bounds: dict[tuple[int, int, int], float] = field(default_factory=dict[tuple[int, int, int], float])
 
     def use(self, forecast: RunForecast) -> None:
-        """Judge the shards of another run."""
+        """Switch to the shards of another run."""
         self.forecast = forecast
         self._bounds.clear()
 
@@ -72,7 +72,7 @@ class BudgetGuard:
     def allows(self, now_s: float, began_s: Sequence[float | None], slots: int) -> bool:
         """Whether one more attempt may begin, next to those in flight (see `ends_in_time`).
 
-        Before the first shard has shown what one costs, each worker gets one.
+        Until the cost of a shard is known, each worker gets one.
         """
         budget, forecast = self.budget, self.forecast
         elapsed_s = now_s - self.began_s

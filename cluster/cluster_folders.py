@@ -69,7 +69,7 @@ def end_processes(processes: list[psutil.Process]) -> None:
 
 
 def is_alive(process: psutil.Process) -> bool:
-    """Whether a process still has memory, which the kernel takes first from one that ends."""
+    """Whether a process still has memory, which the kernel frees first when it ends."""
     try:
         return process.is_running() and process.memory_info().vms > 0
     except psutil.NoSuchProcess:

@@ -4,7 +4,7 @@
         fill the window: due retries first, then new shards
         wait briefly for reports, and handle each: ledger, then done, retry or quarantine
         check attempts that are silent beyond their deadline
-        check what other drivers have committed, after a sign of one
+        check the commits of other drivers, after one superseded an attempt
         handle a stop request
 
 With a budget, an attempt begins only where it fits.
@@ -133,12 +133,12 @@ class _Driver(Generic[T]):
         self._durations = Durations()
         self._numbered = 0
         self._lost_in_a_row = 0
-        # Two drivers of one run must never give two attempts one name.
+        # Random: two drivers of one run must never give two attempts the same name.
         self._name = secrets.token_hex(4)
         self._open = OpenShards(self._shards, random.Random(self._name))
         # The number of the first attempt after this driver last moved to other shards.
         self._here_since = 1
-        self._look_s = float("inf")  # when to check other drivers; never before a sign of one
+        self._look_s = float("inf")  # when to check other drivers; never before one superseded an attempt
         self._looked_s = float("-inf")
         self._next_check_s = float("inf")
         self._end: End | None = None  # set once no new shard is started
@@ -155,7 +155,7 @@ class _Driver(Generic[T]):
                 break
             for report in self._executor.wait(self._patience_s()):
                 self._settle(report)
-            self._look_after_silent()
+            self._check_silent()
             if self._clock() >= self._look_s:
                 self._look_for_others()
             self._totals.in_flight = len(self._flights)
@@ -214,7 +214,7 @@ class _Driver(Generic[T]):
         )
         now_s = self._clock()
         check_s = now_s + order.deadline_s + self._policy.grace_s
-        if len(self._flights) == 1:  # of several, none is alone
+        if len(self._flights) == 1:  # none of several is alone
             next(iter(self._flights.values())).alone = False
         flight = _Flight(order, self._numbered, now_s, check_s, not self._flights)
         self._flights[order.attempt] = flight
@@ -246,7 +246,7 @@ class _Driver(Generic[T]):
             # Not cancelled by this driver: it counts as lost, and the shard stays open.
             report = replace(report, outcome="lost", cause="cancelled by another process")
         if report.outcome not in ("committed", "superseded"):
-            report = self._what_the_run_says(report)
+            report = self._corrected_by_commit(report)
         shard = report.shard
         successes = self._totals.committed + self._totals.superseded
         decision = decide(
@@ -261,7 +261,7 @@ class _Driver(Generic[T]):
         if report.outcome == "committed" and report.cost is not None:
             self._durations.add(report.cost.wall_s)
         if report.outcome == "superseded":
-            self._make_way(flight)
+            self._avoid_other_driver(flight)
         if decision.action == "done":
             self._troubled.pop(shard, None)
         elif decision.action == "retry":
@@ -283,8 +283,8 @@ class _Driver(Generic[T]):
     def _width(self) -> int:
         return min(window(self._policy, self._executor.slots), self._totals.shards - self._totals.finished)
 
-    def _what_the_run_says(self, report: AttemptReport) -> AttemptReport:
-        """A worker may die, or miss the store's response, after its commit: the commit record decides."""
+    def _corrected_by_commit(self, report: AttemptReport) -> AttemptReport:
+        """The report, corrected by the commit record: a worker may die, or miss the response, after it."""
         commit = self._recorder.commit_of(report.shard)
         if commit is None:
             return report
@@ -304,8 +304,8 @@ class _Driver(Generic[T]):
 
     # Others --------------------------------------------------------------------------------
 
-    def _make_way(self, flight: _Flight) -> None:
-        """Another driver was faster at a shard: move to other shards, and check what it has committed."""
+    def _avoid_other_driver(self, flight: _Flight) -> None:
+        """Another driver was faster at a shard: move to other shards, and check its commits."""
         if flight.number >= self._here_since:
             self._open.go_elsewhere()
             self._here_since = self._numbered + 1
@@ -318,14 +318,14 @@ class _Driver(Generic[T]):
         self._looked_s = self._clock()
         took_s = self._looked_s - start_s
         if not dropped:
-            self._look_s = float("inf")  # no other driver nearby: wait for the next sign
+            self._look_s = float("inf")  # no other driver nearby: wait until the next superseded attempt
             return
         # Listing a large run takes time: at most a small share of the driver's.
         self._look_s = self._looked_s + max(self._policy.look_s, self._policy.look_factor * took_s)
 
     # Silence -------------------------------------------------------------------------------
 
-    def _look_after_silent(self) -> None:
+    def _check_silent(self) -> None:
         now_s = self._clock()
         if now_s < self._next_check_s:
             return

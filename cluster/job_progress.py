@@ -26,11 +26,11 @@ class JobStatus:
     labels_per_s: float
     left_s: float | None  # None while the rate is not known
     left_80_s: Interval | None  # None while too few shards are made
-    stopping: str  # why nothing new is begun; "" while it is
+    stopping: str  # why no new shard is started; "" otherwise
 
 
 class StatusBoard(Protocol):
-    """Where a job publishes its status, and where others leave requests to stop it."""
+    """Publishes the status of a job, and holds requests of other processes to stop it."""
 
     def publish(self, status: JobStatus) -> None: ...
     def stop_requested(self) -> StopMode | None: ...
@@ -70,7 +70,7 @@ class JobProgress:
     def tick(self, totals: JobTotals) -> None:
         self._pace.see(totals.labels)
         done, of = self._done_before + totals.finished, self._done_before + totals.shards
-        # The figures may be shown after the executor is closed, so it is asked here.
+        # The figures may be shown after the executor is closed, so the workers are counted here.
         workers = self._left.workers() if self._left else 0
         self._shown.update("shards", done, of, lambda: self._figures(totals, workers))
 
@@ -85,10 +85,10 @@ class JobProgress:
         left = clock_text(left_s) if interval is None else shown_range(interval)
         cpu_s = totals.useful_cpu_s + totals.wasted_cpu_s
         # Rare figures are omitted when 0, to fit 80 columns.
-        given_up = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
+        quarantined = f"  {totals.quarantined} quarantined" if totals.quarantined else ""
         text = (
             f"{rate:,.0f} labels/s  {left} left  "
-            f"{totals.retries} retries{given_up}  {cpu_s / 3600:.2f} core-h{self._note}"
+            f"{totals.retries} retries{quarantined}  {cpu_s / 3600:.2f} core-h{self._note}"
         )
         return text, {
             "shards_done": self._done_before + totals.finished,
@@ -126,7 +126,7 @@ class JobMonitor:
     clock: Callable[[], float] = time.monotonic
     beat_s: float = 10.0
     look_s: float = 3.0
-    _heard: set[StopMode] = field(default_factory=set[StopMode])
+    _handled: set[StopMode] = field(default_factory=set[StopMode])
     _reason: str = ""
 
     def __post_init__(self) -> None:
@@ -134,7 +134,7 @@ class JobMonitor:
         self._next_beat_s = self._next_look_s = self.clock()
 
     def ended(self, report: AttemptReport, action: str) -> None:
-        """Learn from the cost of a made shard."""
+        """Add the cost of a committed shard to the forecast."""
         if self.left is not None and report.outcome == "committed" and report.cost is not None:
             self.left.forecast.add(report.cost, report.host)
         self.shown.ended(report, action)
@@ -158,9 +158,9 @@ class JobMonitor:
             self.board.publish(JobStatus(totals, self._pace.per_s(), left_s, interval, self._reason))
 
     def _handle(self, mode: StopMode | None) -> None:
-        if mode is None or mode in self._heard:
+        if mode is None or mode in self._handled:
             return
-        self._heard.add(mode)
-        # A signal may have asked before: together they ask once.
+        self._handled.add(mode)
+        # A signal may have made the same request before: it counts once.
         while not (self.stop.force if mode == "force" else self.stop.drain):
             self.stop.ask()

@@ -46,7 +46,7 @@ class OpenShards:
         return dropped
 
     def _begin(self, left: ShardRanges, start: int | None = None) -> None:
-        """Give `left` from `start`, or from a random shard on and, after its end, from the first one on."""
+        """Continue with `left` from `start`, or from a random shard; after the last shard, from the first."""
         self._shards, self._given = left, 0
         if start is not None:
             self._start = left.position_of(start)

@@ -1,6 +1,6 @@
-"""Post-mortem of an attempt: what its worker left in files of its machine, and the report made from it.
+"""Post-mortem check of an attempt: read the files that its worker left, and make a failure report.
 
-Notes are kept in a folder of the worker's own machine, under a name that is the job's alone: a job on many
+Notes are kept in a folder of the worker's own machine, under a name unique to the job: a job on many
 machines writes no small files over a network, and needs no folder that all of them share.
 """
 
@@ -20,7 +20,7 @@ from datagen.cluster.task import AttemptReport, Task
 from datagen.schemas.record_files import utc_now
 from datagen.schemas.run_records import Cost, Host, Outcome
 
-# What a ledger entry keeps of a stack, from its end, where the failing frame is.
+# Characters of a stack that a ledger entry keeps, from its end, where the failing frame is.
 STACK_LIMIT = 16_000
 _CAUSE_LIMIT = 300  # a cause is read in a table and on a progress line; the stack has the whole text
 
@@ -33,7 +33,7 @@ def short_line(text: str) -> str:
 
 @dataclass(frozen=True)
 class Note:
-    """What a worker wrote about itself when it began an attempt."""
+    """The note that a worker wrote about its process when it began an attempt."""
 
     host: Host
     started: str
@@ -41,7 +41,7 @@ class Note:
 
 @dataclass(frozen=True)
 class PostMortem:
-    """What a dead worker left of an attempt: its note, and the stack it died with ("" for none)."""
+    """The files that a dead worker left of an attempt: its note, and its last stack ("" for none)."""
 
     note: Note | None = None
     stack: str = ""
@@ -49,7 +49,7 @@ class PostMortem:
 
 @contextmanager
 def notes_of_a_job() -> Generator[str]:
-    """The name under which machines keep their notes of one job; this one's are removed at the end."""
+    """Give the folder name of one job's notes on each machine; this machine's are removed at the end."""
     name = f"datagen-notes-{secrets.token_hex(8)}"
     try:
         yield name
@@ -74,7 +74,7 @@ def read_note(notes: str, attempt: str) -> Note | None:
 
 
 def collect_post_mortem(notes: str, attempt: str) -> PostMortem:
-    """What a dead worker left of an attempt on this machine; note and stack file are removed."""
+    """Read, and remove, the note and the stack file that a dead worker left on this machine."""
     if not notes:
         return PostMortem()
     note, path = read_note(notes, attempt), stack_path(notes, attempt)
@@ -90,11 +90,11 @@ def collect_post_mortem(notes: str, attempt: str) -> PostMortem:
 
 
 def failure_report(task: Task, outcome: Outcome, cause: str, left: PostMortem | None = None) -> AttemptReport:
-    """The report of an attempt whose worker is gone, from what it left behind: here, or `left`.
+    """The report of an attempt whose worker died, from its files on this machine, or from `left`.
 
-    A cause of many lines is cut to one; where the worker left no stack, its whole text stands there.
-    A stack that begins with faulthandler's timeout line tells a hang from a crash. The wall time is
-    counted from the note; CPU time went with the process and is 0.
+    A cause of many lines is cut to one; where the worker left no stack, its whole text is the stack.
+    A stack that begins with faulthandler's timeout line means a hang, not a crash. The wall time is
+    counted from the note; the CPU time is lost with the process, and is 0.
     """
     left, ended = left or collect_post_mortem(task.notes, task.attempt), utc_now()
     note, stack = left.note, left.stack
@@ -122,7 +122,7 @@ def failure_report(task: Task, outcome: Outcome, cause: str, left: PostMortem | 
 
 
 def _folder(notes: str) -> Path:
-    return Path(tempfile.gettempdir(), notes)  # which an absolute path replaces
+    return Path(tempfile.gettempdir(), notes)  # an absolute path is used as it is
 
 
 def note_path(notes: str, attempt: str) -> Path:

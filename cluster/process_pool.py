@@ -1,6 +1,6 @@
-"""Work through a list in processes of one thread on this machine, until it is done or a stop is asked for.
+"""Process a list in single-threaded processes on this machine, until it is done or a stop is requested.
 
-For work that is not a shard of a run: what is done is kept by the work itself, piece by piece.
+For work that is not a shard of a run: the work itself stores its results, piece by piece.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 Stopping = Callable[[], bool]
 Step = Callable[[], None]
 # The function of the processes, importable by name: (item, stopping, step) -> whether it was finished. It
-# asks `stopping` often, and calls `step` for each piece of it.
+# calls `stopping` often, and `step` for each piece.
 Work = Callable[[Item, Stopping, Step], bool]
 
 _POLL_S = 0.2
@@ -37,7 +37,7 @@ def work_through(
     stopping: Stopping,
     seen: Callable[[int], None],
 ) -> bool:
-    """Do all items in `workers` processes, 0: in this one; whether all were finished, else it was stopped.
+    """Do all items in `workers` processes (0: in this one); return whether all were finished, not stopped.
 
     `seen` is called with the number of steps so far. Errors of the work are raised. InputError that names
     `verb` where a process ended without a message.
@@ -86,7 +86,7 @@ _count: Any = None
 
 
 def _begin(stop: Event, count: Any) -> None:
-    """Set up a process: Ctrl-C reaches the whole group, and only the first process decides what it means."""
+    """Set up a process. Ctrl-C reaches the whole group, and only the first process handles it."""
     global _stop, _count
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

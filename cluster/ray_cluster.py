@@ -52,8 +52,8 @@ class RaySettings:
 def ray_cluster(settings: RaySettings) -> Generator[Any]:
     """Start a local cluster, or connect to a running one, for the block; gives the module `ray`.
 
-    A local cluster has a private folder and no dashboard. Raises InputError when it does not start, when the
-    other one cannot be reached, or requires another token.
+    A local cluster has a private folder and no dashboard. Raises InputError when it does not start, or when
+    the running one cannot be reached or requires another token.
     """
     local = settings.address == "local"
     with ExitStack() as whole, ExitStack() as start:
@@ -149,14 +149,14 @@ def token_for(address: str) -> dict[str, str]:
     if address.startswith("ray://"):  # another protocol, without this request
         found = known_token()
         return token_environment(found[0]) if found else {"RAY_AUTH_MODE": "disabled"}
-    if not _turns_away(address, None):
+    if not _refuses(address, None):
         return {"RAY_AUTH_MODE": "disabled"}
     found = known_token()
     if found is None:
         raise InputError("--address", address, "the cluster requires a token, but none is set", _TOKEN_FIX)
-    token, place = found
-    if _turns_away(address, token):
-        raise InputError("--address", address, f"the cluster refuses the token in {place}", _TOKEN_FIX)
+    token, origin = found
+    if _refuses(address, token):
+        raise InputError("--address", address, f"the cluster refuses the token in {origin}", _TOKEN_FIX)
     return token_environment(token)
 
 
@@ -196,15 +196,15 @@ def _resolved(address: str) -> str:
         raise InputError("--address", address, first_line(error), _START_FIX) from error
 
 
-def _turns_away(address: str, token: str | None) -> bool:
+def _refuses(address: str, token: str | None) -> bool:
     """Whether the cluster refuses a client with this token, or without one, by a request for its name."""
     import grpc
 
     headers = (("authorization", f"Bearer {token}"),) if token else ()
     with grpc.insecure_channel(address) as channel:
-        ask = channel.unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")
+        request = channel.unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")
         try:
-            ask(b"", timeout=_PATIENCE_S, metadata=headers)
+            request(b"", timeout=_PATIENCE_S, metadata=headers)
         except grpc.RpcError as error:
             code = error.code()  # pyright: ignore[reportAttributeAccessIssue]
             if code == grpc.StatusCode.UNAUTHENTICATED:

@@ -23,8 +23,8 @@ from datagen.schemas.run_records import Outcome
 
 _SLOTS_SEEN_FOR_S = 5.0
 _BEGUN_SEEN_FOR_S = 1.0
-# A forced cancellation normally kills a worker at once; after this, it is killed by its note.
-_HEEDS_RAY_WITHIN_S = 1.0
+# A forced cancellation normally kills a worker at once; after this, it is killed by the pid in its note.
+_CANCELLED_WITHIN_S = 1.0
 # Timeout for other machines, which may have to start a process first.
 _BEGUN_WITHIN_S, _POST_MORTEM_WITHIN_S, _FORGOTTEN_WITHIN_S = 10.0, 30.0, 5.0
 
@@ -42,7 +42,7 @@ class _Death(Generic[T]):
 
 @dataclass
 class _PostMortemCheck(Generic[T]):
-    """Deaths without a post-mortem on this machine, and what the other machines say of them."""
+    """Deaths without a post-mortem on this machine, and the request for it to the other machines."""
 
     deaths: list[_Death[T]]
     question: Question
@@ -121,23 +121,23 @@ class RayExecutor(Generic[T]):
         self._jobs.add(task.notes)
 
     def wait(self, timeout_s: float) -> list[AttemptReport]:
-        asked = [ref for check in self._post_mortem_checks for ref in check.question.silent]
-        if not self._tasks and not asked:
+        requested = [ref for check in self._post_mortem_checks for ref in check.question.silent]
+        if not self._tasks and not requested:
             if not self._post_mortem_checks:
                 time.sleep(timeout_s)
             return self._ended_post_mortem_checks()
         if dead := self.others.own.dead():
             return self._lose_all(dead)
         self._end_stubborn()
-        refs = [*self._tasks, *asked]
+        refs = [*self._tasks, *requested]
         ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         if ready:  # also take all others that have ended
             ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for check in self._post_mortem_checks:
-            self.others.hear(check.question, ready)
-        ended = [self._answer(ref) for ref in ready if ref in self._tasks]
-        reports = [answer for answer in ended if not isinstance(answer, _Death)]
-        reports += self._failure_reports([answer for answer in ended if isinstance(answer, _Death)])
+            self.others.collect(check.question, ready)
+        ended = [self._result(ref) for ref in ready if ref in self._tasks]
+        reports = [result for result in ended if not isinstance(result, _Death)]
+        reports += self._failure_reports([result for result in ended if isinstance(result, _Death)])
         return reports + self._ended_post_mortem_checks()
 
     def has_begun(self, attempt: str) -> bool:
@@ -146,7 +146,7 @@ class RayExecutor(Generic[T]):
             return False
         if attempts_begun(self._tasks[ref].notes, [attempt]):
             return True
-        if time.monotonic() >= self._begun_until_s:  # checked in batches, at intervals
+        if time.monotonic() >= self._begun_until_s:  # checked for all attempts, at intervals
             self._begun_elsewhere = {
                 begun
                 for notes, flying in self._by_notes(self._tasks.values()).items()
@@ -162,7 +162,7 @@ class RayExecutor(Generic[T]):
         ref = self._refs.get(attempt)
         if ref is None:
             return
-        self._killed[attempt] = time.monotonic() + _HEEDS_RAY_WITHIN_S
+        self._killed[attempt] = time.monotonic() + _CANCELLED_WITHIN_S
         self._ray.cancel(ref, force=True)
         end_attempts(self._tasks[ref].notes, [attempt])  # a stopped process ignores Ray
 
@@ -185,9 +185,9 @@ class RayExecutor(Generic[T]):
 
     def _lose_all(self, cause: str) -> list[AttemptReport]:
         refs = list(self._tasks)
-        ended = [self._answer(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
-        reports = [answer for answer in ended if not isinstance(answer, _Death)]
-        deaths = [answer for answer in ended if isinstance(answer, _Death)]
+        ended = [self._result(r) for r in refs and self._ray.wait(refs, num_returns=len(refs), timeout=0)[0]]
+        reports = [result for result in ended if not isinstance(result, _Death)]
+        deaths = [result for result in ended if isinstance(result, _Death)]
         deaths += [death for check in self._post_mortem_checks for death in check.deaths]
         deaths += [
             _Death(task, "cancelled" if task.attempt in self._killed else "lost", cause)
@@ -207,7 +207,7 @@ class RayExecutor(Generic[T]):
             reports.append(replace(report, cause=cause, ends_job=True) if ends_job else report)
         return reports
 
-    def _answer(self, ref: Any) -> AttemptReport | _Death[T]:
+    def _result(self, ref: Any) -> AttemptReport | _Death[T]:
         task, e = self._tasks.pop(ref), self._ray.exceptions
         del self._refs[task.attempt]
         killed = self._killed.pop(task.attempt, None) is not None

@@ -130,11 +130,11 @@ def _start(workers: int) -> Head:
 
 def _started(workers: int, folder: Path, until_s: float) -> Head | str:
     """Start the head in this private folder; return it, or its last message where it failed."""
-    token, said = new_token(), folder / "start.txt"
+    token, output = new_token(), folder / "start.txt"
     # Jobs bring their own store settings: no job may use the credentials of another.
     inherited = {n: value for n, value in os.environ.items() if n != "RAY_ADDRESS" and not is_of_the_shell(n)}
     arguments = [*head_arguments(max(1, workers)), f"--temp-dir={folder / RAY}"]
-    with said.open("w") as out:
+    with output.open("w") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "ray.scripts.scripts", *arguments],
             env=inherited | head_environment(token, folder),
@@ -149,7 +149,7 @@ def _started(workers: int, folder: Path, until_s: float) -> Head | str:
         except subprocess.TimeoutExpired:
             process.kill()
             code = process.wait()
-    text = said.read_text(errors="replace")
+    text = output.read_text(errors="replace")
     found = _URL.search(text)
     if code != 0 or found is None:
         return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")

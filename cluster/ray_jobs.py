@@ -31,9 +31,9 @@ class RayJobs:
         self._client = client
 
     def submit(self, entrypoint: str, submission: str, environment: Mapping[str, str]) -> None:
-        """Run a shell command on the cluster's head under a name of our own.
+        """Run a shell command on the cluster's head as the job named `submission`.
 
-        Others may see the variables, so they must not contain secrets.
+        Other users may see the variables, so they must not contain secrets.
         """
         runtime: dict[str, Any] = {"env_vars": dict(environment)}
         if JOB_ENVIRONMENT in environment:
@@ -98,10 +98,10 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
     if address.startswith(("http://", "https://")):
         url = address
     else:
-        url = f"http://{address}" if _speaks_http(address) else ""
+        url = f"http://{address}" if _is_dashboard(address) else ""
         if not url:
             refuse_unreachable(address)
-            # Asked for its dashboard, a cluster wants the token where it wants one at all.
+            # The request for the dashboard's address needs the token of a cluster that requires one.
             changed |= {} if address == "auto" else token_for(address)
     if not token and (found := known_token()) and (not url or dashboard_status(url) in (401, 403)):
         token = found[0]
@@ -116,13 +116,13 @@ def open_ray_jobs(address: str, token: str = "") -> RayJobs:
         return RayJobs(str(client.get_address()), client)
 
 
-def _speaks_http(address: str) -> bool:
+def _is_dashboard(address: str) -> bool:
     """Whether HOST:PORT is a dashboard: other ports of a cluster do not respond to HTTP."""
     return "://" not in address and address != "auto" and dashboard_status(f"http://{address}") is not None
 
 
 def dashboard_status(url: str, token: str = "") -> int | None:
-    """A dashboard's response to a request, without a token by default; None where there is none."""
+    """Status code of a dashboard's response, without a token by default; None where there is no response."""
     parts = urlsplit(url)
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     connection = kind(parts.netloc, timeout=_ANSWER_WITHIN_S)

@@ -14,7 +14,7 @@ from typing import Any
 
 from datagen.cluster.post_mortem import PostMortem, collect_post_mortem, read_note
 
-_MUTE_S = 30.0  # a machine that did not respond is not asked again for this time
+_SKIPPED_S = 30.0  # a machine that did not respond gets no request for this time
 _LOOK_S, _CONNECTS_WITHIN_S = 1.0, 2.0
 # A remote GCS server may be restarted. Without one, Ray ends this process after 60 s.
 _PATIENCE_S = 20.0
@@ -23,14 +23,14 @@ _PATIENCE_S = 20.0
 class OwnNode:
     """Health of the two servers that a driver needs: its machine's raylet and the cluster's GCS server.
 
-    Without them, Ray makes a driver wait, fail or exit a minute later. So they are checked once a second, and
+    Without them, Ray makes a driver wait, fail or exit a minute later. They are checked once a second, and
     before each request that would block.
     """
 
     def __init__(self, ray: Any, address: str) -> None:
         self._node = ray._private.worker._global_node  # None for a client (ray://), which needs none of them
         self._patience_s = 0.0 if address == "local" else _PATIENCE_S
-        self._heard_s = self._looked_s = time.monotonic()
+        self._responded_s = self._looked_s = time.monotonic()
 
     def dead(self) -> str:
         """The server that has not responded for too long; "" for none."""
@@ -38,8 +38,8 @@ class OwnNode:
             return ""
         self._looked_s, silent = time.monotonic(), self.silent()
         if not silent:
-            self._heard_s = self._looked_s
-        return silent if self._looked_s - self._heard_s >= self._patience_s else ""
+            self._responded_s = self._looked_s
+        return silent if self._looked_s - self._responded_s >= self._patience_s else ""
 
     def silent(self) -> str:
         """The server that does not respond now; "" for none."""
@@ -81,7 +81,7 @@ class OtherNodes:
         self._alone = address == "local"
         # A client of `ray://` is not a machine of the cluster.
         self._own = "" if address.startswith("ray://") else str(ray.get_runtime_context().get_node_id())
-        self._mute_until_s: dict[str, float] = {}
+        self._skipped_until_s: dict[str, float] = {}
         self._tasks: dict[Callable[..., Any], Any] = {}  # each is sent to the cluster once
 
     def alive(self) -> dict[str, str]:
@@ -100,12 +100,12 @@ class OtherNodes:
         Machines that did not respond to the last request are skipped for a while.
         """
         now_s = time.monotonic()
-        deaf = [node for node, until_s in self._mute_until_s.items() if now_s < until_s]
-        question = self.put(function, *arguments, patience_s=patience_s, but=deaf)
+        skipped = [node for node, until_s in self._skipped_until_s.items() if now_s < until_s]
+        question = self.put(function, *arguments, patience_s=patience_s, but=skipped)
         while question.silent and (left_s := question.until_s - time.monotonic()) > 0:
             ready, _ = self._ray.wait(list(question.silent), num_returns=1, timeout=left_s)
-            self.hear(question, ready)
-        self._mute_until_s |= dict.fromkeys((n for n, _ in question.silent.values()), now_s + _MUTE_S)
+            self.collect(question, ready)
+        self._skipped_until_s |= dict.fromkeys((n for n, _ in question.silent.values()), now_s + _SKIPPED_S)
         return question.answers
 
     def put(
@@ -124,7 +124,7 @@ class OtherNodes:
                 sent[ref] = (node, name)
         return Question(sent, time.monotonic() + patience_s)
 
-    def hear(self, question: Question, ready: Iterable[Any]) -> None:
+    def collect(self, question: Question, ready: Iterable[Any]) -> None:
         """Collect the finished results among these references."""
         for ref in [r for r in ready if r in question.silent]:
             _, name = question.silent.pop(ref)
@@ -134,7 +134,7 @@ class OtherNodes:
                 continue
 
 
-# The requests; each of these functions runs on the other machines.
+# Functions of the requests, which run on the other machines.
 
 
 def attempts_begun(notes: str, attempts: Sequence[str]) -> list[str]:
@@ -143,7 +143,7 @@ def attempts_begun(notes: str, attempts: Sequence[str]) -> list[str]:
 
 
 def post_mortems_of(notes: str, attempts: Sequence[str]) -> dict[str, PostMortem]:
-    """Take the files of dead workers of the attempts from this machine."""
+    """Read, and remove, the files that dead workers of the attempts left on this machine."""
     found = {attempt: collect_post_mortem(notes, attempt) for attempt in attempts}
     return {attempt: left for attempt, left in found.items() if left.note is not None}
 

@@ -116,15 +116,15 @@ def is_suspect(trouble: ShardFailures) -> bool:
 def at_once(lost_in_a_row: int, width: int) -> int:
     """How many of `width` attempts to have in flight.
 
-    After two rounds of losses one at a time: that shows whether one shard ends the machine of all others.
+    One at a time after two rounds of losses: this shows whether one shard kills the machine of all others.
     """
     return 1 if lost_in_a_row >= 2 * width else width
 
 
 def nothing_runs(policy: RetryPolicy, lost_in_a_row: int, width: int) -> bool:
-    """Whether the executor, not a shard, is at fault: of `width` attempts in flight all are lost, always.
+    """Whether the executor, not a shard, is at fault: all `width` attempts in flight are always lost.
 
-    Not before the limit of a shard that is the only one left is reached.
+    False until a shard that is the only one left has reached its limit of losses.
     """
     return lost_in_a_row > max(policy.max_lost + 1, policy.max_lost_rounds * width)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datagen.cluster.shard_costs import Draws, Interval, ShardCosts, Variation, Work, warm_up_share
 from datagen.schemas.run_records import Cost, Host
 
-# Of scenes and jobs on built-in, ProcTHOR and YCB assets; benchmarks/forecast.py shows whether they hold.
+# Measured on built-in, ProcTHOR and YCB assets; benchmarks/forecast.py shows whether they hold.
 BETWEEN_JOBS = {
     "cpu": Variation(0.55, 0.15),
     "wall": Variation(0.55, 0.3),
@@ -24,7 +24,7 @@ _KNOWN_AFTER = 3  # shards
 
 @dataclass(frozen=True)
 class MadeShard:
-    """The cost of a made shard, with the parts that do not grow with its scenes, and who made it."""
+    """The cost of a made shard, with the parts that do not grow with its scenes, and its worker."""
 
     scenes: int
     cost: Cost
@@ -54,7 +54,7 @@ class SeenCosts:
 
 
 class RunForecast:
-    """What the rest of one run costs. `earlier` are shards that another job has made in this run."""
+    """Forecast of the cost of the rest of one run. `earlier` are shards made by other jobs in this run."""
 
     def __init__(self, scenes_per_shard: int, earlier: Iterable[MadeShard] = ()) -> None:
         self._scenes = scenes_per_shard
@@ -62,7 +62,7 @@ class RunForecast:
         for shard in earlier:
             self.costs.add(shard)
         self.costs.workers.clear()  # those processes have ended
-        self._left: tuple[tuple[int, int, int], Interval] | None = None  # the last one, by what it depends on
+        self._left: tuple[tuple[int, int, int], Interval] | None = None  # the last result and its arguments
 
     def add(self, cost: Cost, host: Host | None) -> None:
         """Add a shard that this job has made."""
@@ -89,14 +89,14 @@ class RunForecast:
         return self.costs.wall.bound(self._work(1, workers))
 
     def spending(self, shards: int, workers: int, per_cpu_s: float, per_byte: float) -> Draws:
-        """Draws of what these shards cost at prices of a CPU second and of a byte."""
+        """Draws of the cost of these shards at prices of a CPU second and of a byte."""
         work = self._work(shards, workers)
         return per_cpu_s * self.costs.cpu.total(work) + per_byte * self.costs.stored.total(work)
 
     def _work(self, shards: int, workers: int) -> Work:
         """These shards, with the warm-ups of the workers that make them and have not made enough scenes."""
         made = list(self.costs.workers.values())[-workers:]
-        # The first of the workers that lack scenes make the next shards.
+        # The workers with the fewest scenes make the next shards.
         busy = sorted([*made, *[0] * (workers - len(made))])[: max(1, min(workers, shards))]
         each = shards * self._scenes / len(busy)
         return Work(shards, self._scenes, sum(warm_up_share(before, each) for before in busy))

@@ -1,4 +1,4 @@
-"""What shards will cost, from those that were made: a predictive distribution of one quantity.
+"""Predictive distribution of the cost of shards, for one quantity, from the shards made so far.
 
 The cost of a shard is a linear model with two unknowns, the cost of a scene and the warm-up of a worker:
 
@@ -9,7 +9,7 @@ code, houses, objects and arms are loaded when they are first needed. The noise 
 to the scenes. Weighted least squares with conjugate priors give Student-t predictions (Gelman et al.,
 Bayesian Data Analysis, ch. 14). The priors matter while few shards are seen: a scene's standard deviation
 relative to its mean, so that two shards that happen to be alike do not give a narrow interval, and a warm-up
-in scenes. A common factor stands for what differs between two jobs: load of the machine, and its caches.
+in scenes. A common factor stands for differences between two jobs: load of the machine, and its caches.
 
 `benchmarks/forecast.py` measures how often the intervals hold.
 """
@@ -55,7 +55,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Variation:
-    """How a quantity varies, relative to its mean.
+    """Variation of a quantity, relative to its mean.
 
     `scene`: prior standard deviation between scenes. `job`: that of the factor that the shards of one job
     have in common, compared with the shards seen.
@@ -70,7 +70,7 @@ class Variation:
 class Work:
     """Shards to forecast. `warm_ups`: the sum of `warm_up_share` over the workers that make them.
 
-    `known`: the shards seen are among the scenes, which cost the same when they are made again.
+    `known`: the shards include those seen, which cost the same when they are made again.
     """
 
     shards: int
@@ -90,7 +90,7 @@ def warm_up_share(before: float, scenes: float) -> float:
 
 @dataclass
 class ShardCosts:
-    """Sums over the costs of the shards seen, and draws of what others cost. Constant memory."""
+    """Sums over the costs of the shards seen, and draws of the costs of others. Constant memory."""
 
     variation: Variation
     seen: int = 0
@@ -160,7 +160,7 @@ class ShardCosts:
         fit = inverse @ target
         left = max(float(self._squares[2, 2] - fit @ target), 0.0)  # sum of squared residuals
         freedom = _PRIOR_SHARDS + self.seen - 1
-        # A slow start may look as if all were warm-up: a scene costs something.
+        # After a slow start the fit may count all cost as warm-up, but a scene has a cost too.
         least = max(_LEAST_SCENE * self._sums[2] / self._sums[0], 1e-12)
         prior = (self.variation.scene * max(fit[0], least)) ** 2
         variance = (_PRIOR_SHARDS * prior + left) / rng.chisquare(freedom, N_DRAWS)

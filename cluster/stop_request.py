@@ -1,4 +1,4 @@
-"""A request to stop a job: once to finish what is in flight, twice to end at once."""
+"""A request to stop a job: once to finish attempts in flight, twice to end at once."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ class StopRequest:
     """Counts stop requests. Safe to use in a signal handler."""
 
     def __init__(self) -> None:
-        self._asked = 0
+        self._count = 0
 
     def ask(self) -> None:
-        self._asked += 1
+        self._count += 1
 
     @property
     def drain(self) -> bool:
         """Whether to start nothing more and wait a bounded time for running attempts."""
-        return self._asked >= 1
+        return self._count >= 1
 
     @property
     def force(self) -> bool:
-        return self._asked >= 2
+        return self._count >= 2
 
 
 @contextmanager

@@ -32,9 +32,9 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> IO[bytes]:
-    """Open a stored or deflated member. Raises one of `DAMAGED_ZIP`; ValueError for other methods, since
+    """Open a stored or deflated member. Raises one of `DAMAGED_ZIP`; ValueError for other methods.
 
-    damaged bzip2 raises OSError as a failing disk does, and an LZMA header can claim up to 4 GiB of memory.
+    Damaged bzip2 raises OSError as a failing disk does, and an LZMA header can claim up to 4 GiB of memory.
     """
     if member.compress_type not in _METHODS:
         method = member.compress_type

@@ -1,6 +1,6 @@
-"""What a store says of itself by the conventions CF and ACDD: title, source, licences, history.
+"""Attributes of a store by the conventions CF and ACDD: title, source, licences, history.
 
-All of it follows from specifications, so that a store of one specification has the same bytes everywhere.
+All of them follow from specifications, so that a store of one specification has the same bytes everywhere.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _OBJECTS = {
         "Set, 2015, doi:10.1109/MRA.2015.2448951",
     ),
 }
-# What its package states of its assets, robots among them.
+# As the package states for its assets, which include the robots.
 _ROBOTS = _Asset(
     "ManiSkill robot models",
     "CC-BY-NC-4.0",
@@ -84,7 +84,7 @@ def described(specs: Sequence[Specification], samples: Sequence[int] = ()) -> di
 
 
 def cf_attributes(field: Field, table: Table) -> dict[str, Any]:
-    """An array's CF attributes in a store for readers, which those of a shard's array do not have."""
+    """CF attributes of an array in a sealed store; arrays of shards do not have them."""
     keys = ("scene_index", "house_id")
     if table == "sample":
         keys = ("sample_scene_index", "candidate_index", "robot_index")

@@ -31,7 +31,7 @@ class InputError(ValueError):
 
 
 def refuse_not_utf8(text: str) -> str:
-    """Return the text. InputError where it is not valid Unicode, which file names may be and records not."""
+    """Return the text. InputError where it is not valid Unicode: a record must be, a file name need not."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -53,7 +53,7 @@ def one_line(text: str) -> str:
 
 
 def choices(valid: Iterable[object], given: str = "") -> str:
-    """`Did you mean b? Choose one of: a, b, c.` for the fix of an error; `given` is what was mistyped."""
+    """`Did you mean b? Choose one of: a, b, c.` for the fix of an error; `given` is the mistyped name."""
     names = sorted(map(str, valid))
     near = get_close_matches(given, names, n=1)
     return f"{f'Did you mean {near[0]}? ' if near else ''}Choose one of: {', '.join(names)}"

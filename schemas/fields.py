@@ -223,7 +223,7 @@ SIM_FIELDS = (
           "outcome of the last execution after a first that failed; the label is the first's",
           0, len(RETRY_OUTCOMES) - 1, RETRY_OUTCOMES, since=3),
 )
-# Stored by runs of selected candidates alone.
+# Stored only by runs of selected candidates.
 SELECTION_PROBABILITY = Field(
     "selection_probability", "float64", (), "1", "",
     "probability with which the candidate, and its scene, was selected to be labelled", 0, 1)

@@ -6,10 +6,10 @@ each first writes its mark and then checks for the other's:
     removal                                         commit
     1 writes `removing` into the attempt's folder   1 finds its files whole and no `removing`
     2 reads the shard's commit: where it names      2 puts the commit record, create-only
-      the attempt, takes `removing` back, is done   3 finds its files whole and no `removing`;
-    3 removes the files                               else takes its record back, and fails
-    4 reads the commit again, to tell if it names
-      what is gone; removes `removing` last
+      the attempt, removes `removing` and ends      3 finds its files whole and no `removing`;
+    3 removes the files                               else removes its record, and fails
+    4 reads the commit again, to report one with
+      missing files; removes `removing` last
 
 The writer of the second mark sees the first one, so a surviving commit has its files. One case remains: an
 attempt dies between its steps 2 and 3 while its files are removed. Its commit then names missing files,
@@ -75,22 +75,23 @@ class Swept:
 
 
 def find_garbage(
-    place: Storage, older_than_s: float, now_s: float, seen: Seen = lambda done, of: None
+    storage: Storage, older_than_s: float, now_s: float, seen: Seen = lambda done, of: None
 ) -> list[Garbage]:
     """List garbage last written more than `older_than_s` before `now_s` (seconds since 1970 UTC).
 
     While jobs run, files written since the first of them began are kept, whatever their age. `seen` is called
     with (searched shards, shards). InputError where there is no run.
     """
-    runs = open_runs(place)
-    began = [_seconds(job.record.started) for job in Jobs(place).all() if job.health() in ("live", "silent")]
+    runs = open_runs(storage)
+    running = [job.record for job in Jobs(storage).all() if job.health() in ("live", "silent")]
+    began = [_seconds(job.started) for job in running]
     before_s = min([now_s - older_than_s, *began])
     found: list[Garbage] = []
     for run in runs:
         found += _of_run(run, before_s, seen)
-    if all(run.storage.url != place.url for run in runs):  # merged runs
-        rest = (file for file in place.list("") if not file.key.startswith("parts/"))
-        found += _loose(place, rest, set(), before_s)
+    if all(run.storage.url != storage.url for run in runs):  # merged runs
+        rest = (file for file in storage.list("") if not file.key.startswith("parts/"))
+        found += _loose(storage, rest, set(), before_s)
     return found
 
 
@@ -120,18 +121,18 @@ def _of_run(run: Run, before_s: float, seen: Seen) -> Iterator[Garbage]:
         for file in storage.list("ledger")
         if file.key.endswith(".start.json")
     }
-    spent, passed = set(unreadable_files(run)), 0
+    unreadable, searched = set(unreadable_files(run)), 0
     for key, group in groupby(storage.list(""), key=_folder_of):
         if not (found := _ATTEMPT.fullmatch(f"{key}/")):
-            yield from _loose(storage, group, spent, before_s)
+            yield from _loose(storage, group, unreadable, before_s)
             continue
         files = list(group)
         shard, name = int(found[1]), found[2]
-        passed += 1
-        seen(min(passed, len(committed)), len(committed))
+        searched += 1
+        seen(min(searched, len(committed)), len(committed))
         newest_s = max([started.get(name, 0.0), *(file.modified_s for file in files)])
         if shard in committed and _winner(run, shard) in (name, None):
-            # Only leftovers of a removal or a killed writer in the committed attempt's folder.
+            # In a committed attempt's folder, only leftovers of a removal or a killed writer are garbage.
             left = [file for file in files if file.key == f"{key}/{REMOVING}" or _DRAFT.fullmatch(file.key)]
             yield from (_one(storage, "drafts", file) for file in left if file.modified_s < before_s)
         elif newest_s < before_s:
@@ -158,7 +159,7 @@ def _folder_of(file: StoredFile) -> str:
 
 
 def _loose(
-    storage: Storage, files: Iterable[StoredFile], spent: set[str], before_s: float
+    storage: Storage, files: Iterable[StoredFile], unreadable: set[str], before_s: float
 ) -> Iterator[Garbage]:
     """Garbage outside the attempts' folders: drafts of stores, and single files."""
     drafted: dict[str, list[StoredFile]] = {}
@@ -171,7 +172,7 @@ def _loose(
             yield _one(storage, "probes", file)
         elif _DRAFT.fullmatch(file.key):
             yield _one(storage, "drafts", file)
-        elif file.key in spent:
+        elif file.key in unreadable:
             yield _one(storage, "index", file)
     for key, parts in drafted.items():
         if max(file.modified_s for file in parts) < before_s:

@@ -22,8 +22,8 @@ class Stream(IntEnum):
     PATH = 5
     DISTURBANCE = 6
     SELECTION = 7
-    FORECAST = 8  # of no sample: draws of what a job will cost
-    ARRIVAL = 9  # of no sample: where robots arrive in a closed loop
+    FORECAST = 8  # for no sample: draws of the cost of a job
+    ARRIVAL = 9  # for no sample: poses at which robots arrive in a closed loop
 
 
 def generator(seed: int, stream: Stream, *index: int) -> np.random.Generator:

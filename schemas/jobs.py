@@ -43,7 +43,7 @@ class JobRecord(StoredRecord):
     pid: int = Field(ge=0)
     started: str
     address: str  # local, or the address of the Ray cluster
-    submission: str = ""  # of a detached job: its name at the Jobs API, and the address of that
+    submission: str = ""  # for a detached job: its name in the Ray Jobs API, and the address of the API
     jobs_api: str = ""
 
 
@@ -70,7 +70,7 @@ class JobState(StoredRecord):
 
     @model_serializer(mode="wrap")
     def _without_unknown_interval(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omitted where None, so that ended jobs have the fields that older versions read."""
+        """Omit the interval where it is None: ended jobs then have the fields that older versions read."""
         return {name: value for name, value in plain(self).items() if name != "left_80_s" or value}
 
 
@@ -97,8 +97,8 @@ class StoredJob:
         return self.record.id
 
     def silence(self, at: datetime | None = None) -> timedelta:
-        heard = self.state.updated if self.state else self.record.started
-        return max((at or datetime.now(UTC)) - _time_of(heard), timedelta())
+        last = self.state.updated if self.state else self.record.started
+        return max((at or datetime.now(UTC)) - _time_of(last), timedelta())
 
     def health(self, at: datetime | None = None) -> Health:
         """ended, live, dead, or silent: on another machine, without a record for a minute."""
@@ -114,32 +114,32 @@ class StoredJob:
 class Jobs:
     """The jobs of one run, or of merged runs."""
 
-    def __init__(self, place: Storage) -> None:
-        self._place = place
+    def __init__(self, storage: Storage) -> None:
+        self._storage = storage
 
     def begin(self, record: JobRecord) -> None:
-        if not self._place.put_new(f"jobs/{record.id}.json", encode_record(record)):
-            where = f"{self._place.url}/jobs/{record.id}.json"
+        if not self._storage.put_new(f"jobs/{record.id}.json", encode_record(record)):
+            where = f"{self._storage.url}/jobs/{record.id}.json"
             raise InputError(where, "", "exists already", "Start the job again: it gets another name")
 
     def put_state(self, state: JobState) -> None:
-        self._place.put(f"jobs/{state.id}.state.json", encode_record(state))
+        self._storage.put(f"jobs/{state.id}.state.json", encode_record(state))
 
     def ask_to_stop(self, job: str, at_once: bool) -> None:
         """Ask a job to stop. A request to stop at once is not replaced by a weaker one."""
-        standing = self.stop_order(job)
-        if standing is None or (at_once and not standing.now):
+        existing = self.stop_order(job)
+        if existing is None or (at_once and not existing.now):
             order = StopRecord(id=job, now=at_once, asked=utc_now(), host=platform.node())
-            self._place.put(f"jobs/{job}.stop.json", encode_record(order))
+            self._storage.put(f"jobs/{job}.stop.json", encode_record(order))
 
     def stop_order(self, job: str) -> StopRecord | None:
-        return self._passing(f"jobs/{job}.stop.json", StopRecord)
+        return self._read_or_none(f"jobs/{job}.stop.json", StopRecord)
 
     def get(self, job: str) -> StoredJob | None:
         """Read one job; None where it does not exist. InputError where its record is damaged."""
-        where = f"{self._place.url}/jobs/{job}.json"
+        where = f"{self._storage.url}/jobs/{job}.json"
         try:
-            record = read_record(self._place, f"jobs/{job}.json", JobRecord)
+            record = read_record(self._storage, f"jobs/{job}.json", JobRecord)
         except InputError as error:
             fix = "Remove it: no data depends on it"
             raise InputError(where, error.field, error.problem, fix) from error
@@ -147,17 +147,17 @@ class Jobs:
             return None
         if record.id != job:
             raise InputError(where, "id", f"is {record.id}, not {job}", "Remove this foreign file")
-        return StoredJob(record, self._passing(f"jobs/{job}.state.json", JobState), self.stop_order(job))
+        return StoredJob(record, self._read_or_none(f"jobs/{job}.state.json", JobState), self.stop_order(job))
 
     def all(self) -> list[StoredJob]:
-        names = (_JOB_FILE.fullmatch(file.key) for file in self._place.list("jobs"))
+        names = (_JOB_FILE.fullmatch(file.key) for file in self._storage.list("jobs"))
         found = [job for name in names if name and (job := self.get(name[1])) is not None]
         # Names have seconds only, and two jobs may begin within one.
         return sorted(found, key=lambda job: (job.record.started, job.record.id))
 
-    def _passing(self, key: str, model: type[Replaced]) -> Replaced | None:
+    def _read_or_none(self, key: str, model: type[Replaced]) -> Replaced | None:
         # Replaced too often for fsync: after a power cut it may be torn, and then counts as absent.
-        data = self._place.get(key, MAX_RECORD_BYTES)
+        data = self._storage.get(key, MAX_RECORD_BYTES)
         if data is None:
             return None
         try:

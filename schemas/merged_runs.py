@@ -14,12 +14,12 @@ from datagen.schemas.run_records import Merged, other_value
 from datagen.schemas.storage import Storage, open_storage
 
 
-def open_runs(place: Storage | Path | str) -> list[Run]:
-    """Return the run at `place`, or the parts of merged runs in the order of their rows in the store.
+def open_runs(path: Storage | Path | str) -> list[Run]:
+    """Return the run at `path`, or the parts of merged runs in the order of their rows in the store.
 
     InputError where there is no run, or one that is damaged or of another format.
     """
-    storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
+    storage = path if isinstance(path, Storage) else open_storage(path, probe=False, create=False)
     merged = read_record(storage, MERGED, Merged)
     if merged is None:
         return [Run.open(storage)]

@@ -23,11 +23,11 @@ OUTCOMES: dict[str, str] = {
     "out_of_reach": "reach",  # the target is farther from the mount than the arm is long
     "no_grasp": "grasps",  # the hand alone collides with the scene in every grasp of the target
     "no_ik": "ik",  # no joint configuration puts the hand at pregrasp and grasp
-    "arm_collision": "collision",  # there the arm hits the scene or itself
+    "arm_collision": "collision",  # at every such configuration the arm hits the scene or itself
     "no_start": "path",  # every tucked start pose collides
     "no_path": "path",  # no collision-free path to the pregrasp within the iteration cap
     "no_approach": "path",  # the straight line to the grasp jumps, leaves the limits or collides
-    "no_lift": "path",  # the straight line up does
+    "no_lift": "path",  # the straight line up jumps, leaves the limits or collides
     "not_reached": "execute",  # the arm did not arrive: it was blocked or its drives fell behind
     "missed": "execute",  # closed, with nothing between the fingers
     "slipped": "execute",  # held after closing, not lifted with the hand
@@ -35,5 +35,5 @@ OUTCOMES: dict[str, str] = {
     "unstable": "execute",  # the physics diverged: NaN, impossible speeds, or an object thrown
 }
 
-# How the last of further executions ended, after a first that failed; the order is part of the data format.
+# Outcome of the last execution, where the first failed; the order is part of the data format.
 RETRY_OUTCOMES = ("none", *OUTCOMES)

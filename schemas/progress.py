@@ -75,7 +75,7 @@ class Progress:
         self._every_s = _DRAW_EVERY_S if self._live else _LINE_EVERY_S
         self._next_s = clock() + (0.0 if self._live else self._every_s)
         self._state: tuple[str, int, int, Figures] | None = None  # not shown yet
-        self._told = self._live
+        self._is_shown = self._live
         self._row: TaskID | None = None
         self._bar = Bar(
             TextColumn("{task.description}", style="bold", markup=False),
@@ -101,10 +101,10 @@ class Progress:
             self.say("phase", {"phase": name}, name)
 
     def update(self, what: str, done: int, of: int, figures: Figures) -> None:
-        """Show that `done` of `of` (0: unknown) are done; `what` is their plural. Cheap to call."""
+        """Show that `done` of `of` (0: unknown) are done; `what` is their plural name. Cheap to call."""
         self._state = what, done, of, figures
         if (now_s := self.clock()) >= self._next_s:
-            self._next_s, self._told = now_s + self._every_s, True
+            self._next_s, self._is_shown = now_s + self._every_s, True
             self._show()
 
     def counter(self, what: str) -> Seen:
@@ -124,7 +124,7 @@ class Progress:
 
     def say(self, event: str, values: Mapping[str, object], text: str, style: str = "") -> None:
         """Print a line above the bar: `text`, or as JSON the event with its values."""
-        self._told = True
+        self._is_shown = True
         if self._live:
             self._console.print(Text(printable(text), style=style), soft_wrap=True)
         else:
@@ -137,7 +137,7 @@ class Progress:
             self._bar.stop()
 
     def _end_row(self) -> None:
-        if self._told:
+        if self._is_shown:
             self._show()
         if self._row is not None and self._bar.tasks[-1].total is None:
             self._bar.remove_task(self._row)

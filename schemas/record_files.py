@@ -129,16 +129,16 @@ def refuse_foreign(storage: Storage, *also: str) -> None:
         raise InputError(e.place, "", problem, fix) from e
 
 
-def refuse_other(place: str, there: Manifest, asked: Manifest) -> None:
+def refuse_other(place: str, stored: Manifest, given: Manifest) -> None:
     """Raise InputError for a run of another specification, with every field that differs."""
     # Without the schema version: a run keeps the one it was started with.
     ours, theirs = (
-        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (asked, there)
+        {"spec": one.spec.model_dump(mode="json"), "schema_name": one.schema_name} for one in (given, stored)
     )
     rows = different_fields(ours, theirs)
-    where, each = f"{place}/manifest.json", there.layout.candidates_per_scene
-    if each != asked.layout.candidates_per_scene:
-        problem = f"is {each}, not {asked.layout.candidates_per_scene}"
+    where, each = f"{place}/manifest.json", stored.layout.candidates_per_scene
+    if each != given.layout.candidates_per_scene:
+        problem = f"is {each}, not {given.layout.candidates_per_scene}"
         raise InputError(where, "layout.candidates_per_scene", problem, "Choose another --out")
     if rows:
         shown = [f"{path.removeprefix('spec.')}: {b!r}, but {a!r} was given" for path, a, b in rows[:20]]

@@ -99,9 +99,9 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, place: Storage | Path | str) -> Run:
+    def open(cls, path: Storage | Path | str) -> Run:
         """Open an existing run. InputError where there is none, or it is damaged or of another format."""
-        storage = place if isinstance(place, Storage) else open_storage(place, probe=False, create=False)
+        storage = path if isinstance(path, Storage) else open_storage(path, probe=False, create=False)
         manifest = read_record(storage, "manifest.json", Manifest)
         if manifest is None:
             merged = read_record(storage, MERGED, Merged)
@@ -235,7 +235,7 @@ class Run:
 
     @contextmanager
     def nothing_left_behind(self, shard: int, attempt: str, ours: bool = False) -> Generator[None]:
-        """Remove the files of an attempt that the block wrote where the disk fails, to free a full disk.
+        """Remove the files that the block wrote for an attempt where the disk fails, to free a full disk.
 
         An attempt that is `ours` is removed at once; another one needs a mark, for which a full disk may lack
         space, so that its files may stay until `gc`.
@@ -257,7 +257,7 @@ class Run:
             raise
 
     def remove_attempt(self, shard: int, attempt: str) -> Removal:
-        """Remove an attempt's files, unless its shard's commit may name it (as `garbage_collection` says)."""
+        """Remove an attempt's files, unless its shard's commit may name it (see `garbage_collection`)."""
         folder = shard_folder(shard, attempt)
         mark = f"{folder}/{REMOVING}"
         self.storage.put(mark, b"")
@@ -283,7 +283,7 @@ class Run:
         """Commit a shard. False where another attempt is committed; the files are then garbage.
 
         The attempt's folder keeps a copy of the record, from which a damaged one is restored. The commit of
-        an attempt whose files are removed as garbage meanwhile is withdrawn (as `garbage_collection` says).
+        an attempt whose files are removed as garbage meanwhile is withdrawn (see `garbage_collection`).
         """
         if (problem := self._lack(commit, committing=True)) is not None:
             raise problem

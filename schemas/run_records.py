@@ -126,7 +126,7 @@ class Cost(StoredRecord):
 
     @model_serializer(mode="wrap")
     def _without_empty_source(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omitted where empty, so that records keep the bytes from before the field existed."""
+        """Omit `source_s` where empty: records keep the bytes from before the field existed."""
         return {name: value for name, value in plain(self).items() if name != "source_s" or value}
 
     @property

@@ -18,7 +18,7 @@ from datagen.schemas.run import Run
 from datagen.schemas.run_records import StoredRecord
 from datagen.schemas.scene_rows import read_scenes
 
-# The selection that was read last: a worker makes one run, and asks for every scene.
+# The selection that was read last: a worker makes one run, and needs it for every scene.
 _READ: dict[tuple[str, str], Selection] = {}
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
@@ -26,9 +26,9 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class Selection(StoredRecord):
-    """selection.json: the selected scenes, ascending, and as many candidates of each.
+    """selection.json: the selected scenes, ascending, and equally many candidates of each.
 
-    `probability` is that with which each candidate was selected, its scene's included.
+    `probability` is the probability of selecting each candidate, including that of its scene.
     """
 
     scenes: tuple[Index, ...]
@@ -53,7 +53,7 @@ def misfit(run: Run, selection: Selection) -> str:
 
 
 def selection_of(run: Run) -> Selection | None:
-    """The run's selection; None where it labels every candidate. InputError where its record is not there."""
+    """The run's selection; None where it labels every candidate. InputError where its record is missing."""
     wanted = run.manifest.spec.selection
     return None if wanted is None else _read(run, wanted.sha256)
 

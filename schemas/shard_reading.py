@@ -110,7 +110,7 @@ class ShardPlace:
     """Location of one shard's rows: a committed attempt's folder, or a slice of a sealed store.
 
     `ordinal` is the shard's position in the folder's arrays: 0 in its own folder. `scenes` and `samples` are
-    the rows wanted of it. `digests` has the sha256 of committed files by path, "" once checked; None without
+    its wanted rows. `digests` has the sha256 of committed files by path, "" once checked; None without
     commit. `wall_s_per_sample` is the time of the attempt over its number of samples; NaN without commit.
     """
 

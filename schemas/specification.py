@@ -26,7 +26,7 @@ class _Frozen(BaseModel):
 
     @model_validator(mode="after")
     def _all_set(self, info: ValidationInfo) -> Self:
-        # Then only fields of later versions, which a stored record lacks, are unset.
+        # After this, the only unset fields are those of later versions, which a stored record lacks.
         if info.mode != "json":
             self.model_fields_set.update(type(self).model_fields)
         return self
@@ -122,7 +122,7 @@ class CandidateParams(_Frozen):
     camera_height_m: Range = Range(low=0.8, high=1.5)
     base_height_m: Range = Range(low=0.5, high=1.0)
     arm_reach_m: Range = Range(low=0.3, high=1.0)
-    # Reaches are drawn in whole steps, so that workers open few arms; 0, as in older runs: any reach.
+    # Reaches are sampled in whole steps, so that workers open few arms; 0, as in older runs: any reach.
     arm_reach_step_m: float = Field(default=0.0, ge=0, le=0.1)
     base_radius_m: Metres = 0.25
     # Bases of arms shorter than the Panda are narrower in proportion; None, as in older runs: all alike.
@@ -144,7 +144,7 @@ class GraspParams(_Frozen):
     """Grasps of the target: the number to search, and the number to look at for all candidates of a scene."""
 
     per_object: int = Field(default=4000, ge=1, le=10_000)
-    # The others are looked at for candidates to which none of these leads.
+    # The others are tried only for candidates where all of these fail.
     per_scene: int = Field(default=400, ge=1, le=10_000)
     # Grasps below this share of successful floating-hand trials are not used.
     min_score: Fraction = 0.5
@@ -183,7 +183,7 @@ class TrialParams(_Frozen):
     # Allowed motion of the object in the hand from the end of closing to the end of holding.
     max_slip_m: Metres = 0.03
     # Grasps to execute one after the other, each in a new scene, until one lifts the target. The label is
-    # the first's; how the last ended is stored.
+    # that of the first; the outcome of the last is stored.
     max_attempts: int = Field(default=1, ge=1, le=100)
 
     @model_validator(mode="after")

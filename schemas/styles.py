@@ -1,4 +1,4 @@
-"""How labels, outcomes and marks look in every figure: one colour and one marker each.
+"""Styles of labels, outcomes and marks in every figure: one colour and one marker each.
 
 Outcomes are grouped by the stage that decided them. A group has one hue and one marker, and its members
 differ in lightness, so that groups and members differ for colour-blind readers and in print. Marks (camera,
@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# matplotlib's name of a marker, the corners of a polygon, or "" for what is drawn as an area.
+# matplotlib's name of a marker, the corners of a polygon, or "" for an area.
 Marker = str | tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class Style:
-    """Colour, matplotlib marker and words of what a figure shows, the colour of its edge, and its group."""
+    """Style of one item of a figure: colour, matplotlib marker, words, edge colour and group."""
 
     colour: str
     marker: Marker

@@ -67,7 +67,7 @@ class EndSummary(StoredRecord):
 
 Summary = CommitSummary | EndSummary
 Kind = TypeVar("Kind", CommitSummary, EndSummary)
-# By a record's key: its change stamp, and its summary as JSON.
+# Change stamp and summary (JSON) of a record, by its key.
 Rows = dict[str, tuple[str, str]]
 
 

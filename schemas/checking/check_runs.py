@@ -46,14 +46,14 @@ class Checked:
 
 
 def check_runs(
-    place: Storage, checked: Checked, seen: Callable[[int, int], None] = lambda done, total: None
+    storage: Storage, checked: Checked, seen: Callable[[int, int], None] = lambda done, total: None
 ) -> Iterator[Finding]:
-    """Yield every problem at `place`, as it is found.
+    """Yield every problem in `storage`, as it is found.
 
     `checked` is filled meanwhile; `seen(done, total)` is called for shards. Every file is read once.
     InputError where there is no run, or one of another format or schema.
     """
-    roots = open_roots(place)
+    roots = open_roots(storage)
     yield from roots.findings
     checked.runs = roots.runs
     wanted: dict[str, int] = {}
@@ -61,19 +61,19 @@ def check_runs(
         wanted[run.manifest.spec_hash], found = check_plans(run)
         yield from below(roots.folder_of(run), chain(found, check_selection(run), check_notes(run.storage)))
     if roots.is_merged:
-        yield from check_notes(place)
-    root, found = read_root(place, roots.runs, wanted)
+        yield from check_notes(storage)
+    root, found = read_root(storage, roots.runs, wanted)
     yield from found
     sealed = runs_named(root, roots.runs) if root else {}
     tally = SealedTally()
     checked.is_sealed = root is not None
     checks = [
-        _RunCheck(place, run, roots.folder_of(run), form_of(run), sealed.get(run.manifest.spec_hash))
+        _RunCheck(storage, run, roots.folder_of(run), form_of(run), sealed.get(run.manifest.spec_hash))
         for run in roots.runs
     ]
     work = [(check, check.shards()) for check in checks]
     total, done = sum(len(shards) for _, shards in work), 0
-    threads = _REMOTE_THREADS if place.folder is None else _THREADS
+    threads = _REMOTE_THREADS if storage.folder is None else _THREADS
     with ThreadPoolExecutor(threads) as pool:
         for check, shards in work:
             committed: dict[int, str] = {}
@@ -88,14 +88,14 @@ def check_runs(
                 seen(done, total)
             yield from check.rest(committed, checked)
     if root is not None:
-        yield from check_store(place, roots.runs, wanted, sealed, tally)
+        yield from check_store(storage, roots.runs, wanted, sealed, tally)
 
 
 @dataclass(frozen=True, eq=False)
 class _RunCheck:
     """Checks of one run, which lies in the folder `prefix` of the checked path."""
 
-    place: Storage
+    storage: Storage
     run: Run
     prefix: str
     form: ShardForm
@@ -121,7 +121,7 @@ class _RunCheck:
             findings += check_shard(run, self.form, commit, own)
         findings = list(below(self.prefix, findings))
         if commit is not None and self.sealed is not None and shard in self.sealed.shards:
-            findings += check_chunks(self.place, self.prefix, self.form, self.sealed, commit)
+            findings += check_chunks(self.storage, self.prefix, self.form, self.sealed, commit)
         return replace(found, findings=tuple(findings))
 
     def rest(self, committed: dict[int, str], checked: Checked) -> Iterator[Finding]:

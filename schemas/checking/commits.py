@@ -40,15 +40,15 @@ def check_commit(run: Run, shard: int, listed: dict[str, StoredFile]) -> Checked
     if ours.record is not None:
         attempt = ours.record.attempt
         copy = _copy(run, shard, attempt)
-        is_won = copy.data == ours.data or _says_committed(run, shard, attempt)
+        is_won = copy.data == ours.data or _is_committed_in_ledger(run, shard, attempt)
         copies = [] if is_won else _sound_copies(run, shard, listed)
-        if not any(c.record and _says_committed(run, shard, c.record.attempt) for c in copies):
+        if not any(c.record and _is_committed_in_ledger(run, shard, c.record.attempt) for c in copies):
             return CheckedShard(shard, ours.record, tuple(compare(ours, copy, shard)))
         # The record of a superseded attempt, or of another run of the specification, replaced it.
         ours = Read(ours.key, ours.data, None, "is not that of the committed attempt")
     copies = _sound_copies(run, shard, listed)
     if len(copies) > 1:  # killed superseded attempts left theirs too
-        copies = [c for c in copies if c.record and _says_committed(run, shard, c.record.attempt)]
+        copies = [c for c in copies if c.record and _is_committed_in_ledger(run, shard, c.record.attempt)]
     if len(copies) == 1:
         return CheckedShard(shard, copies[0].record, tuple(compare(ours, copies[0], shard)))
     if not listed and ours.data is None and ours.problem == "missing":
@@ -129,7 +129,7 @@ def odd_cost(cost: Cost | None) -> str:
     return ""
 
 
-def _says_committed(run: Run, shard: int, attempt: str) -> bool:
+def _is_committed_in_ledger(run: Run, shard: int, attempt: str) -> bool:
     end = read(run.storage, end_key(attempt), LedgerEntry).record
     return end is not None and (end.outcome, end.attempt, end.shard) == ("committed", attempt, shard)
 

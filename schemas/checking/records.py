@@ -63,7 +63,7 @@ def compare(
 ) -> list[Finding]:
     """Check a record and its second copy; each restores the other.
 
-    `fix` says what to do where both are valid but differ.
+    `fix` is the fix where both are valid but differ.
     """
     if ours.record is not None and copy.record is not None:
         if ours.data == copy.data:

@@ -28,7 +28,7 @@ from datagen.schemas.storage import Storage, StoredFile
 
 # Repairing a record reveals what depends on it: commits, then files, then the sealed store.
 _PASSES = 5
-# Findings that decide which rows there are.
+# Kinds of findings that leave the set of rows undecided.
 _UNDECIDED = ("record", "lost", "foreign", "sealed")
 
 _BadFile = tuple[Finding, Regenerate]
@@ -57,7 +57,7 @@ class Repaired:
 
 
 def repair_runs(
-    place: Storage, regenerate: RegenerateShard, workers: int = 1, seen: Seen = lambda done, total: None
+    storage: Storage, regenerate: RegenerateShard, workers: int = 1, seen: Seen = lambda done, total: None
 ) -> Repaired:
     """Check, repair what can be repaired, and check again, until no more can be repaired.
 
@@ -65,9 +65,9 @@ def repair_runs(
     concurrently. A regenerated file is written only if all bad files of its shard have the committed digests.
     The result holds the remaining findings. InputError as `check_runs`.
     """
-    repair = _Repair(place, regenerate, workers)
+    repair = _Repair(storage, regenerate, workers)
     repaired = repair.result
-    before = {file.key: _state(file) for file in place.list("")}
+    before = {file.key: _state(file) for file in storage.list("")}
     for _ in range(_PASSES):
         if not repair.run_pass(seen):
             break
@@ -76,7 +76,7 @@ def repair_runs(
         return key in written or (repaired.resealed and key.startswith(f"{SEALED}/"))
 
     written = repaired.written
-    for file in place.list(""):  # a second dictionary of all files would not fit into memory for a large run
+    for file in storage.list(""):  # a second dictionary of all files of a large run would not fit into memory
         state = before.pop(file.key, None)
         if state is None or is_ours(file.key):
             continue
@@ -95,9 +95,9 @@ def _state(file: StoredFile) -> int:
 
 @dataclass
 class _Repair:
-    """A repair in several passes. `refused` says why a file, or the sealed store, is not tried again."""
+    """A repair in several passes. `refused` has the reason why a file, or the sealed store, is skipped."""
 
-    place: Storage
+    storage: Storage
     regenerate: RegenerateShard
     workers: int
     result: Repaired = field(default_factory=Repaired)
@@ -110,7 +110,7 @@ class _Repair:
         bad: dict[tuple[str, int], list[_BadFile]] = {}
         sealed: list[Finding] = []
         done = False
-        for finding in check_runs(self.place, result.checked, seen):
+        for finding in check_runs(self.storage, result.checked, seen):
             cure = finding.cure
             if isinstance(cure, Restore):
                 done |= self._put(finding, cure.data, result.records, cure.is_guess)
@@ -121,7 +121,7 @@ class _Repair:
             else:
                 self._leave(finding)
         files = self._repair_files(bad.values()) if bad else 0
-        relink = bool(files) and result.checked.is_sealed and self.place.folder is not None
+        relink = bool(files) and result.checked.is_sealed and self.storage.folder is not None
         if any(finding.kind in _UNDECIDED for finding in result.left):
             why = "Repair the other findings first: the run cannot be sealed before"
             result.left += [replace(finding, fix=why, cure=None) for finding in sealed]
@@ -140,10 +140,10 @@ class _Repair:
             try:
                 is_put = True
                 if is_guess:
-                    is_put = self.place.put_new(finding.key, data)
+                    is_put = self.storage.put_new(finding.key, data)
                 else:
-                    self.place.put(finding.key, data)
-                    self.place.sync([finding.key])
+                    self.storage.put(finding.key, data)
+                    self.storage.sync([finding.key])
                 noted += [finding.key] * is_put
                 return True
             except InputError as error:
@@ -158,7 +158,7 @@ class _Repair:
         for files in bad:
             rest: list[_BadFile] = []
             for finding, cure in files:
-                data = _second_source(self.place, sealed.get(cure.run.manifest.spec_hash), cure)
+                data = _second_source(self.storage, sealed.get(cure.run.manifest.spec_hash), cure)
                 if data is None:
                     rest.append((finding, cure))
                 else:
@@ -177,8 +177,8 @@ class _Repair:
         return put
 
     def _sealed_runs(self) -> Mapping[str, SealedRun]:
-        runs = open_roots(self.place).runs
-        root, _ = read_root(self.place, runs, {run.manifest.spec_hash: run.n for run in runs})
+        runs = open_roots(self.storage).runs
+        root, _ = read_root(self.storage, runs, {run.manifest.spec_hash: run.n for run in runs})
         return runs_named(root, runs) if root else {}
 
     def _regenerated(
@@ -209,17 +209,17 @@ class _Repair:
         """Repair the sealed store: at once where one rename does it, else file by file."""
         roots = {SEALED, f"{SEALED}/{ROOT}"}
         try:
-            _refuse_fewer_rows(self.place)
-            if self.place.folder is not None or any(
+            _refuse_fewer_rows(self.storage)
+            if self.storage.folder is not None or any(
                 f.key in roots and isinstance(f.cure, Reseal) and f.cure.data is None for f in findings
             ):
-                seal(self.place)
+                seal(self.storage)
                 self.result.resealed = True
                 return True
             # The root last: it makes the store readable.
             for finding in sorted(findings, key=lambda f: f.key in roots):
                 if isinstance(finding.cure, Reseal):
-                    _repair_one(self.place, finding.key, finding.cure)
+                    _repair_one(self.storage, finding.key, finding.cure)
                     self.result.sealed_files.append(finding.key)
         except InputError as error:
             self.refused[SEALED] = str(error)
@@ -229,7 +229,7 @@ class _Repair:
         return True
 
 
-def _second_source(place: Storage, sealed: SealedRun | None, cure: Regenerate) -> bytes | None:
+def _second_source(storage: Storage, sealed: SealedRun | None, cure: Regenerate) -> bytes | None:
     """The committed bytes of a file where they can be restored without making the shard again."""
     entry, form = cure.entry, form_of(cure.run)
     if _has_digest(data := form.metadata.get(entry.path), entry):
@@ -243,7 +243,7 @@ def _second_source(place: Storage, sealed: SealedRun | None, cure: Regenerate) -
     number = sealed.position_of(cure.shard) * len(paths) + paths.index(entry.path)
     array = next(f for _, f in form.schema.fields if f.name == name)
     try:
-        data = place.get(f"{SEALED}/{name}/{chunk_key(array, number)}", entry.size)
+        data = storage.get(f"{SEALED}/{name}/{chunk_key(array, number)}", entry.size)
     except InputError:
         return None
     return data if _has_digest(data, entry) else None
@@ -253,25 +253,25 @@ def _has_digest(data: bytes | None, entry: FileEntry) -> bool:
     return data is not None and len(data) == entry.size and sha256(data).hexdigest() == entry.sha256
 
 
-def _refuse_fewer_rows(place: Storage) -> None:
+def _refuse_fewer_rows(storage: Storage) -> None:
     """Raise InputError where sealing would drop rows that all arrays of the store have."""
-    contents = read_contents(place, check=False)
+    contents = read_contents(storage, check=False)
     names = [field.name for field in contents.schema.sample_fields]
     try:
-        sealed = ShardPlace(place, SEALED, 0, 0, 0, 0, 0).metadata(names)
+        sealed = ShardPlace(storage, SEALED, 0, 0, 0, 0, 0).metadata(names)
         held = min(array.shape[0] for array in sealed.values())
     except InputError:
         return  # a damaged store does not count
     if (rows := contents.rows("sample")) < held:
         problem = f"has {held} samples, but {rows} are committed and wanted"
         fix = "Restore the plans or commits of its shards, or remove it with `datagen unseal`"
-        raise InputError(f"{place.url}/{SEALED}", "", problem, fix)
+        raise InputError(f"{storage.url}/{SEALED}", "", problem, fix)
 
 
-def _repair_one(place: Storage, key: str, cure: Reseal) -> None:
+def _repair_one(storage: Storage, key: str, cure: Reseal) -> None:
     if cure.source:
-        place.adopt(place, cure.source, key)
+        storage.adopt(storage, cure.source, key)
     elif cure.data is not None:
-        place.put(key, cure.data)
+        storage.put(key, cure.data)
     else:
-        place.delete([key])
+        storage.delete([key])

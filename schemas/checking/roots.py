@@ -33,23 +33,23 @@ class Roots:
         return f"{part_folder(run.manifest.spec_hash)}/" if self.is_merged else ""
 
 
-def open_roots(place: Storage) -> Roots:
-    """Open the run, or the parts, at `place` from undamaged copies of the records.
+def open_roots(storage: Storage) -> Roots:
+    """Open the run, or the parts, in `storage` from undamaged copies of the records.
 
     InputError where there is no run, or one of another format.
     """
-    parts, findings = _merged_parts(place)
+    parts, findings = _merged_parts(storage)
     if parts is None:
-        run, found = _open_run(place)
+        run, found = _open_run(storage)
         if run is None and not found:
-            raise InputError(place.url, _MANIFEST, "not a run: no such file", "Name a run's folder")
+            raise InputError(storage.url, _MANIFEST, "not a run: no such file", "Name a run's folder")
         return Roots([run] if run else [], False, found)
     roots = Roots([], True, findings)
     for spec_hash in parts:
         folder = part_folder(spec_hash)
         run, found = None, list[Finding]()
-        if next(iter(place.list(folder)), None) is not None:
-            run, found = _open_run(place.below(folder), spec_hash)
+        if next(iter(storage.list(folder)), None) is not None:
+            run, found = _open_run(storage.below(folder), spec_hash)
         if run is None and not found:
             found = [Finding(_MANIFEST, "record", "missing, as is its copy", "Merge the runs again")]
         roots.findings += below(f"{folder}/", found)
@@ -58,16 +58,16 @@ def open_roots(place: Storage) -> Roots:
     return roots
 
 
-def _merged_parts(place: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
+def _merged_parts(storage: Storage) -> tuple[tuple[str, ...] | None, list[Finding]]:
     """Specification hashes of the parts, or None where these are not merged runs."""
-    ours, copy = read(place, MERGED, Merged), read(place, copy_key(MERGED), Merged)
+    ours, copy = read(storage, MERGED, Merged), read(storage, copy_key(MERGED), Merged)
     merged = sound(ours, copy)
     if merged is not None:
-        refuse_other_format(f"{place.url}/{MERGED}", merged.format_version)
+        refuse_other_format(f"{storage.url}/{MERGED}", merged.format_version)
         return merged.parts, compare(ours, copy, fix=_BROKEN_OFF)
     hashes: set[str] = set()
-    for folder in sorted({"/".join(f.key.split("/")[:2]) for f in place.list("parts")}):
-        run, _ = _open_run(place.below(folder)) if folder.count("/") == 1 else (None, [])
+    for folder in sorted({"/".join(f.key.split("/")[:2]) for f in storage.list("parts")}):
+        run, _ = _open_run(storage.below(folder)) if folder.count("/") == 1 else (None, [])
         if run is not None and part_folder(run.manifest.spec_hash) == folder:
             hashes.add(run.manifest.spec_hash)
     if ours.data is None and ours.problem == "missing" and len(hashes) < 2:

@@ -40,7 +40,7 @@ class SealedTally:
     unknown: int = 0  # shards without any file
 
     def add(self, sealed: SealedRun, looked: CheckedShard) -> None:
-        """Count one shard of the store; without a commit it has findings where it has files."""
+        """Count one shard of the store. A shard without a commit has findings if it has files."""
         if looked.commit is None:
             has_files = bool(looked.findings)
             self.lost, self.unknown = self.lost + has_files, self.unknown + (not has_files)
@@ -51,24 +51,25 @@ class SealedTally:
 
 
 def read_root(
-    place: Storage, runs: Iterable[Run], wanted: Mapping[str, int]
+    storage: Storage, runs: Iterable[Run], wanted: Mapping[str, int]
 ) -> tuple[SealedRoot | None, list[Finding]]:
-    """Return the metadata of data.zarr; a finding where it exists and is impossible.
+    """Return the metadata of data.zarr; a finding where it exists and is invalid.
 
     `wanted` are the samples of the newest plans, by specification hash.
     """
     key = f"{SEALED}/{ROOT}"
     try:
-        root = sealed_root(place)
-        there = root is not None or next(iter(place.list(SEALED)), None) is not None
+        root = sealed_root(storage)
+        there = root is not None or next(iter(storage.list(SEALED)), None) is not None
     except InputError as error:
         return None, [curable(key, "sealed", error.problem, Reseal())]
     if root is None:
         if there:  # in an object store, possibly unfinished
             return None, [curable(key, "sealed", "missing, or without the list of its shards", Reseal())]
         return None, []
-    told = {part.spec_hash: part.n for part in root.parts}
-    if not told or told.keys() - wanted.keys() or any(not 0 < n <= wanted[spec] for spec, n in told.items()):
+    sealed_n = {part.spec_hash: part.n for part in root.parts}
+    unplanned = sealed_n.keys() - wanted.keys()
+    if not sealed_n or unplanned or any(not 0 < n <= wanted[spec] for spec, n in sealed_n.items()):
         problem = "names rows that no plan wants"
         return None, [curable(key, "sealed", problem, Reseal())]
     layouts = {run.manifest.spec_hash: run.layout for run in runs}
@@ -95,7 +96,7 @@ def runs_named(root: SealedRoot, runs: Iterable[Run]) -> dict[str, SealedRun]:
 
 
 def check_chunks(
-    place: Storage, prefix: str, form: ShardForm, sealed: SealedRun, commit: Commit
+    storage: Storage, prefix: str, form: ShardForm, sealed: SealedRun, commit: Commit
 ) -> Iterator[Finding]:
     """Check the store's chunks of one shard: links to its files, or equal bytes."""
     folder = f"{prefix}{shard_folder(commit.shard, commit.attempt)}"
@@ -108,25 +109,25 @@ def check_chunks(
         for i, path in enumerate(paths[: -(-wanted[table] // step)]):
             key = f"{SEALED}/{array.name}/{chunk_key(array, position * len(paths) + i)}"
             entry = entries.get(path)
-            if entry is None or _is_link(place, key, f"{folder}/{path}"):
+            if entry is None or _is_link(storage, key, f"{folder}/{path}"):
                 continue
-            if problem := _other_bytes(place, key, min(entry.size, form.most_bytes(path)), entry.sha256):
+            if problem := _other_bytes(storage, key, min(entry.size, form.most_bytes(path)), entry.sha256):
                 yield curable(key, "sealed", problem, Reseal(source=f"{folder}/{path}"), commit.shard)
 
 
-def _is_link(place: Storage, key: str, source: str) -> bool:
-    if place.folder is None:
+def _is_link(storage: Storage, key: str, source: str) -> bool:
+    if storage.folder is None:
         return False
     try:
-        one, other = (place.folder / key).lstat(), (place.folder / source).lstat()
+        one, other = (storage.folder / key).lstat(), (storage.folder / source).lstat()
     except OSError:
         return False
     return stat.S_ISREG(one.st_mode) and (one.st_dev, one.st_ino) == (other.st_dev, other.st_ino)
 
 
-def _other_bytes(place: Storage, key: str, size: int, digest: str) -> str:
+def _other_bytes(storage: Storage, key: str, size: int, digest: str) -> str:
     try:
-        data = place.get(key, size)
+        data = storage.get(key, size)
     except InputError as error:
         return error.problem
     if data is None:
@@ -135,7 +136,7 @@ def _other_bytes(place: Storage, key: str, size: int, digest: str) -> str:
 
 
 def check_store(
-    place: Storage,
+    storage: Storage,
     runs: list[Run],
     wanted: Mapping[str, int],
     sealed: Mapping[str, SealedRun],
@@ -153,12 +154,12 @@ def check_store(
         return
     parts = tuple(sealed.values())
     first, digests = parts[0].run, (tally.digest.hexdigest(),)
-    contents = Contents(place, parts, tuple(tally.shards), digests, first.schema, first.layout)
+    contents = Contents(storage, parts, tuple(tally.shards), digests, first.schema, first.layout)
     older = sealed_metadata(contents, for_readers=False)
     for path, data in sealed_metadata(contents).items():
         key = f"{SEALED}/{path}"
         try:
-            there = place.get(key, MAX_RECORD_BYTES)
+            there = storage.get(key, MAX_RECORD_BYTES)
             problem = "missing" if there is None else ""
             if there is not None and not (same_json(there, data) or same_json(there, older[path])):
                 problem = "differs from what sealing these shards writes"
@@ -182,7 +183,7 @@ def _foreign_files(contents: Contents) -> Iterator[Finding]:
     known = {f"{SEALED}/{ROOT}", *(f"{SEALED}/{name}/{ROOT}" for name in fields)}
     # Only the last shard is cut, so chunks are numbered without gaps.
     counts = {name: sum(1 for _ in contents.chunks(field)) for name, field in fields.items()}
-    for file in contents.place.list(SEALED):
+    for file in contents.storage.list(SEALED):
         if file.key in known:
             continue
         names = file.key.split("/")

@@ -24,7 +24,7 @@ from datagen.schemas.shard_files import MAX_TEXT_BYTES, chunk_paths, group_metad
 from datagen.schemas.shard_reading import MAX_META_BYTES, Array, StoredArray, decode_chunk, parse_metadata
 from datagen.schemas.storage import StoredFile
 
-_WRITTEN_SO = "It is undamaged but wrong: remove the commit and its copy, and `datagen resume` makes it again"
+_WRONG_FIX = "It is undamaged but wrong: remove the commit and its copy, and `datagen resume` makes it again"
 # Arrays that are checked together; every other array is checked by itself.
 _KEYS = (
     *("scene_index", "redraws", "sample_id", "sample_scene_index", "candidate_index", "label"),
@@ -75,7 +75,7 @@ def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, 
     findings: list[Finding] = []
     if odd := sorted(form.paths ^ entries.keys()):
         problem = f"files: {len(odd)} missing or extra, first {odd[0]}"
-        findings.append(Finding(commit_key(shard), "rows", problem, _WRITTEN_SO, shard))
+        findings.append(Finding(commit_key(shard), "rows", problem, _WRONG_FIX, shard))
     known = {f"{folder}/{path}" for path in ("commit.json", *entries)}
     for key in listed:
         if key not in known and not key.endswith(".part"):
@@ -97,7 +97,7 @@ def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, 
     for path, data in read(form.metadata).items():
         if not same_json(data, form.metadata[path]):
             problem = "differs from the metadata of the schema"
-            findings.append(Finding(f"{folder}/{path}", "rows", problem, _WRITTEN_SO, shard))
+            findings.append(Finding(f"{folder}/{path}", "rows", problem, _WRONG_FIX, shard))
     kept: dict[str, Array] = {}
     whole = True
     for table, field in form.schema.fields:
@@ -107,14 +107,14 @@ def check_shard(run: Run, form: ShardForm, commit: Commit, listed: Mapping[str, 
         if len(chunks) == len(paths):
             values, problem = _decode(run, form, table, field, list(chunks.values()))
         if problem:
-            findings.append(Finding(f"{folder}/{field.name}", "rows", problem, _WRITTEN_SO, shard))
+            findings.append(Finding(f"{folder}/{field.name}", "rows", problem, _WRONG_FIX, shard))
         if values is None:
             whole = False
         elif field.name in _KEYS:
             kept[field.name] = values
     if whole:
         for name, problem in _row_problems(run, commit, kept):
-            findings.append(Finding(f"{folder}/{name}", "rows", problem, _WRITTEN_SO, shard))
+            findings.append(Finding(f"{folder}/{name}", "rows", problem, _WRONG_FIX, shard))
     return findings
 
 
@@ -125,7 +125,7 @@ def _bytes_of(
     key = f"{shard_folder(commit.shard, commit.attempt)}/{entry.path}"
     if entry.size > form.most_bytes(entry.path):
         problem = f"has {entry.size} bytes by its commit, more than such a file can have"
-        return None, Finding(key, "rows", problem, _WRITTEN_SO, commit.shard)
+        return None, Finding(key, "rows", problem, _WRONG_FIX, commit.shard)
     data, problem = None, "missing"
     if there is not None and there.size != entry.size:
         problem = f"has {there.size} bytes, but {entry.size} were committed"

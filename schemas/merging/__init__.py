@@ -27,7 +27,7 @@ class MergePlan:
     """Runs that can be merged: one union per specification, by ascending hash."""
 
     out: str
-    existing: tuple[Run, ...]  # runs at the place already
+    existing: tuple[Run, ...]  # runs at `out` before the merge
     unions: tuple[Union, ...]
     hashes: tuple[str, ...]  # of all specifications in the result
 
@@ -46,27 +46,27 @@ class MergePlan:
 class MergeResult:
     """The result of a merge; `sealed` is the store's address, "" where nothing is committed."""
 
-    place: Storage
+    storage: Storage
     written: tuple[WrittenUnion, ...]
     sealed: str
 
 
-def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> MergePlan:
+def plan_merge(paths: Sequence[str], out: str, tick: Callable[[], None] = lambda: None) -> MergePlan:
     """Plan a merge without writing; `tick` is called for every commit that was read.
 
     A run at `out` is one of the sources. InputError when there is nothing to merge, when runs are of
     different kinds, have different rows for a scene, or cannot be added to the run at `out`.
     """
-    if not places:
+    if not paths:
         raise InputError("datagen merge", "RUN", "is missing", "Name the runs to merge")
-    place = _place(out)
-    has_runs = place is not None and any(map(place.exists, ("manifest.json", MERGED)))
-    existing = open_runs(place) if place is not None and has_runs else []
-    sources = list({_identity(run.storage): run for path in places for run in open_runs(path)}.values())
+    storage = _existing_storage(out)
+    has_runs = storage is not None and any(map(storage.exists, ("manifest.json", MERGED)))
+    existing = open_runs(storage) if storage is not None and has_runs else []
+    sources = list({_identity(run.storage): run for path in paths for run in open_runs(path)}.values())
     refuse_incompatible(sources)
     if existing:
         refuse_incompatible([existing[0], *sources])
-    _refuse_nested(places, out, existing, sources)
+    _refuse_nested(paths, out, existing, sources)
     named = {_identity(run.storage) for run in existing}
     groups: dict[str, list[Run]] = {run.manifest.spec_hash: [run] for run in existing}
     for run in sources:
@@ -74,10 +74,10 @@ def plan_merge(places: Sequence[str], out: str, tick: Callable[[], None] = lambd
             groups.setdefault(run.manifest.spec_hash, []).append(run)
     layout = common_layout(run.layout for group in groups.values() for run in group)
     hashes = tuple(sorted(groups))
-    _refuse_other_place(existing, hashes, layout)
-    if place is not None and not existing:
+    _refuse_unfit_output(existing, hashes, layout)
+    if storage is not None and not existing:
         # An interrupted merge may have left parts that no record names yet, and a draft of the record.
-        refuse_foreign(place, *(("parts/", MERGED) if len(hashes) > 1 else ()))
+        refuse_foreign(storage, *(("parts/", MERGED) if len(hashes) > 1 else ()))
     here = {run.manifest.spec_hash for run in existing}
     unions = tuple(
         plan_union(groups[spec_hash], 0 if spec_hash in here else None, layout, tick)
@@ -92,29 +92,30 @@ def merge_runs(merge: MergePlan, tick: Callable[[], None] = lambda: None) -> Mer
 
     Called again, it completes an interrupted merge, and changes nothing in a complete one.
     """
-    place = open_storage(merge.out)
+    storage = open_storage(merge.out)
     runs: list[Run] = []
     for union in merge.unions:
         spec_hash = union.manifest.spec_hash
-        runs.append(begin_union(union, place if merge.is_ordinary else place.below(part_folder(spec_hash))))
+        target = storage if merge.is_ordinary else storage.below(part_folder(spec_hash))
+        runs.append(begin_union(union, target))
     # From here on the result counts as merged runs; shards that are not written yet are missing.
     if not merge.is_ordinary:
-        replace_record(place, MERGED, encode_record(Merged(parts=merge.hashes)))
+        replace_record(storage, MERGED, encode_record(Merged(parts=merge.hashes)))
     written = [write_union(union, run, tick) for union, run in zip(merge.unions, runs, strict=True)]
-    return MergeResult(place, tuple(written), _seal(place))
+    return MergeResult(storage, tuple(written), _seal(storage))
 
 
-def _seal(place: Storage) -> str:
+def _seal(storage: Storage) -> str:
     """Seal the result unless its store is up to date."""
-    if not label_counts(open_runs(place)).labels:
+    if not label_counts(open_runs(storage)).labels:
         return ""
-    root = sealed_metadata(read_contents(place, check=False))["zarr.json"]
-    if place.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:
-        return f"{place.url}/{SEALED}"
-    return seal(place)
+    root = sealed_metadata(read_contents(storage, check=False))["zarr.json"]
+    if storage.get(f"{SEALED}/zarr.json", 4 * MAX_RECORD_BYTES) == root:
+        return f"{storage.url}/{SEALED}"
+    return seal(storage)
 
 
-def _place(out: str) -> Storage | None:
+def _existing_storage(out: str) -> Storage | None:
     """The storage of the result; None where the folder does not exist yet."""
     try:
         return open_storage(out, probe=False, create=False)
@@ -128,15 +129,15 @@ def _identity(storage: Storage) -> str:
     return storage.url if storage.folder is None else str(storage.folder.resolve())
 
 
-def _address(place: str) -> str:
-    if place.startswith("s3://"):
-        return place.rstrip("/")
-    return str(Path(place.removeprefix("file://")).expanduser().resolve())
+def _address(path: str) -> str:
+    if path.startswith("s3://"):
+        return path.rstrip("/")
+    return str(Path(path.removeprefix("file://")).expanduser().resolve())
 
 
-def _refuse_nested(places: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
+def _refuse_nested(paths: Sequence[str], out: str, existing: Sequence[Run], sources: Sequence[Run]) -> None:
     """Raise InputError where the result is inside a source or a source inside the result."""
-    here, roots = _address(out), {_address(place) for place in places}
+    here, roots = _address(out), {_address(path) for path in paths}
     known = {here, *(_identity(run.storage) for run in existing)}
     for other in sorted({*roots, *(_identity(run.storage) for run in sources)} - known):
         if here.startswith(f"{other}/") or other.startswith(f"{here}/"):
@@ -144,7 +145,7 @@ def _refuse_nested(places: Sequence[str], out: str, existing: Sequence[Run], sou
             raise InputError(out, "--out", problem, "Choose another folder for the result")
 
 
-def _refuse_other_place(existing: Sequence[Run], hashes: Sequence[str], layout: Layout) -> None:
+def _refuse_unfit_output(existing: Sequence[Run], hashes: Sequence[str], layout: Layout) -> None:
     """Raise InputError for runs that cannot be added to the run at `out`, whose shards are kept."""
     if not existing:
         return

@@ -47,11 +47,11 @@ def _first_difference(schema: RecordSchema, ours: SceneRows, theirs: SceneRows) 
         if not _equal(np.asarray(ours.record[field.name]), np.asarray(theirs.record[field.name])):
             return field.name, 0
     found: list[tuple[int, int, str]] = []
-    for place, field in enumerate(schema.sample_fields):
+    for position, field in enumerate(schema.sample_fields):
         a, b = ours.samples[field.name], theirs.samples[field.name]
         if not _equal(a, b):
             row = next(k for k in range(len(a)) if not _equal(a[k : k + 1], b[k : k + 1]))
-            found.append((row, place, field.name))
+            found.append((row, position, field.name))
     return (min(found)[2], min(found)[0]) if found else None
 
 

@@ -1,6 +1,6 @@
 """Merge ledgers: every attempt once, with its cost.
 
-Where a shard is kept from another attempt, an attempt is superseded. Attempts of resharded shards are split
+An attempt is superseded where its shard is kept from another one. Attempts of resharded shards are split
 with them, each piece with its share of the cost; unsuccessful ones are kept whole, with their first piece.
 """
 
@@ -30,43 +30,43 @@ class _NamedAttempt:
 class UnitedLedger:
     """The ledger of a union, whose attempts have `names`.
 
-    An attempt without an end is lost, with unknown cost, where its shard is kept or in `given_up`.
+    An attempt without an end is lost, with unknown cost, where its shard is kept or in `quarantined`.
     """
 
-    def __init__(self, union: Union, given_up: Container[int]) -> None:
-        self._union, self._given_up = union, given_up
+    def __init__(self, union: Union, quarantined: Container[int]) -> None:
+        self._union, self._quarantined = union, quarantined
         self._kept = {holding.name: holding for holding in union.kept.values()}
         self._spare = {holding.name: holding for holdings in union.spare.values() for holding in holdings}
-        self._places = _places(union)
-        self.names = sorted(self._places)
+        self._named = _named_attempts(union)
+        self.names = sorted(self._named)
 
     def records(self, name: str) -> tuple[AttemptStart | None, LedgerEntry | None]:
         """Read the start and the end of an attempt; None for one that is missing in every source."""
         union = self._union
         starts: list[AttemptStart] = []
         ends: list[LedgerEntry] = []
-        for place in self._places[name]:
-            ledger, cut = union.runs[place.source].ledger, union.cut(place.source)
-            start, end = ledger.start_of(place.attempt), ledger.end_of(place.attempt)
+        for named in self._named[name]:
+            ledger, cut = union.runs[named.source].ledger, union.cut(named.source)
+            start, end = ledger.start_of(named.attempt), ledger.end_of(named.attempt)
             if start is not None:
-                shard = cut.first(start.shard) if place.piece is None else place.piece
+                shard = cut.first(start.shard) if named.piece is None else named.piece
                 starts.append(start.model_copy(update={"attempt": name, "shard": shard}))
             if end is not None:
-                shard = cut.first(end.shard) if place.piece is None else place.piece
+                shard = cut.first(end.shard) if named.piece is None else named.piece
                 cost = (
-                    end.cost if place.piece is None or end.cost is None else cut.cost(end.cost, place.piece)
+                    end.cost if named.piece is None or end.cost is None else cut.cost(end.cost, named.piece)
                 )
                 ends.append(end.model_copy(update={"attempt": name, "shard": shard, "cost": cost}))
         start = min(starts, key=encode_record) if starts else None
         held = self._kept.get(name) or self._spare.get(name)
         if held is not None:
             return start, _end_of_held(union, held, start, ends, name in self._kept)
-        if start is not None and not ends and (start.shard in union.kept or start.shard in self._given_up):
+        if start is not None and not ends and (start.shard in union.kept or start.shard in self._quarantined):
             ends.append(lost_end(start, cause=GUESS_CAUSE))
         return start, min(ends, key=_account_first) if ends else None
 
 
-def _places(union: Union) -> dict[str, list[_NamedAttempt]]:
+def _named_attempts(union: Union) -> dict[str, list[_NamedAttempt]]:
     found: dict[str, list[_NamedAttempt]] = {}
     of_source: list[dict[str, int]] = [{} for _ in union.runs]
     for holdings in (union.kept.values(), *union.spare.values()):
@@ -105,5 +105,5 @@ def _end_of_held(
 
 
 def _account_first(end: LedgerEntry) -> tuple[bool, bool, bytes]:
-    """The most informative of several ends of one attempt: with cost, and a guess only where all are."""
+    """Sort key of several ends of one attempt: with cost before without, then guesses last."""
     return end.cost is None, end.cause == GUESS_CAUSE, encode_record(end)

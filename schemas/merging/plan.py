@@ -27,14 +27,14 @@ def refuse_incompatible(runs: Sequence[Run]) -> None:
     for run in runs[1:]:
         rows = different_fields(_kind(first), _kind(run))
         if rows:
-            told = "; ".join(
+            shown = "; ".join(
                 f"{path}: {ours!r:.80} and {theirs!r:.80}" for path, ours, theirs in rows[:_SHOWN]
             )
             more = f"; and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
             raise InputError(
                 f"{first.storage.url} and {run.storage.url}",
                 rows[0][0],
-                f"differs in kind ({told}{more})",
+                f"differs in kind ({shown}{more})",
                 f"Merge runs that differ only in {', '.join(FREE_FIELDS[:-1])} or {FREE_FIELDS[-1]}",
             )
 

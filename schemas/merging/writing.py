@@ -50,12 +50,12 @@ def begin_union(union: Union, storage: Storage) -> Run:
             publish(storage, SELECTION, encode_record(selection))
         publish(storage, "manifest.json", encode_record(union.manifest))
     run = Run.open(storage)
-    for field, found, asked in (
+    for field, found, expected in (
         ("spec_hash", run.manifest.spec_hash, union.manifest.spec_hash),
         ("layout", run.layout, union.layout),
     ):
-        if found != asked:
-            problem = f"is {found}, but {asked} in the merged run"
+        if found != expected:
+            problem = f"is {found}, but {expected} in the merged run"
             raise InputError(f"{storage.url}/manifest.json", field, problem, "Choose a new --out")
     run.grow(union.plan.n, union.plan.created)
     return run
@@ -80,10 +80,10 @@ def write_union(union: Union, run: Run, tick: Tick = lambda: None) -> WrittenUni
         for _ in holdings:
             tick()
     union = _without(union, lost)
-    given_up = _given_up(union)
-    attempts = _write_ledger(union, run, given_up, tick)
-    for shard in sorted(given_up.keys() - run.quarantined()):
-        run.quarantine(given_up[shard])
+    quarantined = _quarantined_only(union)
+    attempts = _write_ledger(union, run, quarantined, tick)
+    for shard in sorted(quarantined.keys() - run.quarantined()):
+        run.quarantine(quarantined[shard])
     replace_record(run.storage, LINEAGE, encode_lineage(_lineage(union)))
     return WrittenUnion(run, len(wanted) - len(new), linked, cut, len(union.spare), attempts)
 
@@ -122,9 +122,9 @@ def _cut(union: Union, run: Run, holdings: list[Holding]) -> list[bool]:
     schema, layout = source.schema, union.layout
     won: list[bool] = []
     for holding in holdings:
-        place = holding.shard - union.cut(holding.source).first(holding.of)
-        scenes = slice(place * layout.scenes_per_shard, (place + 1) * layout.scenes_per_shard)
-        samples = slice(place * layout.samples_per_shard, (place + 1) * layout.samples_per_shard)
+        position = holding.shard - union.cut(holding.source).first(holding.of)
+        scenes = slice(position * layout.scenes_per_shard, (position + 1) * layout.scenes_per_shard)
+        samples = slice(position * layout.samples_per_shard, (position + 1) * layout.samples_per_shard)
         scene_arrays = {f.name: arrays[f.name][scenes] for f in schema.scene_fields}
         sample_arrays = {f.name: arrays[f.name][samples] for f in schema.sample_fields}
         files = encode_shard(schema, layout, run.manifest.spec_hash, scene_arrays, sample_arrays)
@@ -158,9 +158,9 @@ def _without(union: Union, lost: Iterable[Holding]) -> Union:
     return replace(union, kept=kept, spare=spare)
 
 
-def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) -> int:
+def _write_ledger(union: Union, run: Run, quarantined: Container[int], tick: Tick) -> int:
     there = {file.key for file in run.storage.list("ledger")}
-    ledger = UnitedLedger(union, given_up)
+    ledger = UnitedLedger(union, quarantined)
 
     def write(name: str) -> None:
         for key, record in zip((start_key(name), end_key(name)), ledger.records(name), strict=True):
@@ -177,21 +177,21 @@ def _write_ledger(union: Union, run: Run, given_up: Container[int], tick: Tick) 
     return len(ledger.names)
 
 
-def _given_up(union: Union) -> dict[int, QuarantineRecord]:
+def _quarantined_only(union: Union) -> dict[int, QuarantineRecord]:
     """Records of the shards that are quarantined in a source and committed in none, by shard."""
     found: dict[int, QuarantineRecord] = {}
     scenes = union.layout.scenes_per_shard
     for source, run in enumerate(union.runs):
         for record in run.quarantine_records():
             for shard in union.cut(source).shards(record.shard):
-                place = {"shard": shard, "first_scene": shard * scenes, "scenes": scenes}
-                piece = record.model_copy(update=place)
+                changed = {"shard": shard, "first_scene": shard * scenes, "scenes": scenes}
+                piece = record.model_copy(update=changed)
                 found[shard] = min(found.get(shard, piece), piece, key=encode_record)
     return {shard: record for shard, record in found.items() if shard not in union.kept}
 
 
 def _lineage(union: Union) -> dict[ShardOrigin, list[int]]:
-    """The shards of each origin; of several sources with a shard from one attempt, the first."""
+    """The shards of each origin; where several sources have a shard from one attempt, the first counts."""
     origins = [Origins(run) for run in union.runs]
     shards: dict[ShardOrigin, list[int]] = {}
     for source, known in enumerate(origins):

@@ -14,30 +14,30 @@ from datagen.schemas.storage import Storage
 __all__ = ["SEALED", "SealedPart", "SealedRoot", "seal", "sealed_metadata", "sealed_root", "unseal"]
 
 
-def seal(place: Storage) -> str:
-    """Make data.zarr over the committed shards of the run, or merged runs, at `place`; return its address.
+def seal(storage: Storage) -> str:
+    """Make data.zarr over the committed shards of the run, or merged runs, in `storage`; return its address.
 
     Quarantined and missing shards are omitted. An older store is replaced atomically; linked files become
     read-only. InputError when no shard is committed, a committed file is missing or of another size, merged
     runs have different arrays, or the disk or the server fails.
     """
-    contents = read_contents(place)
+    contents = read_contents(storage)
     metadata = sealed_metadata(contents)
-    if place.folder is not None:
-        seal_folder(contents, place.folder, metadata)
+    if storage.folder is not None:
+        seal_folder(contents, storage.folder, metadata)
     else:
         # Imported here: local runs need no client of object stores.
         from datagen.schemas.sealing.remote import seal_prefix
 
         seal_prefix(contents, metadata)
-    return f"{place.url}/{SEALED}"
+    return f"{storage.url}/{SEALED}"
 
 
-def unseal(place: Storage) -> None:
-    """Remove data.zarr at `place`, if any. The shards' files are kept. InputError as `seal`."""
-    if place.folder is not None:
-        unseal_folder(place.folder)
+def unseal(storage: Storage) -> None:
+    """Remove data.zarr in `storage`, if any. The shards' files are kept. InputError as `seal`."""
+    if storage.folder is not None:
+        unseal_folder(storage.folder)
     else:
         from datagen.schemas.sealing.remote import unseal_prefix
 
-        unseal_prefix(place)
+        unseal_prefix(storage)

@@ -19,7 +19,7 @@ from datagen.schemas.storage import Storage
 
 # Far above any real run.
 MOST_SHARDS = 10_000_000
-# The root's metadata lists them one by one, and is as limited as a record.
+# The root's metadata lists missing shards one by one, and has the size limit of a record.
 _MOST_MISSING = 500_000
 
 
@@ -74,7 +74,7 @@ class RowsDigest:
 class Contents:
     """The rows of a store. `digests[k]` is over the bytes of the files of its first k shards."""
 
-    place: Storage
+    storage: Storage
     runs: tuple[SealedRun, ...]
     shards: tuple[SealedShard, ...]
     digests: tuple[str, ...]
@@ -99,8 +99,8 @@ class Contents:
                 yield position, f"{shard.folder}/{path}", chunk_key(field, position * len(paths) + i)
 
 
-def read_contents(place: Storage, check: bool = True) -> Contents:
-    """Return the current content of a store over the run, or the merged runs, at `place`.
+def read_contents(storage: Storage, check: bool = True) -> Contents:
+    """Return the current content of a store over the run, or the merged runs, in `storage`.
 
     Rows are those of the committed planned shards in order, run after run. Rows beyond n are cut only at the
     end of the store.
@@ -108,7 +108,7 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
     With `check`, InputError when a committed file is missing or of another size. Always when no shard is
     committed, when a commit names other files than a shard has, or when merged runs have different arrays.
     """
-    runs = open_runs(place)
+    runs = open_runs(storage)
     first = runs[0]
     for run in runs[1:]:
         _refuse_other_arrays(first, run)
@@ -134,14 +134,14 @@ def read_contents(place: Storage, check: bool = True) -> Contents:
             raise InputError(run.storage.url, "plans", problem, fix)
         sealed.append(SealedRun(run, n, done, absent, first_position))
     if not folders:
-        raise InputError(place.url, "commits", "no shard is committed", "Make some with `datagen resume`")
+        raise InputError(storage.url, "commits", "no shard is committed", "Make some with `datagen resume`")
     sealed = with_last(sealed)
     shards = tuple(
         SealedShard(folder, *part.rows_of(shard))
         for part in sealed
         for shard, folder in folders[part.first : part.first + len(part.shards)]
     )
-    return Contents(place, tuple(sealed), shards, tuple(digests), first.schema, first.layout)
+    return Contents(storage, tuple(sealed), shards, tuple(digests), first.schema, first.layout)
 
 
 def with_last(sealed: Sequence[SealedRun]) -> list[SealedRun]:

@@ -31,14 +31,14 @@ def seal_folder(contents: Contents, folder: Path, metadata: Mapping[str, bytes])
     supported, the old one is renamed first, and a kill between the two renames leaves none. InputError when
     the disk fails.
     """
-    draft, place = draft_of(folder), contents.place
+    draft, storage = draft_of(folder), contents.storage
     try:
         files = {f"{draft.name}/{path}": data for path, data in metadata.items()}
-        place.put_many(files)
+        storage.put_many(files)
         for _, field in contents.schema.fields:
             _link(contents, field, draft)
-        place.sync(files)  # with every folder of the store, since each has metadata
-        old = _take_the_name(draft, folder / SEALED)
+        storage.sync(files)  # with every folder of the store, since each has metadata
+        old = _publish(draft, folder / SEALED)
         sync_folder(folder)
         remove_tree(old)
     except OSError as e:
@@ -76,17 +76,17 @@ def remove_tree(path: Path) -> None:
 
 def _link(contents: Contents, field: Field, draft: Path) -> None:
     for _, source, name in contents.chunks(field):
-        contents.place.adopt(contents.place, source, f"{draft.name}/{field.name}/{name}")
+        contents.storage.adopt(contents.storage, source, f"{draft.name}/{field.name}/{name}")
         target = draft / field.name / name
         mode = target.lstat().st_mode
         if not stat.S_ISREG(mode):
-            place = f"{contents.place.url}/{source}"
-            raise InputError(place, "", "is not a regular file", "Restore the file from a copy")
+            address = f"{contents.storage.url}/{source}"
+            raise InputError(address, "", "is not a regular file", "Restore the file from a copy")
         if mode & 0o777 != 0o444:
             target.chmod(0o444)
 
 
-def _take_the_name(draft: Path, sealed: Path) -> Path:
+def _publish(draft: Path, sealed: Path) -> Path:
     """Rename the finished store; return the new name of an older one.
 
     Another process may seal or unseal the run at any moment.

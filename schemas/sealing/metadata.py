@@ -41,9 +41,9 @@ class SealedRoot(BaseModel):
         return next((part for part in self.parts if part.spec_hash == spec_hash), None)
 
 
-def sealed_root(place: Storage) -> SealedRoot | None:
-    """Read the root of data.zarr at `place`; None where it does not exist or has another form."""
-    data = place.get(f"{SEALED}/{ROOT}", MAX_RECORD_BYTES)
+def sealed_root(storage: Storage) -> SealedRoot | None:
+    """Read the root of data.zarr in `storage`; None where it does not exist or has another form."""
+    data = storage.get(f"{SEALED}/{ROOT}", MAX_RECORD_BYTES)
     if data is None:
         return None
     try:

@@ -21,25 +21,25 @@ def seal_prefix(contents: Contents, metadata: Mapping[str, bytes]) -> None:
     replaced. Any other store is removed first, root first. A kill leaves the old store, the new one, or none;
     objects without a root do not count.
     """
-    place = contents.place
-    old = sealed_root(place)
+    storage = contents.storage
+    old = sealed_root(storage)
     kept = contents.digests.index(old.rows_sha256) if old and old.rows_sha256 in contents.digests else 0
     if not kept:
-        unseal_prefix(place)
+        unseal_prefix(storage)
     _copy_chunks(contents, kept, tidy=True)
-    place.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
-    place.put(f"{SEALED}/{ROOT}", metadata[ROOT])
-    # Another process that seals or unseals may have removed chunks before the root was written. It repairs
-    # what it publishes itself.
+    storage.put_many({f"{SEALED}/{path}": data for path, data in metadata.items() if path != ROOT})
+    storage.put(f"{SEALED}/{ROOT}", metadata[ROOT])
+    # Another process that seals or unseals may have removed chunks before the root was written: copy them
+    # again. Another seal does the same for its own store.
     _copy_chunks(contents, len(contents.shards), tidy=False)
 
 
-def unseal_prefix(place: Storage) -> None:
+def unseal_prefix(storage: Storage) -> None:
     """Remove data.zarr: its root, then the arrays' metadata, then the chunks, so that it is never readable
     in part."""
-    place.delete([f"{SEALED}/{ROOT}"])
-    place.delete([f.key for f in place.list(SEALED) if f.key.endswith(f"/{ROOT}")])
-    place.delete(f.key for f in place.list(SEALED))
+    storage.delete([f"{SEALED}/{ROOT}"])
+    storage.delete([f.key for f in storage.list(SEALED) if f.key.endswith(f"/{ROOT}")])
+    storage.delete(f.key for f in storage.list(SEALED))
 
 
 def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
@@ -50,13 +50,13 @@ def _copy_chunks(contents: Contents, kept: int, tidy: bool) -> None:
     for _, field in contents.schema.fields:
         odd = _copy_array(contents, field, kept)
         if tidy:
-            contents.place.delete(odd)
+            contents.storage.delete(odd)
 
 
 def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
     """Copy an array's chunks; return the keys of other objects."""
-    place, folder = contents.place, f"{SEALED}/{field.name}"
-    there = {f.key.removeprefix(f"{folder}/") for f in place.list(folder)} - {ROOT}
+    storage, folder = contents.storage, f"{SEALED}/{field.name}"
+    there = {f.key.removeprefix(f"{folder}/") for f in storage.list(folder)} - {ROOT}
 
     def missing() -> Iterator[tuple[str, str]]:
         for position, source, name in contents.chunks(field):
@@ -64,5 +64,5 @@ def _copy_array(contents: Contents, field: Field, kept: int) -> list[str]:
                 yield source, f"{folder}/{name}"
             there.discard(name)
 
-    place.adopt_many(place, missing())
+    storage.adopt_many(storage, missing())
     return [f"{folder}/{name}" for name in sorted(there)]

@@ -38,8 +38,8 @@ class Storage:
     """Files under one root, named by keys with forward slashes.
 
     Every failure is an `InputError` with the root, the key and the fix, also for keys that are absolute, have
-    empty parts or lead up. `folder` is the root on this machine, None for remote storage. On a disk, symbolic
-    links below the root are not followed, and pipes and devices are refused.
+    empty parts or contain `..`. `folder` is the root on this machine, None for remote storage. On a disk,
+    symbolic links below the root are not followed, and pipes and devices are refused.
     """
 
     def __init__(self, files: LocalFiles | RemoteObjects) -> None:
@@ -97,8 +97,8 @@ class Storage:
     def concurrent_map(self, do: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Yield `do(item)`, which uses this storage, for each item in order; the first exception ends it.
 
-        Calls are concurrent for remote storage, so `do` must not use the methods for many files. None is
-        running after the iterator has ended.
+        Calls are concurrent for remote storage, so `do` must not use the methods for many files. No call
+        is running after the iterator has ended.
         """
         if isinstance(self._files, LocalFiles):
             return map(do, items)
@@ -156,11 +156,11 @@ class Storage:
 
     def adopt_many(self, source: Storage, pairs: Iterable[tuple[str, str]], limit_bytes: int = 2**31) -> None:
         """Link or copy many files of another storage, given as (its key, key here), as `adopt` does."""
-        asked = source if isinstance(self._files, LocalFiles) else self
-        _exhaust(asked.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
+        remote = source if isinstance(self._files, LocalFiles) else self  # if either is remote
+        _exhaust(remote.concurrent_map(lambda pair: self.adopt(source, *pair, limit_bytes), pairs))
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files and their folders up to the root durable; objects of a store are already."""
+        """Make files and their folders up to the root durable; objects are durable already."""
         files = self._files
         if isinstance(files, LocalFiles):
             files.sync(_checked(self.url, key) for key in keys)
@@ -175,13 +175,13 @@ class Storage:
             raise storage_error(f"{self.url}/{key}", e) from e
 
 
-def open_storage(place: str | Path, probe: bool = True, create: bool = True) -> Storage:
+def open_storage(path: str | Path, probe: bool = True, create: bool = True) -> Storage:
     """Open the storage at a folder or a URL (`s3://bucket/prefix`).
 
     With `probe`, InputError unless create-only puts work, which commits depend on. With `create`, a missing
     folder is created; without, it is an error.
     """
-    text = str(place)
+    text = str(path)
     if "\0" in text or not text.strip():
         raise InputError(repr(text), "", "is not the name of a folder", "Name a folder or an s3:// address")
     if text.startswith("s3:") and not text.startswith("s3://"):  # a typing error that would become a folder

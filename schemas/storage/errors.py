@@ -14,8 +14,8 @@ from datagen.schemas.errors import InputError
 # Errors of the machine that any write can cause, whatever the shard.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# A name that is taken, or whose folder is a file; a file system without hard links from there, or without
-# the exchange of two names.
+# TAKEN: the name exists, or its folder is a file. NOT_LINKED: the file system allows no hard link between
+# these folders. CANNOT_EXCHANGE: it cannot exchange two names.
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
 NOT_LINKED = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EACCES)
 CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
@@ -59,11 +59,11 @@ class FileTooLarge(InputError):
 
 @dataclass(frozen=True)
 class RequestFailure:
-    """The failure of one request to an object store. `passing`: a retry may succeed."""
+    """The failure of one request to an object store. `is_transient`: a retry may succeed."""
 
     problem: str
     fix: str
-    passing: bool
+    is_transient: bool
 
     def at(self, place: str) -> StoreUnavailable:
         return StoreUnavailable(place, "", self.problem, self.fix)
@@ -105,41 +105,41 @@ def store_trouble(error: Exception) -> RequestFailure:
     status = _found(r"non-2xx status code: ([0-9]{3})", text) or _found(r"status: ([0-9]{3})", text)
     code = _found(rf"<Code>({_TRUSTED})</Code>", text)
     if "//169.254." in text:  # address at which a cloud machine requests its role
-        asked_too_often = status.startswith("5") or status == "429"
-        return RequestFailure("no credentials are set", _KEYS_FIX, passing=asked_too_often)
+        is_busy = status.startswith("5") or status == "429"
+        return RequestFailure("no credentials are set", _KEYS_FIX, is_transient=is_busy)
     if code == "NoSuchBucket":
         fix = "Create the bucket, or check its name, AWS_ENDPOINT_URL and AWS_REGION"
-        return RequestFailure("no such bucket", fix, passing=False)
+        return RequestFailure("no such bucket", fix, is_transient=False)
     if "Received redirect without LOCATION" in text or status in ("301", "307"):
         fix = "Set AWS_REGION to the bucket's region, or AWS_ENDPOINT_URL to its store"
-        return RequestFailure("the bucket is in another region", fix, passing=False)
+        return RequestFailure("the bucket is in another region", fix, is_transient=False)
     if status in ("401", "403") or code in ("ExpiredToken", "InvalidAccessKeyId", "InvalidToken"):
-        return RequestFailure(f"access denied ({code or status})", _KEYS_FIX, passing=False)
+        return RequestFailure(f"access denied ({code or status})", _KEYS_FIX, is_transient=False)
     if status and not status.startswith("2"):
         shown = f"{status} {code}" if code else status
         if (status.startswith("5") and status != "501") or status in ("408", "409", "429"):
             fix = f"Wait until the store has recovered, {_RESUME}"
-            return RequestFailure(f"the store responds {shown}", fix, passing=True)
+            return RequestFailure(f"the store responds {shown}", fix, is_transient=True)
         fix = "Check that AWS_ENDPOINT_URL is an S3 store that supports this request"
-        return RequestFailure(f"the store refuses ({shown})", fix, passing=False)
+        return RequestFailure(f"the store refuses ({shown})", fix, is_transient=False)
     if code:  # a copy that fails late responds 200 with an error in its body
         fix = f"Wait until the store has recovered, {_RESUME}"
-        return RequestFailure(f"the store responds {code}", fix, passing=True)
-    return _trouble_on_the_way(text)
+        return RequestFailure(f"the store responds {code}", fix, is_transient=True)
+    return _connection_failure(text)
 
 
-def _trouble_on_the_way(text: str) -> RequestFailure:
+def _connection_failure(text: str) -> RequestFailure:
     kind = _found(r"HttpError \{\s*kind: ([A-Za-z]+)", text)
     if kind == "Connect":
         why = "unknown host name" if "dns error" in text else "the connection fails"
-        return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_FIX, passing=True)
+        return RequestFailure(f"the store cannot be reached ({why})", _ENDPOINT_FIX, is_transient=True)
     if kind == "Timeout":
         fix = f"Check the network, or raise DATAGEN_STORE_TIMEOUT_S, {_RESUME}"
-        return RequestFailure("the store does not respond in time", fix, passing=True)
+        return RequestFailure("the store does not respond in time", fix, is_transient=True)
     if kind in ("Request", "Interrupted", "Decode"):
-        return RequestFailure("the store's response is cut off", _ENDPOINT_FIX, passing=True)
+        return RequestFailure("the store's response is cut off", _ENDPOINT_FIX, is_transient=True)
     fix = "Check that AWS_ENDPOINT_URL is an S3 store"
-    return RequestFailure("the response is not that of an S3 store", fix, passing=False)
+    return RequestFailure("the response is not that of an S3 store", fix, is_transient=False)
 
 
 def _found(pattern: str, text: str) -> str:

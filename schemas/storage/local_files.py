@@ -125,7 +125,7 @@ class LocalFiles:
             yield from self._list(here, f"{prefix}/" if prefix else "", 0)
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove files; missing ones are ignored. Of a link, the link is removed."""
+        """Remove files; missing ones are ignored. A link itself is removed, not its target."""
         for key in keys:
             folders, name = _split(key)
             with suppress(FileNotFoundError), _closing(self._walk(folders)) as here:

@@ -56,7 +56,7 @@ class RemoteObjects:
             try:
                 obstore.put(self._store, key, data, mode="create", use_multipart=False)
             except AlreadyExistsError as e:
-                # Also sent while another request for this name is running, which may fail.
+                # Also the response while another request for this name is running, which may fail.
                 if "409 Conflict" in str(e) and not self.exists(key):
                     raise _TransientTrouble("the store responds 409") from e
                 return False
@@ -160,7 +160,7 @@ class RemoteObjects:
                 if isinstance(e, FileNotFoundError) and trouble.problem != "no such bucket":
                     raise
                 tries += 1
-                if not trouble.passing or (tries > 1 and time.monotonic() + pause_s > end_s):
+                if not trouble.is_transient or (tries > 1 and time.monotonic() + pause_s > end_s):
                     raise trouble.at(f"{self.url}/{key}" if key else self.url) from e
             time.sleep(pause_s * random.uniform(0.5, 1.0))
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
@@ -170,5 +170,5 @@ class _TransientTrouble(OSError):
     """A failure that the client does not report as one."""
 
     def __init__(self, problem: str) -> None:
-        self.trouble = RequestFailure(problem, "Submit again when the store has recovered", passing=True)
+        self.trouble = RequestFailure(problem, "Submit again when the store has recovered", is_transient=True)
         super().__init__(problem)

@@ -271,12 +271,12 @@ def told_of(port: int, problem: str, monkeypatch: pytest.MonkeyPatch, timeout_s:
 def test_what_is_told_of_an_answer_does_not_hang_on_names():
     told = "Error performing GET http://host/redirect/dns error/k - Server returned non-2xx status code: "
     trouble = store_trouble(GenericError(told + "503 Service Unavailable: <Error><Code>SlowDown</Code>"))
-    assert (trouble.problem, trouble.passing) == ("the store responds 503 SlowDown", True)
+    assert (trouble.problem, trouble.is_transient) == ("the store responds 503 SlowDown", True)
     asked = "Error performing PUT http://169.254.169.254/latest/api/token - "
     trouble = store_trouble(GenericError(asked + "HTTP error: error sending request"))
-    assert (trouble.problem, trouble.passing) == ("no credentials are set", False)
+    assert (trouble.problem, trouble.is_transient) == ("no credentials are set", False)
     trouble = store_trouble(GenericError(asked + "Server returned non-2xx status code: 503 Busy"))
-    assert trouble.passing
+    assert trouble.is_transient
 
 
 def test_addresses_and_settings_that_cannot_be_used(bucket: str, monkeypatch: pytest.MonkeyPatch):
